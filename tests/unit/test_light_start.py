@@ -1,4 +1,4 @@
-"""Whoever passes scans on without looking into them starts without numpy, which is half of the time to start."""
+"""Processes that only pass scans on start without numpy, which saves half of their start time."""
 
 from __future__ import annotations
 
@@ -23,6 +23,6 @@ import pytest
         "afspm.cli.status",
     ],
 )
-def test_numpy_is_loaded_by_those_who_reckon_with_values(module: str) -> None:
+def test_numpy_is_loaded_only_by_processes_that_use_values(module: str) -> None:
     script = f"import sys, {module}; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0

@@ -1,4 +1,4 @@
-"""Addresses as ZeroMQ writes them, and settings of components that are one: what listens is known before it starts."""
+"""Addresses in ZeroMQ's notation, and the settings of components that hold an address to listen at."""
 
 from __future__ import annotations
 
@@ -16,13 +16,12 @@ _ADDRESS = re.compile(r"(tcp://(\[[0-9A-Fa-f:.%]+\]|[^:/\s]+):(\d+|\*)|ipc://\S+
 
 
 def is_address(text: str) -> bool:
-    """Return whether this is an address as ZeroMQ writes it."""
     match = _ADDRESS.fullmatch(text)
     return match is not None and _has_port(match)
 
 
 def hint_on(text: str) -> str:
-    """Return what to do about a text that is no address but for its port; empty: it does not even look like one."""
+    """Return the hint for an address whose port is out of range; empty for any other text."""
     match = _ADDRESS.fullmatch(text)
     return f"a port is {HIGHEST_PORT} at most" if match and not _has_port(match) else ""
 
@@ -32,7 +31,9 @@ def _has_port(match: re.Match[str]) -> bool:
 
 
 def reaches(connect: str, bind: str) -> bool:
-    """Return whether a connection to one address ends at what is bound at the other (a wildcard means any host)."""
+    """Return whether a connection to the address `connect` ends at a socket bound at `bind` (a wildcard means any
+    host).
+    """
     if connect == bind:
         return True
     a, b = _ADDRESS.fullmatch(connect), _ADDRESS.fullmatch(bind)
@@ -43,31 +44,38 @@ def reaches(connect: str, bind: str) -> bool:
 
 
 def connectable(bind: str) -> str:
-    """Return how a peer on the same computer connects to what is bound: a wildcard is no address to connect to."""
+    """Return the address for peers on this computer of a bound socket: a wildcard becomes loopback."""
     return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", f"tcp://{LOOPBACK}", bind)
 
 
 @dataclass(frozen=True)
 class Listens:
-    """Marks a setting at which a component listens, so that a check sees who else does: an address, or a port (0: any
-    that is free).
+    """Mark of a setting that holds an address, or a port (0: any free port), to listen at.
+
+    `afspm check` finds two components that listen at one address by this mark.
 
     Attributes:
-        host: of a port: the setting that names the host; empty: this computer only.
-        keyed: whether it is ours to keep strangers out, with the keys of the experiment; a page has its passwords.
+        host: for a port, the setting that names the host; empty: this computer only.
+        keyed: whether the keys of the experiment protect the address; a page has passwords instead.
     """
 
     host: str = ""
     keyed: bool = True
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> object:
-        """Makes pydantic refuse what is none. Called by it alone, so that we need not load it here."""
+        """Have pydantic refuse anything but an address or a port. Only pydantic calls it, so pydantic is not loaded
+        here.
+        """
         from pydantic_core import core_schema
 
         return core_schema.no_info_after_validator_function(self.checked, handler(source))
 
     def checked(self, value: object) -> object:
-        """Raises InvalidValue: neither an address nor a port."""
+        """Return a valid value.
+
+        Raises:
+            InvalidValue: `value` is neither an address nor a port.
+        """
         if isinstance(value, str) and not is_address(value):
             raise InvalidValue("this is not an address", hint=hint_on(value) or EXAMPLE)
         if isinstance(value, int) and not 0 <= value <= HIGHEST_PORT:
@@ -75,11 +83,12 @@ class Listens:
         return value
 
     def address(self, value: object, settings: Mapping[str, object]) -> str | None:
-        """Return where the component listens, as ZeroMQ writes it; None: it decides itself, or this is none.
+        """Return the address that the component listens at; None if the component chooses one itself, or the value is
+        invalid.
 
         Args:
-            value: of the setting.
-            settings: all of the component's, those left out too.
+            value: value of the setting.
+            settings: all settings of the component, defaults included.
         """
         if isinstance(value, int) and value:
             host = str(settings.get(self.host, LOOPBACK))

@@ -1,7 +1,7 @@
 """The one clock of a run: experiment time, which in a simulation may begin anywhere and pass faster than real time.
 
-All time that means something in the experiment (timestamps, scan durations, periods) comes from here. Heartbeats,
-request timeouts and whatever else is about processes stays in real time: `monotonic_s`.
+Timestamps, scan durations and periods are in experiment time. Heartbeats, request timeouts and other times of
+processes are in real time: `monotonic_s`.
 """
 
 from __future__ import annotations
@@ -30,7 +30,10 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
 def utc_time(time_ns: int) -> datetime:
-    """Return a time, ns since the Unix epoch, to the microsecond. Python's own refuses those before it on Windows."""
+    """Return a time in ns since the Unix epoch as a datetime, exact to the microsecond.
+
+    `datetime.fromtimestamp` refuses times before the epoch on Windows.
+    """
     return _EPOCH + timedelta(microseconds=time_ns // 1000)
 
 
@@ -45,28 +48,28 @@ class Clock(Protocol):
     """A source of time."""
 
     def now_ns(self) -> int:
-        """Experiment time, ns since the Unix epoch."""
+        """Return the experiment time in ns since the Unix epoch."""
         ...
 
     def now_s(self) -> float:
-        """Experiment time, s since the Unix epoch."""
+        """Return the experiment time in s since the Unix epoch."""
         ...
 
     def monotonic_s(self) -> float:
-        """Real time in s that never jumps, from an arbitrary zero: for timeouts and heartbeats."""
+        """Return real time in s that never jumps, from an arbitrary zero: for timeouts and heartbeats."""
         ...
 
     def real_s(self, experiment_s: float) -> float:
-        """Return how long `experiment_s` of the experiment last in real time, in s."""
+        """Return the real time, in s, that `experiment_s` of the experiment lasts."""
         ...
 
     def late(self) -> AbstractContextManager[None]:
-        """Let a simulated time wait, within bounds, for what is done in the block."""
+        """Slow a simulated time down to real time, within bounds, while the block runs."""
         ...
 
 
 def _anchor_s() -> float:
-    """Wall-clock time at the zero of time.monotonic(), so that a corrected system clock never jumps a run."""
+    # wall-clock time at the zero of time.monotonic(): a system clock that is corrected later never makes a run jump
     return time.time() - time.monotonic()
 
 
@@ -75,14 +78,14 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 @cache
 def monotonic_id() -> str:
-    """Return what tells apart computers, boots of one computer, and clocks of one boot, by which time.monotonic() goes.
+    """Return an identity of the zero of time.monotonic(): of the computer, its boot, and the clock that Python reads.
 
     In one boot all processes count from one zero: the function is "system-wide" by Python's documentation (since 3.5;
-    on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Elsewhere than on
-    Linux a boot has no name here: what is handed on by a run has no use after it.
+    on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Only Linux gives a
+    boot an identity. Elsewhere the computer's name must do: no run hands times on to a run after it.
     """
     boot = ""
-    if sys.platform == "linux":  # under Wine, too, there may be such a file, for those who are on its drive
+    if sys.platform == "linux":  # Wine shows the file only to processes on its drive Z:
         with suppress(OSError):
             boot = _BOOT.read_text(encoding="ascii").strip()
     if not boot:
@@ -92,38 +95,38 @@ def monotonic_id() -> str:
     return f"{boot} {time.get_clock_info('monotonic').implementation}"
 
 
-LONGEST_LATE_S = 10.0  # real time: who is killed while it is late must not slow the rest of the night
-_LOOKS = 1000  # while somebody writes; whoever was killed just then leaves the time as it was before
-_MOST_LATE = 16  # at the same time; more are not waited for
-_SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")  # real time, experiment time then, until when each is waited for; ns
+LONGEST_LATE_S = 10.0  # real time: a process that is killed while it is late must not slow the rest of the night
+_LOOKS = 1000  # at a file that is being written; after them its writer was killed, and the time before it counts
+_MOST_LATE = 16  # late processes at a time; further ones get no time
+# in ns: real time, experiment time at that moment, until which real time each late process slows the experiment
+_SHARED = struct.Struct(f"<{2 + _MOST_LATE}q")
 _CHECKSUM = struct.Struct("<I")
 
 
 class SharedSimulationTime:
-    """The time of a simulated run, which waits for those who are late; shared by its processes in a small file.
+    """Time of a simulated run that slows down for late processes; all processes share it in a small file.
 
-    Since a moment of real time it has gone at the speed of real time until another, and at full speed from then on. Who
-    is late writes both anew.
+    From a moment of real time the experiment goes at real speed until another moment, and at full speed afterwards. A
+    late process writes both moments.
 
     Args:
-        path: of the file, which is there.
+        path: an existing file.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = path.open("r+b")  # stays open: a disk that hangs then hangs nobody who is late
+        self._file = path.open("r+b")  # stays open: opening it may hang with the disk, and a late process must not
         weakref.finalize(self, self._file.close)
-        self._turn = threading.Lock()  # of this process, whose threads share the lock of the file
+        self._turn = threading.Lock()  # threads of one process share the lock of the file
         self._map = mmap.mmap(self._file.fileno(), _SHARED.size + _CHECKSUM.size)
         self._last: tuple[int, ...] = (0,) * (2 + _MOST_LATE)
 
     def now_ns(self, real_ns: int, speed: float) -> int:
-        """Experiment time at a moment of real time, by `time.monotonic_ns`."""
+        """Return the experiment time at a moment of `time.monotonic_ns`."""
         return _shown_ns(self._read(), real_ns, speed)
 
     @contextmanager
     def late(self, speed: float) -> Iterator[None]:
-        """See `ExperimentClock.late`."""
         mine_ns = time.monotonic_ns() + int(LONGEST_LATE_S * NS_PER_S)
         self._change(0, mine_ns, speed)
         try:
@@ -132,7 +135,7 @@ class SharedSimulationTime:
             self._change(mine_ns, 0, speed)
 
     def _change(self, before_ns: int, after_ns: int, speed: float) -> None:
-        """Write one of the times until which somebody is waited for instead of another, and the time that it is now."""
+        # one of the moments until which time is slow replaces another, and the moment of writing becomes the new origin
         with self._turn, locked(self._file):
             real_ns, (since_ns, shown_ns, *until_ns) = time.monotonic_ns(), self._read()
             shown_ns = _shown_ns((since_ns, shown_ns, *until_ns), real_ns, speed)
@@ -150,20 +153,21 @@ class SharedSimulationTime:
         return self._last
 
 
-def _shown_ns(told: tuple[int, ...], real_ns: int, speed: float) -> int:
-    since_ns, shown_ns, *until_ns = told
+def _shown_ns(shared: tuple[int, ...], real_ns: int, speed: float) -> int:
+    since_ns, shown_ns, *until_ns = shared
     real_ns = max(real_ns, since_ns)
     fast_since_ns = min(max(since_ns, *until_ns), real_ns)
     return shown_ns + fast_since_ns - since_ns + int((real_ns - fast_since_ns) * speed)
 
 
 def _shared_bytes(real_ns: int, shown_ns: int, *until_ns: int) -> bytes:
-    told = _SHARED.pack(real_ns, shown_ns, *until_ns)
-    return told + _CHECKSUM.pack(zlib.crc32(told))
+    # the checksum shows a reader that a writer was killed half way
+    shared = _SHARED.pack(real_ns, shown_ns, *until_ns)
+    return shared + _CHECKSUM.pack(zlib.crc32(shared))
 
 
 def _waiting_in(path: str | None) -> SharedSimulationTime | None:
-    """Return the time that is shared in a file; None where that is gone with its run, or was cut off."""
+    # None once the file is gone with its run, or was cut off by a full disk
     try:
         return SharedSimulationTime(Path(path)) if path else None
     except (OSError, ValueError):
@@ -172,10 +176,10 @@ def _waiting_in(path: str | None) -> SharedSimulationTime | None:
 
 @dataclass(frozen=True)
 class ExperimentClock:
-    """experiment time = start + (real time - origin) · speed.
+    """Clock of a run: experiment time = start + (real time - origin) · speed.
 
-    Every process of a run is given the same origin, start and speed, and, on one computer, the same anchor of real
-    time: so all show the same time, whatever becomes of the clock on the wall and whenever they were started.
+    All processes of a run get the same origin, start and speed, and on one computer the same anchor of real time. So
+    all show the same time, at any start and after any change of the system clock.
 
     Attributes:
         origin_s: real time, s since the Unix epoch, at which the run began.
@@ -191,7 +195,7 @@ class ExperimentClock:
 
     @classmethod
     def real(cls) -> ExperimentClock:
-        """Return the clock on the wall."""
+        """Return a clock that shows the real time."""
         return cls()
 
     @classmethod
@@ -202,23 +206,23 @@ class ExperimentClock:
 
     @classmethod
     def from_dict(cls, values: PlainMapping) -> ExperimentClock:
-        """Return the clock that `as_dict` told of; of nothing, the one on the wall."""
+        """Return the clock that `as_dict` described; the real time for an empty table."""
         if not values:
             return cls.real()
-        told = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
+        times = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
         waits = values.get("waits")
-        if values.get("monotonic") != monotonic_id():  # another computer's: real time is what the wall here says
+        if values.get("monotonic") != monotonic_id():  # of another computer: its own system clock must do
             if waits:
                 raise ConfigError(
-                    "the simulated clock waits for those who are late, which it can do on one computer only",
+                    "the simulated clock waits for late processes, which works on one computer only",
                     where="[clock]",
                     hint="set waits = false where the scheduler is started",
                 )
-            return cls(*told)
-        return cls(*told, float(values["wall_at_zero_s"]), _waiting_in(waits))
+            return cls(*times)
+        return cls(*times, float(values["wall_at_zero_s"]), _waiting_in(waits))
 
     def as_dict(self) -> dict[str, object]:
-        """As JSON has it, for the other processes of the run."""
+        """Return the clock in JSON's types, for the other processes of the run."""
         return {
             "origin_s": self.origin_s,
             "start_s": self.start_s,
@@ -229,10 +233,10 @@ class ExperimentClock:
         }
 
     def waiting_in(self, path: Path) -> ExperimentClock:
-        """Return this clock, which from now on waits for those who are late, if it goes faster than real time.
+        """Return this clock with late processes shared in a file, if it goes faster than real time.
 
         Args:
-            path: of the file by which the processes of the run share that.
+            path: file that the processes of the run share.
         """
         if self.speed <= 1.0 or self._waiting is not None:
             return self
@@ -240,15 +244,17 @@ class ExperimentClock:
         return replace(self, _waiting=SharedSimulationTime(path))
 
     def late(self) -> AbstractContextManager[None]:
-        """Let the experiment's time go no faster than real time in the block, at most for `LONGEST_LATE_S`.
+        """Slow the experiment's time down to real time while the block runs, for at most `LONGEST_LATE_S`.
 
-        For what takes no time in the experiment, and computers need time for: a scan that is due and not begun, one
-        that is finished and not yet registered. At a speed of one nothing changes.
+        Use it for work that takes no experiment time but computing time: a scan that is due and not begun, a scan that
+        is finished and not yet registered. At a speed of one nothing changes.
         """
         return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
 
     def wall_ahead_s(self) -> float:
-        """By how much the clock on the wall is ahead, s: it was set since, or the computer was suspended."""
+        """Return by how many seconds the system clock is ahead: it was set since the start, or the computer was
+        suspended.
+        """
         return _anchor_s() - self._wall_at_zero_s
 
     def now_s(self) -> float:
@@ -262,11 +268,12 @@ class ExperimentClock:
         real_ns = time.monotonic_ns() + self._since_origin_ns
         return self._start_ns + (real_ns if self.speed == 1.0 else int(real_ns * self.speed))
 
-    # float64 would round the sum to a quarter of a microsecond: in whole nanoseconds, and reckoned once
+    # whole nanoseconds, since float64 rounds a time since 1970 to a quarter of a microsecond; cached, since now_ns is
+    # called for every packet
 
     @cached_property
     def _since_origin_ns(self) -> int:
-        """The age of the run at the zero of time.monotonic()."""
+        # age of the run at the zero of time.monotonic()
         return int(self._wall_at_zero_s * NS_PER_S) - int(self.origin_s * NS_PER_S)
 
     @cached_property

@@ -50,7 +50,7 @@ class DeclaredName:
 
     Attributes:
         package: name and version of the package.
-        problem: why the name can't be used; empty: it can be, or was not tried.
+        problem: why the name can't be used; empty: the name can be used, or was not tried.
     """
 
     group: str
@@ -60,7 +60,7 @@ class DeclaredName:
 
 
 def names(*groups: str) -> tuple[str, ...]:
-    """Return the names of some groups, sorted."""
+    """Return the sorted names in some groups."""
     return tuple(sorted({point.name for point in _points(groups)}))
 
 
@@ -68,8 +68,9 @@ def find(name: str, *groups: str) -> EntryPoint | None:
     """Return the entry point of a name in some groups; None if no package declares the name.
 
     Raises:
-        ConfigError: two packages declare it.
+        ConfigError: two packages declare the name.
     """
+    # by value: two packages may declare the same object
     found = {point.value: point for point in _points(groups) if point.name == name}
     if len(found) > 1:
         packages = sorted({_package(point) for point in found.values()})
@@ -85,35 +86,35 @@ def class_path(name: str) -> str | None:
     """Return the class that an experiment file names, as "package.module.Name"; None if no package declares it.
 
     Raises:
-        ConfigError: two packages declare it.
+        ConfigError: two packages declare the name.
     """
     point = find(name, *CLASSES)
     return None if point is None else f"{point.module}.{point.attr}"
 
 
 def modules(*groups: str) -> tuple[str, ...]:
-    """Return the modules that the names of some groups are in, sorted."""
+    """Return the sorted modules that declare the names in some groups."""
     return tuple(sorted({point.module for point in _points(groups)}))
 
 
 def is_declared(class_: type) -> bool:
-    """Return whether a class, or a class that it is derived from, is in a module of declared classes."""
+    """Return whether a declared module defines a class or one of its bases."""
     declared = modules(*CLASSES)
     return any(base.__module__ in declared for base in class_.__mro__)
 
 
 def load(group: str, name: str) -> Any:
-    """Import what a name stands for; None if no package declares it.
+    """Import the object behind a name; None if no package declares the name.
 
     Raises:
-        ConfigError: it can't be imported, or two packages declare it.
+        ConfigError: the module can't be imported, or two packages declare the name.
     """
     point = find(name, group)
     return None if point is None else _loaded(point)
 
 
 def required(group: str, name: str) -> Any:
-    """Import what a name stands for.
+    """Import the object behind a name that afspm itself declares.
 
     Raises:
         ConfigError: no package declares the name, its module can't be imported, or two packages declare it.
@@ -132,7 +133,7 @@ def folder(group: str, name: str) -> Path | None:
 
 
 def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
-    """Load everything that is declared, and return it by group and name, each with why it can't be used.
+    """Load every declared name, and return all by group and name, with the reason why a name can't be used.
 
     Args:
         taken_commands: the commands of the core, which no package replaces.
@@ -170,12 +171,12 @@ def _installed() -> Mapping[str, Sequence[EntryPoint]]:
 
 
 def _is_first(package: metadata.Distribution, declared: str) -> bool:
-    # of two versions in sys.path Python imports the first
+    # a package may be installed twice in sys.path: Python imports the first
     return metadata.distribution(package.name).read_text(_FILE) == declared
 
 
 def forget() -> None:
-    """Read the metadata of the installed packages again when the next name is looked for."""
+    """Drop the cached metadata: the next look-up reads the installed packages again."""
     _installed.cache_clear()
 
 

@@ -1,4 +1,4 @@
-"""The errors of afspm: each says what happened, where, and what to do about it."""
+"""The errors of afspm: each states what happened, where, and the remedy."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import ClassVar, Final
 
 _PACKAGE: Final = str(Path(__file__).parents[1])
 _LIBRARIES: Final = "site-packages"
+# IPython's names of the files that cells pretend to be
 _CELLS: Final = ("<ipython-input", "ipykernel_")
 
 
@@ -17,8 +18,8 @@ class AfspmError(Exception):
 
     Args:
         what: what happened, in words a physicist understands.
-        where: the file, component, parameter … that it happened at.
-        hint: what to do about it.
+        where: the file, component, parameter … where the error occurred.
+        hint: the remedy.
     """
 
     code: ClassVar[str] = "error"
@@ -34,7 +35,7 @@ class AfspmError(Exception):
         return f"{text} ({self.hint})" if self.hint else text
 
     def _render_traceback_(self) -> list[str]:
-        """Return the lines that IPython shows in place of the traceback: the error, and the caller's own lines."""
+        # IPython calls this and shows the lines in place of the traceback
         return rendered(self, str(self))
 
 
@@ -46,7 +47,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def rendered(error: BaseException, text: str) -> list[str]:
-    """Return an error and the caller's own lines, without those of afspm and of libraries."""
+    """Return an error and the caller's own lines, without the lines of afspm and of libraries."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
     own = [one for one in own if one.line]
@@ -65,10 +66,10 @@ class ConfigError(AfspmError):
 
 
 class ConfigErrors(ConfigError):
-    """Several settings are wrong.
+    """Several wrong settings.
 
     Attributes:
-        errors: one for each, in the order in which they were found.
+        errors: one error for each setting, in the order of discovery.
     """
 
     def __init__(self, errors: Sequence[AfspmError]) -> None:
@@ -77,7 +78,7 @@ class ConfigErrors(ConfigError):
 
 
 class ErrorCollector:
-    """Errors that are raised together at the end, so that whoever mends one hears of all::
+    """Errors that are raised together at the end, so that a user sees all mistakes at once::
 
         errors = ErrorCollector()
         for name in names:
@@ -85,7 +86,7 @@ class ErrorCollector:
                 check(name)
         errors.raise_all()
 
-    An error of ours ends its block and not what comes after it.
+    An AfspmError ends its block, and the code after the block goes on.
     """
 
     def __init__(self) -> None:
@@ -104,13 +105,13 @@ class ErrorCollector:
         return False
 
     def raise_all(self) -> None:
-        """Raises ConfigErrors; the only one as it is; nothing if there are none."""
+        """Raise ConfigErrors, or the one error itself; return if there are no errors."""
         if self.errors:
             raise self.errors[0] if len(self.errors) == 1 else ConfigErrors(self.errors)
 
 
 def individual_errors(error: AfspmError) -> tuple[AfspmError, ...]:
-    """Return the errors that one stands for: those that it gathers, or itself."""
+    """Return the errors that a ConfigErrors gathers; any other error alone."""
     return error.errors if isinstance(error, ConfigErrors) else (error,)
 
 
@@ -121,22 +122,22 @@ class InvalidValue(AfspmError, ValueError):
 
 
 class NoSuchItem(AfspmError, KeyError, IndexError):
-    """There is nothing by this name, key or number."""
+    """A name, key or number that does not exist."""
 
     code = "no-such-item"
 
 
 class UnitError(AfspmError, ValueError):
-    """An unknown unit, or one of the wrong dimension."""
+    """An unknown unit, or a unit of the wrong dimension."""
 
     code = "unit"
 
 
 class WireError(AfspmError):
-    """Bytes from a peer that are not what the wire format says.
+    """Bytes from a peer that violate the wire format.
 
     Args:
-        response: the number of the ControlResponse to answer a request with, if it was one.
+        response: the number of the ControlResponse that answers the request, if the bytes were a request.
     """
 
     code = "wire"
@@ -147,29 +148,29 @@ class WireError(AfspmError):
 
 
 class TransportError(AfspmError):
-    """An address that can't be used, keys that are missing or don't fit."""
+    """An unusable address, or keys that are missing or don't fit."""
 
     code = "transport"
 
 
 class FileError(AfspmError):
-    """A file that can't be read or written, or is not what its name says."""
+    """A file that can't be read or written, or whose content does not match its name."""
 
     code = "file"
 
 
 class RequestError(AfspmError):
-    """Base of what may come of a request to the microscope."""
+    """Base of the errors of a request to the microscope."""
 
     code = "request"
 
 
 class Refused(RequestError):
-    """A request was answered, and the answer is no.
+    """A refusal of a request by the scheduler, a limit or the microscope.
 
     Args:
         response: the number of the ControlResponse.
-        reason: why, in the words of the one who refused.
+        reason: the reason for people, as the refusing process gave it.
     """
 
     code = "refused"
@@ -181,24 +182,24 @@ class Refused(RequestError):
 
 
 class NoResponse(RequestError):
-    """A request was not answered in time: it may or may not have been carried out."""
+    """A request without an answer in time: it may or may not have been carried out."""
 
     code = "no-response"
 
 
 class MeasurementFailed(NoResponse):
-    """A scan or spectrum failed again and again, and nothing explains it: a person has to look."""
+    """A scan or spectrum that failed again and again without a known reason: a person has to look."""
 
     code = "measurement-failed"
 
 
 class ControlLost(RequestError):
-    """Control was taken away and the caller asked not to wait for it."""
+    """Control was taken away, and the caller does not wait for its return."""
 
     code = "control-lost"
 
 
 class ExperimentEnded(AfspmError):
-    """The experiment has ended: nothing more can be asked of the microscope."""
+    """The experiment has ended: the microscope takes no more requests."""
 
     code = "ended"

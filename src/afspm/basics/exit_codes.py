@@ -1,4 +1,4 @@
-"""Exit codes, by which a process tells its supervisor why it ends."""
+"""Exit codes: the reason why a process ends, for its supervisor."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit codes of our processes. Every other code, and every signal, is a crash: restart it."""
+    """Exit codes of afspm's processes. Every other code, and every signal, is a crash that a restart follows."""
 
     DONE = 0
     """Finished on purpose: there is nothing more to do."""
     CRASHED = 1
-    """An exception nobody handled; its traceback is in the log."""
+    """An exception without a handler; its traceback is in the log."""
+    # EX_CONFIG of sysexits.h
     CONFIG = 78
     """The settings can't work: a restart would fail the same way."""
     ENDED = 80
     """The experiment ended (KILL)."""
     OWN_FAULT = 82
-    """An exception of the component's own code, told in `<name>.fault.json`: restart it unless it makes no progress."""
+    """An exception of the component's own code, written to `<name>.fault.json`: restart it while it makes progress."""
     ORPHAN = 81
-    """The parent went away, or asked us to stop by closing our standard input."""
+    """The parent is gone, or closed the standard input of this process to stop it."""

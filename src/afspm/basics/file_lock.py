@@ -1,4 +1,4 @@
-"""Locks on files, as each system has them."""
+"""Locks on files, by flock on POSIX systems and msvcrt on Windows."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from typing import IO
 
 
 def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
-    """Lock a file until it is closed. Raises OSError: another process has it.
+    """Lock a file until it is closed.
 
     Args:
-        wait: for the process that has it (on Windows for ten seconds).
+        shared: several processes may hold the lock (not on Windows).
+        wait: wait until another process releases the lock, on Windows for at most ten seconds.
+
+    Raises:
+        OSError: another process holds the lock.
     """
     if sys.platform == "win32":
         import msvcrt
 
+        # Windows locks bytes from the present position on: the first byte stands for the file
         file.seek(0)
         msvcrt.locking(file.fileno(), msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)
     else:
@@ -27,7 +32,7 @@ def lock(file: IO[bytes], *, shared: bool = False, wait: bool = False) -> None:
 
 @contextmanager
 def locked(file: IO[bytes]) -> Iterator[None]:
-    """Lock a file in the block, which waits for the process that has it, and release it."""
+    """Wait for the lock of a file, hold it in the block, and release it."""
     lock(file, wait=True)
     try:
         yield

@@ -1,4 +1,4 @@
-"""Durations, lengths, times and quantities as text: in logs, terminals, on pages and in reports alike."""
+"""Durations, lengths, times and quantities as text, for logs, terminals, pages and reports."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _LENGTHS = ((1e-3, "mm"), (1e-6, "µm"), (1e-9, "nm"), (1e-12, "pm"))
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration, as exactly as it matters.
+    """Return a duration in units and digits that suit its size.
 
-    >>> [lasting(s) for s in (8.2, 200, 725, 7500, 300_000)]
+    >>> [duration_text(s) for s in (8.2, 200, 725, 7500, 300_000)]
     ['8 s', '3 min 20 s', '12 min', '2 h 05 min', '3 d 11 h']
     """
     whole = max(0, round(seconds))
@@ -37,9 +37,9 @@ def duration_text(seconds: float) -> str:
 
 
 def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
-    """Lengths in the unit that suits the largest of them, as they may be written in an experiment file, too.
+    """Return lengths in the unit that suits the largest, in the notation of experiment files.
 
-    >>> lengths([5e-7, 2.5e-7], " x ")
+    >>> lengths_text([5e-7, 2.5e-7], " x ")
     '500 x 250 nm'
     """
     largest_m = max(map(abs, values_m))
@@ -48,50 +48,50 @@ def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
 
 
 def area_text(size_m: Sequence[float]) -> str:
-    """(width, height) of a region.
+    """Return (width, height) of a region as text.
 
-    >>> area((2e-6, 1e-6))
+    >>> area_text((2e-6, 1e-6))
     '2 x 1 µm'
     """
     return lengths_text(size_m, " x ")
 
 
 def position_text(xy_m: tuple[float, float]) -> str:
-    """(x, y).
+    """Return (x, y) as text.
 
-    >>> place((1.2e-6, -5e-7))
+    >>> position_text((1.2e-6, -5e-7))
     '(1.2, -0.5) µm'
     """
     numbers, unit = lengths_text(xy_m).rsplit(" ", 1)
     return f"({numbers}) {unit}"
 
 
-def typeset(told: str) -> str:
-    """Return what `lengths`, `area` and `place` give, for pages.
+def typeset(text: str) -> str:
+    """Return the text of lengths, areas and positions with typographic signs, for pages.
 
     >>> typeset("2 x 1 µm at (1.2, -0.5) µm")
     '2 × 1 µm at (1.2, −0.5) µm'
     """
-    return told.replace(" x ", " × ").replace("-", "−")
+    return text.replace(" x ", " × ").replace("-", "−")
 
 
 def time_of_day(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
-    """ "22:04:31". Where no zone is given, that of this computer."""
+    """Return a time of day, "22:04:31"; without a zone in the zone of this computer."""
     return f"{_moment(time_ns, zone):{'%H:%M:%S' if seconds else '%H:%M'}}"
 
 
 def day_and_time(time_ns: int, zone: tzinfo | None = None, *, seconds: bool = True) -> str:
-    """ "2026-11-20 22:04:31", in UTC "2026-11-20 22:04:31 UTC"."""
+    """Return a date and time, "2026-11-20 22:04:31", in UTC "2026-11-20 22:04:31 UTC"."""
     return f"{_moment(time_ns, zone):{'%Y-%m-%d %H:%M:%S' if seconds else '%Y-%m-%d %H:%M'}}{_zone(zone)}"
 
 
 def day(time_ns: int, zone: tzinfo | None = None) -> str:
-    """ "2026-11-20"."""
+    """Return a date, "2026-11-20"."""
     return f"{_moment(time_ns, zone):%Y-%m-%d}"
 
 
 def period_text(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
-    """ "2026-11-20 22:04 to 23:10 UTC"; the day of the end where it is another."""
+    """Return a period, "2026-11-20 22:04 to 23:10 UTC", with the date of its end if that is another day."""
     same = day(begin_ns, zone) == day(end_ns, zone)
     until = (
         time_of_day(end_ns, zone, seconds=False) + _zone(zone) if same else day_and_time(end_ns, zone, seconds=False)
@@ -112,10 +112,10 @@ def _moment(time_ns: int, zone: tzinfo | None) -> datetime:
 
 
 def scale(largest: float, unit: str) -> tuple[float, str]:
-    """Return (factor, unit with prefix) in which numbers up to `largest` read well: shown = value * factor."""
+    """Return (factor, unit with prefix) that suit numbers up to `largest`: shown = value * factor."""
     if unit not in PREFIXABLE or not math.isfinite(largest) or largest == 0.0:
         return 1.0, unit
-    # what rounds up to a thousand belongs to the next prefix
+    # a number that rounds up to a thousand, as 999.6 nm in three digits, belongs to the next prefix
     size = abs(largest) * 1.0005
     power, prefix = next(((p, name) for p, name in _PREFIXES if size >= p), _PREFIXES[-1])
     return 1.0 / power, prefix + unit
@@ -130,25 +130,22 @@ def quantity(value: float | None, unit: str, digits: int = 4) -> str:
 
 
 def typeset_position(xy_m: tuple[float, float]) -> str:
-    """Return a position for a page: "(1.2, −0.5) µm"."""
     return typeset(position_text(xy_m))
 
 
 def typeset_area(size_m: Sequence[float]) -> str:
-    """Return a size for a page: "2 × 1 µm"."""
     return typeset(area_text(size_m))
 
 
 def typeset_length(length_m: float) -> str:
-    """Return a length for a page: "200 nm"."""
     return typeset(lengths_text([length_m]))
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit as texts show it: "um/s" as "µm/s"."""
+    """Return a unit for texts: "um/s" as "µm/s"."""
     return f"µ{unit[1:]}" if unit.startswith("um") else unit
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Return (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many` where that is no s more."""
+    """Return a number of things: (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many`: irregular plural."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"

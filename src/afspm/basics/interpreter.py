@@ -1,4 +1,4 @@
-"""The Python that runs afspm, for processes of its own."""
+"""The Python interpreter for processes that afspm starts."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from collections.abc import Mapping
 
 
 def python_command(module: str) -> tuple[str, ...]:
-    """Return the command that runs a module as a process of its own.
+    """Return the command that runs a module as a process.
 
-    Modules are those that are installed, and never what happens to lie in the current folder.
+    With -P only installed modules are found, never a file of the same name in the current folder.
     """
     return (_executable(), "-P", "-m", module)
 
@@ -17,8 +17,8 @@ def python_command(module: str) -> tuple[str, ...]:
 def python_environment() -> Mapping[str, str]:
     """Return the environment variables to add for `python_command`.
 
-    In a virtual environment of Windows `sys.executable` is only a launcher, with another process number, which starts
-    Python itself. That one is started directly, and told by this variable which environment it belongs to.
+    In a virtual environment of Windows `sys.executable` is only a launcher with another process number, which starts
+    the real Python. afspm starts the real Python directly; this variable names its virtual environment.
     """
     return {} if _executable() == sys.executable else {"__PYVENV_LAUNCHER__": sys.executable}
 

@@ -1,12 +1,12 @@
-"""The launch line: one JSON line on standard input from which a process learns its part in an experiment.
+"""The launch line: one JSON line on standard input that gives a process its part in an experiment.
 
 The same line goes to Python components (`python -m afspm.supervisor.host`) and to commands in any other
-language. Standard input then stays open: its end means that the parent is gone or wants us to stop.
+language. Standard input then stays open: its end means that the parent is gone or stops the process.
 
 On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
 for how many seconds the current step has been running (ASCII; 0 when idle), how long a step may take (ASCII), and
-`beat_token`. All but the first are optional. The second and third tell busy from frozen; once the fourth has come,
-nobody else can beat for the process.
+`beat_token`. All but the first are optional. The second and third distinguish a busy process from a frozen one. After
+the first beat with a token, beats without it are ignored: no other process can beat in its place.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from afspm.basics.plain_data import Plain, PlainMapping
 
 @dataclass(frozen=True)
 class Sockets:
-    """The addresses of one process. Absent ones are not used."""
+    """The addresses of one process; None for sockets that it does not use."""
 
     publish: str | None = None
-    """Bound: where we publish."""
+    """Bound: the process publishes here."""
     subscribe: tuple[str, ...] = ()
-    """Connected: the publishers we listen to."""
+    """Connected: publishers that the process subscribes to."""
     serve: str | None = None
-    """Bound: where we answer requests."""
+    """Bound: the process answers requests here."""
     control: str | None = None
-    """Connected: whom we send requests to."""
+    """Connected: the process sends requests here."""
     heartbeat: str | None = None
-    """Connected: where the supervisor listens for our beats."""
+    """Connected: the supervisor listens for heartbeats here."""
 
 
 @dataclass(frozen=True)
@@ -49,49 +49,53 @@ class Launch:
     """Keyword arguments of the constructor."""
     sockets: Sockets = Sockets()
     envelopes: tuple[str, ...] | None = None
-    """Prefixes of the envelopes subscribed to; None: all."""
+    """Prefixes of the envelopes to subscribe to; None: all."""
     clock: PlainMapping = field(default_factory=dict)
     """`ExperimentClock.as_dict()`; empty: real time."""
     problems: Mapping[str, int] = field(default_factory=dict)
     """Problems named in the experiment file."""
     run_dir: str = ""
     state_dir: str = ""
-    """Where to keep what must survive a restart; empty: nothing is kept."""
+    """Folder for state that must survive a restart; empty: nothing is kept."""
     beat_period_s: float = 1.0
     beat_token: str = ""
-    """To be sent with each heartbeat: the supervisor knows by it who beats."""
+    """Sent with each heartbeat: proves to the supervisor which process beats."""
     request_timeout_s: float = 5.0
     request_retries: int = 3
     log_level: str = "INFO"
     keys: PlainMapping | None = None
-    """The own CURVE pair, and whose key to expect where, see `transport.keys.from_launch`; None: no encryption."""
+    """CURVE key pair of the process, and the key owner of each address (`transport.keys.from_launch`); None: plain."""
     messages: tuple[str, ...] = ()
-    """Python modules, or .proto files, with message types of the user."""
+    """Python modules, or .proto files, with the user's message types."""
     run: str = ""
-    """The identity of the run, random; empty: it is not known."""
+    """The random identity of the run; empty: unknown."""
     simulated: bool = False
-    """True only where the microscope is simulated for certain: by its translator itself, or by `controller`."""
+    """True only if the microscope is certainly simulated: by its translator, or by `controller`."""
     controller: str = ""
-    """Of a translator: the name of the emulator of this run that it talks to, and to nobody else; empty: none."""
+    """For a translator: the emulator of this run that is the only controller it connects to; empty: none."""
     sample_coordinates: bool = False
-    """Places are those of the sample, which the scheduler maps to those of the tip."""
+    """Positions are sample coordinates, which the scheduler maps to tip coordinates."""
     retracts: bool = False
-    """Of a translator: it retracts the tip when its standard input ends and a request of the run has switched the
-    feedback off."""
+    """For a translator: retract the tip when standard input ends while a request of the run has switched the feedback
+    off."""
     adjustable: tuple[str, ...] = ()
-    """Of a translator: parameters that are set during a scan, too."""
+    """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()
-    """Of a scheduler: the problems that components of the run solve."""
+    """For a scheduler: the problems that components of the run solve."""
 
     def to_json(self) -> str:
-        """Return one line, without the newline at its end."""
+        """Return one line of JSON, without a newline at its end."""
         plain = dataclasses.asdict(self)
         plain["class"] = plain.pop("class_")
         return json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Launch:
-        """Read what `to_json` wrote. Raises ConfigError naming what is wrong."""
+        """Return the launch line in a line of JSON.
+
+        Raises:
+            ConfigError: the line is not JSON, or an entry is unknown or of the wrong type.
+        """
         try:
             plain = json.loads(line)
         except ValueError as error:
@@ -109,6 +113,7 @@ class Launch:
         return cls(**values, sockets=Sockets(**_fields(Sockets, sockets, "launch line, sockets")))
 
 
+# JSON has one type of number, and 1.0 may be written as 1
 _JSON_TYPES: Mapping[str, tuple[type, ...]] = {
     "str": (str,),
     "str | None": (str, NoneType),
@@ -121,11 +126,10 @@ _JSON_TYPES: Mapping[str, tuple[type, ...]] = {
     "tuple[str, ...]": (list,),
     "tuple[str, ...] | None": (list, NoneType),
 }
-"""By the annotation of a field."""
+"""JSON types by the annotation of a field."""
 
 
 def _fields(cls: type[Launch | Sockets], plain: object, where: str) -> Plain:
-    """Return the values of `plain` as arguments of the dataclass `cls`, each of the JSON type that belongs there."""
     if not isinstance(plain, dict):
         raise ConfigError(f"expected a JSON object, got {type(plain).__name__}", where=where)
     if cls is Launch and not plain.get("name"):
@@ -138,6 +142,7 @@ def _fields(cls: type[Launch | Sockets], plain: object, where: str) -> Plain:
 
 
 def _checked(key: str, value: object, kind: str, where: str) -> object:
+    # a bool is an int in Python
     fits = isinstance(value, _JSON_TYPES[kind]) and (kind == "bool" or not isinstance(value, bool))
     if isinstance(value, int | float):
         fits = fits and value >= 0

@@ -1,4 +1,4 @@
-"""Faults of a component's own code, which a restart meets again."""
+"""Faults of a component's own code, which come again after a restart."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class OwnFault:
-    """The end of a component by an error of its own code.
+    """An error of a component's own code that ended the component.
 
-    A restart begins with what the component keeps: its memory and its keyed measurements. A life that leaves this as it
-    was has made no progress. Two equal faults in a row are therefore one that a restart repeats, with all that the
-    component does to the microscope before it.
+    A restart begins with the component's memory and keyed measurements. If a life ends with both unchanged, it has made
+    no progress. So two equal faults in a row will come again after every restart, with every request to the microscope
+    before them.
 
     Attributes:
         error: the type of the exception; its text may differ from life to life.
         place: file and line in the component's code.
-        kept: a checksum of what is kept.
+        kept: a checksum of memory and keyed measurements.
     """
 
     error: str

@@ -1,4 +1,4 @@
-"""Types of plain data: what JSON and TOML hold. The data say what is in them, so a reader checks each value."""
+"""Types of plain data, as in JSON and TOML: a reader must check the type of each value."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
 
 Plain: TypeAlias = dict[str, Any]
-"""A table, to fill."""
+"""A table that may be changed."""
 PlainMapping: TypeAlias = Mapping[str, Any]
-"""A table, to read."""
+"""A read-only table."""
 
 
 class _Strict:
-    """Marks a bool of the settings: pydantic reads "yes" and 1 as true, too, a file has true alone."""
+    """Mark of a boolean setting: without it pydantic accepts "yes" and 1 as true; an experiment file must say true."""
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
         from pydantic_core import core_schema
@@ -26,7 +26,7 @@ class _Strict:
 
 @dataclass(frozen=True)
 class _AtLeast:
-    """Marks an int of the settings: a whole number, not below `least`."""
+    """Mark of an integer setting: a whole number, not below `least`."""
 
     least: int
 
@@ -42,7 +42,7 @@ Count = Annotated[int, _AtLeast(1)]
 
 
 def file_key(name: str) -> str:
-    """Return the key in the experiment file of a setting, which is its name without its unit.
+    """Return the key of a setting in the experiment file: its name without the unit.
 
     >>> file_key("lease_s"), file_key("above_m"), file_key("idle")
     ('lease', 'above', 'idle')
@@ -51,4 +51,4 @@ def file_key(name: str) -> str:
 
 
 SECTION: Plain = {"extra": "forbid", "alias_generator": file_key}
-"""For `__pydantic_config__` of a dataclass that describes a table of the experiment file."""
+"""Value of `__pydantic_config__` for a dataclass that describes a table of the experiment file."""

@@ -1,9 +1,9 @@
-"""Packages that a class needs beyond a plain install of afspm: named in its attribute `requires`, as for `pip install`.
+"""Packages that a class needs beyond a plain install of afspm, in its attribute `requires`, as for `pip install`.
 
     class Ridges(Component):
         requires = ("afspm[features]", "torch>=2.4")
 
-What is missing is found before anything starts, and by `afspm check`.
+`afspm check` and `afspm run` report missing packages before anything starts.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ ATTRIBUTE = "requires"
 
 
 def require(class_: object) -> None:
-    """Check that what a class requires is installed.
+    """Check that the packages a class requires are installed.
 
     Raises:
-        ConfigError: a package is missing, or is of another version; the hint is the command that installs it.
+        ConfigError: a package is missing, or has another version; the hint is the command that installs it.
     """
     wanted = getattr(class_, ATTRIBUTE, ())
     require_installed(getattr(class_, "__name__", str(class_)), *((wanted,) if isinstance(wanted, str) else wanted))
 
 
 def require_installed(what: str, *requirements: str) -> None:
-    """Check that `what` has the packages that it requires. Raises as `require` does."""
+    """Check that the packages `what` requires are installed. Raises ConfigError as `require` does."""
     lacking = {one: missing for one in requirements if (missing := list(_missing(one)))}
     if lacking:
         packages = ", ".join(dict.fromkeys(package for missing in lacking.values() for package in missing))
         command = "pip install " + " ".join(f'"{one}"' for one in lacking)
-        raise ConfigError(f"{what} needs what is not installed: {packages}", hint=command)
+        raise ConfigError(f"{what} needs packages that are not installed: {packages}", hint=command)
 
 
 def _missing(requirement: str) -> Iterator[str]:
-    """Yield the packages that a requirement lacks, those of its extras too."""
+    # packages of extras too: metadata lists them as requirements with a marker
     from packaging.requirements import InvalidRequirement, Requirement  # imported late: few classes require anything
 
     try:

@@ -36,13 +36,14 @@ _BASES = {
     "Ohm": "ohm",
     "ohm": "ohm",
 }
+# fractions are exact: a ratio of two units has no rounding error
 _NANO, _MICRO = Fraction(1, 10**9), Fraction(1, 10**6)
 _DEGREE = Fraction(math.pi) / 180
 _SPECIAL: dict[str, tuple[str, Fraction]] = {
     "": ("", Fraction(1)),
     "1": ("", Fraction(1)),
     "%": ("", Fraction(1, 100)),
-    **dict.fromkeys(("Å", "\u212b", "angstrom"), ("m", Fraction(1, 10**10))),  # the letter, and the sign of its own
+    **dict.fromkeys(("Å", "\u212b", "angstrom"), ("m", Fraction(1, 10**10))),  # the letter Å and the ångström sign
     **dict.fromkeys(("min", "minute", "minutes"), ("s", Fraction(60))),
     **dict.fromkeys(("h", "hour", "hours"), ("s", Fraction(3600))),
     **dict.fromkeys(("d", "day", "days"), ("s", Fraction(86400))),
@@ -60,9 +61,9 @@ class Dimension:
     """A kind of quantity.
 
     Attributes:
-        name: of one quantity, with its article.
+        name: name of a quantity of this kind, with its article.
         example: a quantity as people write it.
-        largest_plain: the largest number without a unit that is accepted, in SI.
+        largest_plain: the largest number accepted without a unit, in SI.
     """
 
     name: str
@@ -71,7 +72,7 @@ class Dimension:
 
     @property
     def hint(self) -> str:
-        """Return an example to write, for an error."""
+        """Return a hint with an example, for an error."""
         return f'{self.name}, for example "{self.example}"'
 
 
@@ -85,18 +86,18 @@ DIMENSIONS: Final[Mapping[str, Dimension]] = {
     "s": Dimension("a time", "15 min"),
     "Hz": Dimension("a frequency", "2 kHz"),
 }
-"""By SI unit. A plain number is in SI, and a person who writes 400 for a length meant nanometres, not metres."""
+"""By SI unit. A plain number means SI: with the bounds, 400 for a length is refused, not taken as 400 m."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Marks a float of a component's settings: the experiment file may give it as text with any unit of this kind.
+    """Mark of a float setting: the experiment file may give it as text with any unit of this kind.
 
     Attributes:
         si: the SI unit that the component gets, e.g. "m".
-        is_written: whether the file has to write a unit, where a plain number could mean several (seconds, minutes).
-        least: the smallest value, in that unit.
-        above: each value is above it.
+        is_written: the file must write a unit, since a plain number could mean several (seconds, minutes).
+        least: the smallest value, in the SI unit.
+        above: exclusive lower bound of the values.
     """
 
     si: str
@@ -105,16 +106,16 @@ class Unit:
     above: float = -math.inf
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
-        """Makes pydantic read the text too. Called by it alone, so that we need not load it here."""
+        """Have pydantic read text with a unit. Only pydantic calls it, so pydantic is not loaded here."""
         from pydantic_core import core_schema
 
         return core_schema.no_info_before_validator_function(self.read, handler(source))
 
     def read(self, value: object) -> float:
-        """Return a quantity of the experiment file in this SI unit; a plain number is in it already.
+        """Return a quantity of the experiment file in the SI unit; a plain number is taken as SI.
 
         Raises:
-            UnitError: not a finite number, an unknown unit, one of another kind, or none where there should be one.
+            UnitError: not a finite number, an unknown unit, a unit of another kind, or a required unit is missing.
         """
         if isinstance(value, bool) or not isinstance(value, str | float | int):
             raise UnitError(f"{value!r} is not a quantity", hint=_hint(self.si))
@@ -136,7 +137,7 @@ PositiveDuration = Annotated[float, Unit("s", above=0.0)]
 Period = Annotated[float, Unit("s", is_written=True, least=0.0)]
 """A duration on which a night depends: 10 may mean seconds or minutes, so the file names the unit."""
 PollPeriod = Annotated[float, Unit("s", least=1e-3)]
-"""The time between two looks at a controller: without any, a process does nothing else."""
+"""The time between two polls of a controller: with none, the process would do nothing else."""
 Angle = Annotated[float, Unit("rad")]
 Voltage = Annotated[float, Unit("V")]
 Current = Annotated[float, Unit("A")]
@@ -145,7 +146,7 @@ Frequency = Annotated[float, Unit("Hz")]
 
 
 def convert(value: Number, unit_from: str, unit_to: str) -> Number:
-    """`value` (a float or an array) from one unit to another.
+    """Convert `value` (a float or an array) from one unit to another.
 
     Raises:
         UnitError: a unit is unknown, or the two are of different kinds.
@@ -153,7 +154,7 @@ def convert(value: Number, unit_from: str, unit_to: str) -> Number:
     if unit_from == unit_to:
         return value
     ratio = _ratio(unit_from, unit_to)
-    # a power of ten below one is no exact float, its inverse is: 1500 nm become 1.5e-06 m to the last bit
+    # divide by 10**9, which is an exact float, and don't multiply by 1e-9: 1500 nm become 1.5e-06 m to the last bit
     if ratio.numerator == 1:
         return value / float(ratio.denominator)
     return value * float(ratio)
@@ -163,15 +164,15 @@ _QUANTITY = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:n
 
 
 def parse_quantity(text: str) -> tuple[float, str]:
-    """ "2.5 um" -> (2.5, "um"); the unit may be missing.
+    """Return number and unit of a text, "2.5 um" as (2.5, "um"); the unit may be missing.
 
     Raises:
-        UnitError: it does not begin with a number.
+        UnitError: the text does not begin with a number.
     """
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise UnitError(f"{text!r} is not a number with a unit", hint='write it as "2.5 um"')
-    if match[2].startswith(","):  # else 1,5 um would be one of the unit ",5 um"
+    if match[2].startswith(","):  # else "1,5 um" would be read as 1 with the unit ",5 um"
         raise UnitError(f"{text!r} has a comma: numbers have a decimal point", hint='write it as "2.5 um"')
     return float(match[1]), match[2]
 
@@ -180,7 +181,7 @@ def si(value: str | float, unit: str) -> float:
     """Return a quantity as text ("2.5 um") or a plain number (SI already) as a float in the SI unit `unit`.
 
     Raises:
-        UnitError: not a number, an unknown unit, one of another kind than `unit`, or none where there should be one.
+        UnitError: not a number, an unknown unit, a unit of another kind than `unit`, or a required unit is missing.
     """
     if isinstance(value, bool):
         raise UnitError(f"{value} is not a number in {unit}")
@@ -195,10 +196,10 @@ def si(value: str | float, unit: str) -> float:
 
 
 def si_or_text(value: float | str, unit: str) -> float:
-    """Return a number, which is in the SI unit `unit`, or a quantity as text, which must name its unit.
+    """Return a number, taken in the SI unit `unit`, or a text with a unit, as a float in `unit`.
 
     Raises:
-        UnitError: text without a unit, or one that is not understood.
+        UnitError: text without a unit, or with an unknown unit.
         TypeError, ValueError: neither a number nor text.
     """
     if not isinstance(value, str):
@@ -209,10 +210,10 @@ def si_or_text(value: float | str, unit: str) -> float:
 
 
 def require_unit(number: float, unit: str) -> None:
-    """Refuse a number given without a unit if it is too large in `unit` to be meant so.
+    """Refuse a number without a unit that is implausibly large in `unit`.
 
     Raises:
-        UnitError: it is above `Dimension.largest_plain`.
+        UnitError: the number is above `Dimension.largest_plain`.
     """
     dimension = DIMENSIONS.get(unit)
     if dimension is not None and dimension.largest_plain < abs(number) < math.inf:
@@ -224,7 +225,7 @@ def si_unit(unit: str) -> str:
     """Return the SI unit of the same kind: "nm" -> "m", "um/s" -> "m/s", "deg" -> "rad".
 
     Raises:
-        UnitError: an unknown unit.
+        UnitError: the unit is unknown.
     """
     return _base_and_factor(unit)[0]
 
@@ -256,7 +257,7 @@ def _hint(si_unit: str) -> str:
 
 @lru_cache(maxsize=1000)
 def _base_and_factor(unit: str) -> tuple[str, Fraction]:
-    """Return a unit as its kind, written in base units, and the factor to them."""
+    # the kind of a unit, written in base units, and the factor to them
     unit = unit.strip()
     simple = _simple(unit)
     if simple is not None:
@@ -279,6 +280,7 @@ def _simple(unit: str) -> tuple[str, Fraction] | None:
     return None
 
 
+# pint's names of base units
 _SI_NAMES = {
     "meter": "m",
     "second": "s",
@@ -305,6 +307,6 @@ def _by_pint(unit: str) -> tuple[str, Fraction]:
         base, factor = f"{one.units}", Fraction(float(one.magnitude))
     except Exception as error:  # pint raises many kinds, even plain AttributeError and TokenError
         raise UnitError(f"{unit!r} is not a unit", hint="e.g. nm, um, mV, nA, deg, nm/s") from error
-    if none.magnitude != 0.0:  # degrees Celsius, decibels: 20 of them are not twenty times one
+    if none.magnitude != 0.0:  # units with an offset (degrees Celsius, decibels) have no factor to SI
         raise UnitError(f"{unit!r} does not count from zero, and is not converted here", hint=f"give it in {base}")
     return _SI_NAMES.get(base, base), factor

@@ -1,4 +1,4 @@
-"""Packets that wait to be handled: in order, none lost, in bounded memory however long a handler takes."""
+"""Packets that wait for their handler: in order, none lost, in bounded memory however long a handler takes."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MEMORY_LIMIT_BYTES = 256 << 20
 
 
 class PacketBacklog:
-    """A queue of packets. Those beyond `limit_bytes` wait in a temporary file, which goes when it is empty."""
+    """A queue of packets; beyond `limit_bytes` they wait in a temporary file, which is removed when it is empty."""
 
     def __init__(self, limit_bytes: int = MEMORY_LIMIT_BYTES) -> None:
         self._limit_bytes = limit_bytes
@@ -29,7 +29,7 @@ class PacketBacklog:
 
     def put(self, packet: Packet) -> None:
         size = len(packet.payload)
-        # once some wait on disk all later ones must too, or they would overtake
+        # while packets wait on disk, later ones must too, or they would overtake them
         if self._file is None and (not self._memory or self._memory_bytes + size <= self._limit_bytes):
             self._memory.append(packet)
             self._memory_bytes += size
@@ -42,7 +42,6 @@ class PacketBacklog:
         self._on_disk += 1
 
     def take(self) -> Packet | None:
-        """Return the oldest packet; None if there is none."""
         if self._memory:
             packet = self._memory.popleft()
             self._memory_bytes -= len(packet.payload)
@@ -60,7 +59,7 @@ class PacketBacklog:
         return entry.packet
 
     def close(self) -> None:
-        """Drop everything."""
+        """Drop all packets."""
         self._memory.clear()
         self._memory_bytes = self._on_disk = self._read_at = 0
         if self._file is not None:

@@ -1,4 +1,4 @@
-"""Commands to the microscope, repeated with the same id until they are answered, and refused loudly."""
+"""Commands to the microscope, repeated with the same id until they are answered; refusals become errors."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from afspm.model import (
     request_name,
 )
 
-PATIENCE_S = 60.0  # real time that a translator may take to be there again
-RETRY_S = 1.0  # before an unreachable one is asked again, when nothing is published in between
-STATE_WITHIN_S = 5.0  # before a warning that the microscope has published no state
-CONNECTED_WITHIN_S = 5.0  # before a warning that the scheduler has no connection to the translator (yet)
-SETTLED_WITHIN_S = 2.0  # what was set is published, if it changed anything
-ASK_FREE_AGAIN_S = 5.0  # should the state FREE never reach us
-ASK_BUSY_AGAIN_S = 25.0  # the same where another state than FREE was published
+PATIENCE_S = 60.0  # real time for the restart of a translator
+RETRY_S = 1.0  # before a repetition, unless a state is published earlier
+STATE_WITHIN_S = 5.0  # before the warning that the microscope has published no state
+CONNECTED_WITHIN_S = 5.0  # before the warning that the scheduler has no connection to the translator (yet)
+SETTLED_WITHIN_S = 2.0  # for the publication of a setting; without a change there is none
+ASK_FREE_AGAIN_S = 5.0  # in case the state FREE was lost
+ASK_BUSY_AGAIN_S = 25.0  # the same after another state than FREE
 
 _ASKED_FOR: dict[int, str] = {
     ControlRequest.ACTION: "the action",
@@ -40,29 +40,30 @@ _ASKED_FOR: dict[int, str] = {
     RELAY_REQUEST: "the note",
 }
 _NO_STATE = (
-    "waiting for the microscope, which has published no state yet: is its translator running? If it never publishes "
-    "what is in force when a scheduler connects: restart it, or scan once by hand"
+    "waiting for the microscope, which has published no state yet: is its translator running? If it does not "
+    "publish its state when a scheduler connects: restart it, or scan once by hand"
 )
 NOT_IN_CONTROL = {ControlResponse.NOT_IN_CONTROL, ControlResponse.WRONG_CONTROL_MODE}
 
 
 class CommandRetry:
-    """Asks the microscope for something, through the scheduler, in control."""
+    """A sender of commands, through the scheduler, while the component is in control."""
 
     def __init__(self, link: ExperimentLink, control: ControlHold) -> None:
         self._link = link
         self._control = control
 
     def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
-        """Ask for a command until it succeeds. Control must be held around it; where it is lost it is waited for.
+        """Send a command until it succeeds, inside a block with control; wait for control if it is lost.
 
-        Not so in an unbroken block: what comes in the tenure after may find the microscope otherwise.
+        In an unbroken block, lost control is an error instead: others may have changed the microscope meanwhile.
 
         Raises:
-            Refused: the microscope, or a limit, says no.
+            Refused: the microscope or a limit refuses.
             NoResponse: the microscope stays silent, or is not free until `until_s`; or, in an unbroken block, control
                 was lost before an action was answered.
-            ControlLost: control was not back until `until_s`; or, in an unbroken block, was lost, and no action done.
+            ControlLost: control was not back until `until_s`; or, in an unbroken block, was lost, and no action was
+                carried out.
         """
         request_id = self._link.next_id()
         while True:
@@ -72,15 +73,19 @@ class CommandRetry:
                 response = self.send(kind, subject, request_id=request_id, until_s=until_s)
             except KeyboardInterrupt:
                 if kind == ControlRequest.ACTION:
-                    told = "interrupted before the answer: the microscope may have carried out %s"
-                    self._link.log.warning(told, subject)
+                    text = "interrupted before the answer: the microscope may have carried out %s"
+                    self._link.log.warning(text, subject)
                 raise
             if response.ok:
                 return response
-            if response.code != ControlResponse.NO_RESPONSE:  # else it may have been carried out: the same id again
+            if (
+                response.code != ControlResponse.NO_RESPONSE
+            ):  # after NO_RESPONSE it may have been carried out: keep the id
                 self.get_over(kind, response, states, until_s)
                 request_id = self._link.next_id()
-            elif kind == ControlRequest.ACTION and self._control.is_unbroken:  # what is set is set anew
+            elif (
+                kind == ControlRequest.ACTION and self._control.is_unbroken
+            ):  # settings may be repeated, actions may not
                 raise NoResponse(
                     f"control was lost before the action was answered: {self._control.why_lost}",
                     where=self._link.name,
@@ -88,12 +93,12 @@ class CommandRetry:
                 )
 
     def in_control(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
-        """`ask`, with control held around it."""
+        """Take control, and send a command until it succeeds."""
         with self._control.hold(until_s=until_s):
             return self.ask(kind, subject, until_s=until_s)
 
     def read(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
-        """Ask for a reading; where the scheduler gives it to the holder of control alone, take control around it."""
+        """Send a reading request; take control for it if only the holder may read."""
         response = self.send(kind, subject, until_s=until_s)
         if response.code != ControlResponse.NOT_IN_CONTROL:
             return response
@@ -101,9 +106,9 @@ class CommandRetry:
             return self.send(kind, subject, until_s=until_s)
 
     def set(self, kind: ControlRequest, wanted: object, message: str, until_s: float | None) -> None:
-        """Ask for a setting, and wait until its `message` is published and the tip has stopped moving.
+        """Send a setting, and wait until its `message` is published and the tip has stopped moving.
 
-        A microscope that publishes nothing, since nothing changed, is not waited for long.
+        The wait is short for a microscope that publishes nothing, since nothing changed.
         """
         link, view = self._link, self._link.view
         count = view.count(message)
@@ -120,26 +125,28 @@ class CommandRetry:
         until_s: float | None = None,
         is_seen: Callable[[], bool] = lambda: False,
     ) -> Response:
-        """Ask once, with patience for a microscope that is silent: the same id has it executed once.
+        """Send a request, and repeat it with its id, so that it is executed once, while the microscope is silent.
 
         Args:
-            is_seen: returns whether what was asked for is seen to happen, which is as good as an answer.
+            is_seen: returns whether the effect of the request is seen, which counts as an answer.
 
         Returns:
-            The answer; NO_RESPONSE only if control was lost before there was any.
+            The answer; NO_RESPONSE only if control was lost before any answer.
 
         Raises:
-            NoResponse: it stays silent.
+            NoResponse: the microscope stays silent.
         """
         link = self._link
         request_id = request_id or link.next_id()
         give_up_s = link.earlier(PATIENCE_S, until_s)
-        is_repeated = is_told = False
+        is_repeated = has_warned = False
         self._wait_for_state(give_up_s)
         late_s = link.earlier(CONNECTED_WITHIN_S, give_up_s)
         while True:
             response = link.request(kind, subject, request_id=request_id, until_s=until_s)
-            if is_repeated and response.code in NOT_IN_CONTROL:  # now; whether it was done before is still unknown
+            if (
+                is_repeated and response.code in NOT_IN_CONTROL
+            ):  # refused now; an earlier repetition may have been executed
                 self._control.lost(response.reason)
                 return Response(ControlResponse.NO_RESPONSE, reason=response.reason, id=request_id)
             if response.code != ControlResponse.NO_RESPONSE or self._control.was_lost:
@@ -150,23 +157,25 @@ class CommandRetry:
                 raise NoResponse(
                     f"the microscope does not answer {kind.name}: {response.reason or 'no reason given'}",
                     where=link.name,
-                    hint="is its translator running? it may or may not have been carried out",
+                    hint="is its translator running? the request may or may not have been carried out",
                 )
-            if not is_told and (response.detail is not ResponseDetail.NOT_SENT or link.clock.monotonic_s() >= late_s):
+            if not has_warned and (
+                response.detail is not ResponseDetail.NOT_SENT or link.clock.monotonic_s() >= late_s
+            ):
                 why = response.reason or "no reason given"
                 link.log.warning("the microscope does not answer %s (%s); asking again", kind.name, why)
-                is_told = True
+                has_warned = True
             is_repeated = True
             self._wait_for_news(link.earlier(RETRY_S, give_up_s))
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
-        """After a response that is no success: wait for what stands in the way, or raise Refused.
+        """Wait for the obstacle that a failed response names, or raise Refused.
 
         Args:
-            states: how many states had been published before it was asked.
+            states: number of states published before the request.
         """
         if response.code == ControlResponse.NO_RESPONSE:
-            return  # control is lost, and waited for when it is asked again
+            return  # control was lost: the caller regains it before the next attempt
         if response.code in NOT_IN_CONTROL:
             self._control.lost(response.reason)
         elif response.code == ControlResponse.NOT_FREE:
@@ -175,7 +184,7 @@ class CommandRetry:
             raise refused(kind, response, self._link.name)
 
     def _wait_for_state(self, give_up_s: float) -> None:
-        """Wait for the first state: a microscope that has not said a word yet is still starting, and would refuse."""
+        # a microscope without a published state is still starting, and would refuse
         link = self._link
         link.wait(lambda: link.view.status is not None, link.earlier(STATE_WITHIN_S, give_up_s))
         if link.view.status is None:
@@ -183,7 +192,7 @@ class CommandRetry:
             link.wait(lambda: link.view.status is not None, give_up_s)
 
     def _wait_free(self, states: int, until_s: float | None) -> None:
-        """Wait until the microscope says that it is free, later than `states`; not for ever, should that get lost."""
+        # a state later than `states`; with a time limit, in case the state FREE is lost
         link, view = self._link, self._link.view
 
         def is_free() -> bool:
@@ -196,7 +205,6 @@ class CommandRetry:
             raise NoResponse(f"the microscope was not free in time: it is {view.state.name}", where=link.name)
 
     def _wait_for_news(self, until_s: float) -> None:
-        """Wait until the microscope says anything or control changes."""
         view = self._link.view
 
         def counts() -> tuple[int, int]:
@@ -207,7 +215,7 @@ class CommandRetry:
 
 
 def refused(kind: int, response: Response, where: str) -> Refused:
-    """Return a response as the error that it is."""
+    """Return a refusal as an error."""
     known = response.code in ControlResponse._value2member_map_
     code = ControlResponse(response.code).name if known else str(response.code)
     what = _ASKED_FOR.get(kind, request_name(kind))

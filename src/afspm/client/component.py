@@ -1,4 +1,4 @@
-"""`Component`: the class that a scientist derives from, with a handler for each kind of message."""
+"""`Component`: the base class of a scientist's component, with a handler for each kind of message."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 
 class Component:
-    """One part of an experiment, in a process of its own.
+    """One part of an experiment, in its own process.
 
     Write the handlers you need, and `__init__` with the settings of the experiment file as keyword arguments
-    (`super().__init__()` need not be called)::
+    (`super().__init__()` is not needed)::
 
         class Sharpness(Component):
             def __init__(self, threshold: float = 0.5):
@@ -45,46 +45,45 @@ class Component:
                 for i, region in enumerate(self.regions):
                     scans = self.scope.scan(region, shape=(256, 256), key=f"tile-{i}")
 
-    Everything happens on one thread, one handler at a time. A handler that raises ends the process; the supervisor
-    starts it again and the scheduler sends it what it has cached.
+    Everything runs on one thread, one handler at a time. An exception in a handler ends the process; the supervisor
+    restarts it, and the scheduler sends it the cached packets.
 
-    The attributes below are given before `on_start`; they are not there yet in `__init__`.
+    The attributes below exist from `on_start` on, not yet in `__init__`.
 
     Attributes:
-        scope: to ask for things: scans, parameters, control.
-        clock: the time in the experiment. Never use `time.time()`.
+        scope: the handle for scans, parameters and control.
+        clock: the experiment's clock. Never use `time.time()`.
         log: a `logging.Logger`.
-        name: of this component in the experiment file.
-        memory: a dict kept on disk, written when a handler has returned (in `run`: by its `save`): it is there again
-            after a restart.
-        run_dir: the folder of this run.
-        simulated: whether the microscope is a simulated one; say so in what you write.
-        packet: the packet that is being handled (its envelope, its time), None between handlers.
-        longest_step_s: how long a handler may take in real seconds before the process counts as frozen and is
-            killed. Waiting inside `scope` does not count.
-        period_s: how often `on_tick` is called; None: never.
+        name: name of this component in the experiment file.
+        memory: a dict on disk, saved after each handler (in `run`: by its `save`) and restored after a restart.
+        run_dir: folder of this run.
+        simulated: whether the microscope is simulated; state it in your output.
+        packet: the packet being handled (its envelope, its time), None between handlers.
+        longest_step_s: longest allowed handler in real seconds; after it the process counts as frozen and is killed.
+            Waiting inside `scope` does not count.
+        period_s: period of `on_tick`; None: no ticks.
         period_time: whether that is experiment time or real time.
     """
 
     solves: ClassVar[tuple[str, ...]] = ()
-    """Problems that it puts right."""
+    """Problems that the component solves."""
     flags: ClassVar[tuple[str, ...]] = ()
-    """Problems that it may flag; the experiment file must have somebody who solves each."""
+    """Problems that the component may flag; the experiment file must have a component that solves each."""
     publishes: ClassVar[tuple[str, ...]] = ()
-    """Envelopes that it publishes itself: it then gets an address to do so."""
+    """Envelopes that the component publishes itself; with any, it gets an address to publish on."""
     listens: ClassVar[tuple[str, ...] | None] = None
-    """Envelopes, or how they begin, that it subscribes to where the experiment file doesn't say. None: all but what is
-    told of processes, requests and logs; `("",)`: that too."""
+    """Prefixes of the envelopes to subscribe to, unless the experiment file gives them. None: all except messages about
+    processes, requests and logs; `("",)`: really all."""
     operates: ClassVar[bool] = False
-    """A person commands the microscope by it in MANUAL mode, where the experiment file names nobody else."""
+    """In MANUAL mode a person uses the microscope through this component, unless the experiment file names another."""
     has_people: ClassVar[bool] = False
-    """It acts for persons, whose passwords are in its setting `people`."""
+    """The component acts for people, whose passwords are in its setting `people`."""
     requires: ClassVar[tuple[str, ...]] = ()
-    """Packages that it needs beside a plain install of afspm, as for `pip install`: `("scikit-learn>=1.4",)`."""
+    """Packages needed beside a plain install of afspm, in the notation of `pip install`: `("scikit-learn>=1.4",)`."""
     needs_actions: tuple[str, ...] = ()
     """Actions that the microscope must have."""
     needs_parameters: tuple[str, ...] = ()
-    """Parameters that the microscope must have. `afspm check` looks; a ready-made one may say so by its settings."""
+    """Parameters that the microscope must have, for `afspm check`; they may depend on the settings of an instance."""
 
     longest_step_s: ClassVar[float] = 30.0
     period_s: float | None = None
@@ -101,62 +100,62 @@ class Component:
     _publish: Callable[[Any, str | None], None]
 
     def run(self) -> None:
-        """The experiment as a script; when it returns, the component is done. Not to be combined with ticks."""
+        """Run the experiment as a script; at its return the component is done. It excludes ticks."""
 
     def on_start(self) -> None:
-        """Before anything else; all attributes are there."""
+        """Start; all attributes exist, and no other handler was called."""
 
     def on_scan(self, scan: Scan) -> None:
-        """One channel of a scan was measured."""
+        """Handle one measured channel of a scan."""
 
     def on_spectrum(self, spectrum: Spectrum) -> None:
-        """A spectrum was measured."""
+        """Handle a measured spectrum."""
 
     def on_state(self, status: ScopeStatus) -> None:
-        """The microscope does something else now."""
+        """Handle a new state of the microscope."""
 
     def on_control(self, control_state: ControlState) -> None:
-        """Mode, holder or problems have changed."""
+        """Handle a change of mode, holder or problems."""
 
     def on_problem(self, problem: str, flagged: bool) -> None:
-        """A problem was flagged (True) or removed (False). At the start, for each that is flagged already.
+        """Handle a flagged (True) or removed (False) problem; at the start, each problem that is already flagged.
 
-        `problem` is its name, such as "tip-shape-changed", or one named in the experiment file.
+        `problem` is its name, such as "tip-shape-changed", or a name of the experiment file.
         """
 
     def on_scan_parameters(self, parameters: ScanParameters) -> None:
-        """Where and how the next scan will be taken has changed."""
+        """Handle a new region or shape of the next scan."""
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """The z feedback was set."""
+        """Handle a new setting of the z feedback."""
 
     def on_probe_position(self, position: ProbePosition) -> None:
-        """The probe was moved."""
+        """Handle a new position of the probe."""
 
     def on_message(self, envelope: str, message: Any) -> None:
-        """Any other message, for which there is no handler by its name.
+        """Handle any other message, without a handler of its own name.
 
-        A method `on_peak_list(self, message)` gets the messages of a type `PeakList` of your own.
+        A method `on_peak_list(self, message)` handles the messages of your type `PeakList`.
         """
 
     def on_tick(self) -> None:
-        """Called every `period_s`. A tick that was missed in a long step is not made up for."""
+        """Run every `period_s`. Ticks missed during a long step are skipped."""
 
     def on_end(self) -> None:
-        """The last call: the experiment ended, we were asked to stop, or `run` has returned."""
+        """Finish: the experiment has ended, the process is being stopped, or `run` has returned."""
 
     def publish(self, message: Any, envelope: str | None = None) -> None:
         """Publish an object of `afspm.model` or a message of your own type.
 
         Args:
-            envelope: how others subscribe to it; the name of the message by default.
+            envelope: topic for subscribers; the name of the message by default.
 
         Raises:
             ConfigError: the component has no address to publish on.
         """
         self._publish(message, envelope)
 
-    if not TYPE_CHECKING:  # for the type checker the annotations above are all there is
+    if not TYPE_CHECKING:  # hidden from type checkers, which should see only the annotated attributes
 
         def __getattr__(self, name: str) -> Any:
             if name in Component.__annotations__:
@@ -166,7 +165,7 @@ class Component:
             raise AttributeError(f"{type(self).__name__!r} has no attribute {name!r}")
 
     def run_process(self, context: ProcessContext) -> int:
-        """Called by the host; see `afspm.transport.process.context.ExperimentProcess`."""
+        """Run the component; the host calls this, see `afspm.transport.process.context.ExperimentProcess`."""
         from afspm.client.loop import ComponentLoop
 
         return ComponentLoop(self, Component, context).run()

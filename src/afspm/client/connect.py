@@ -1,4 +1,4 @@
-"""`afspm.connect`: a script or notebook joins an experiment that is running."""
+"""`afspm.connect`: a script or notebook joins a running experiment."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ from afspm.wire.message_types import register_all
 
 GUEST = "guest"
 GUEST_KEYS = "guest.keys"
-"""The file beside what the run keeps with the keys of those who join it; see `supervisor.key_ring`."""
+"""The file with the keys of guests, beside the state folder of the run; see `supervisor.key_ring`."""
 JOINED_WITHIN_S = 5.0
-HEARD_WITHIN_S = 30.0  # what is cached may be many large scans
+HEARD_WITHIN_S = 30.0  # the cache may hold many large scans
 
 
 def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Sequence[str] = ()) -> Scope:
-    """Join a running experiment; what is returned can be used like `self.scope` in a component.
+    """Join a running experiment; use the returned scope like `self.scope` in a component.
 
         with afspm.connect("runs/my_experiment-20261120-040000") as scope:
             scope.scan(afspm.Region((0, 0), (2e-6, 2e-6)))
 
     Args:
-        where: the folder of the run, the folder of all runs (its newest is meant), or the experiment file (its newest
-            run is meant, in the folder `runs` here or beside it).
-        name: what others see as the holder of control. Two that join need different names.
-        messages: modules and .proto files with message types of your own, as in the experiment file. They are imported
-            here; those that the run names are not, since its folder may come from another person.
+        where: the folder of the run, the folder of all runs (for the newest), or the experiment file (for its newest
+            run, in the folder `runs` here or beside it).
+        name: holder of control that others see. Two programs that join need different names.
+        messages: modules and .proto files with message types of your own, as in the experiment file. Only these are
+            imported, not the run's own list, since its folder may come from another person.
 
     Raises:
         FileError: there is no such run.
-        ConfigError: it has nobody to connect to; or `messages` can't be imported.
-        NoResponse: its scheduler is not running, or nothing is heard of what it publishes.
-        ExperimentEnded: it has just ended.
+        ConfigError: the run has no scheduler to connect to; or `messages` can't be imported.
+        NoResponse: the scheduler is not running, or its packets do not arrive.
+        ExperimentEnded: the experiment has just ended.
     """
     folder = find_run(Path(where))
     launch = guest_of(folder, name)
@@ -61,10 +61,10 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
         if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
             hint = cut_off_message(folder) or "is the experiment still running?"
             raise NoResponse("the scheduler does not answer", where=str(folder), hint=hint)
-        link.wait_caught_up(link.until(HEARD_WITHIN_S))  # so that the first look at the scope tells its state
+        link.wait_caught_up(link.until(HEARD_WITHIN_S))  # so that the scope shows the present state at once
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
         scope = Scope(link, ProblemNames(launch.problems), folder / STATE_DIR, frame=frame)
-    except BaseException:  # Ctrl-C in a notebook, too: a connection that is left would keep the name
+    except BaseException:  # also Ctrl-C in a notebook: an open connection would keep the name in use
         port.close()
         raise
     weakref.finalize(scope, port.close)
@@ -72,11 +72,11 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
 
 
 def _stem(source: str) -> str:
-    return Path(source).name  # of a file: it may be beside the experiment file or here
+    return Path(source).name  # a file may be in the folder of the experiment file or in the current one
 
 
 def _log_of(name: str) -> logging.Logger:
-    """Return the log of a guest; what it waits for goes to the terminal unless the program has set up logging."""
+    # waiting must be visible in a terminal, unless the program has set up logging itself
     log = logging.getLogger(f"afspm.{name}")
     if not log.hasHandlers():
         log.addHandler(logging.StreamHandler())
@@ -85,7 +85,7 @@ def _log_of(name: str) -> logging.Logger:
 
 
 def guest_facts(launch: Launch) -> Plain:
-    """Return the guest of run.json: the launch line of a component, without what is that component's own."""
+    """Return the guest's entry in run.json: a component's launch line without the fields of that component."""
     sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
     guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
     facts: Plain = json.loads(guest.to_json())
@@ -104,7 +104,7 @@ def guest_of(folder: Path, name: str) -> Launch:
     guest = read_run_json(folder).get(GUEST)
     if not isinstance(guest, dict):
         raise ConfigError(
-            "this part of the experiment has no component that could be joined",
+            "no component of this run is on this computer, so nothing can be joined here",
             where=str(folder / RUN_FILE),
             hint="connect on the computer where components run",
         )
@@ -115,7 +115,7 @@ def guest_of(folder: Path, name: str) -> Launch:
 
 
 def _keys_in(folder: Path) -> Plain:
-    """Return the keys of this run's guests; nothing if none were made."""
+    # nothing if the run has no keys
     from afspm.transport.keys import require_private
 
     file = folder / STATE_DIR / GUEST_KEYS
@@ -132,7 +132,11 @@ def _keys_in(folder: Path) -> Plain:
 
 
 def find_run(where: Path) -> Path:
-    """Return the folder of the run that is meant. Raises FileError if there is none."""
+    """Return the folder of a run.
+
+    Raises:
+        FileError: there is no such run.
+    """
     if where.suffix == ".toml":
         name = where.resolve().parent.name if where.stem == "experiment" else where.stem
         runs = (Path("runs"), where.resolve().parent / "runs")
@@ -148,7 +152,6 @@ def find_run(where: Path) -> Path:
 
 
 def _newest(runs: Path, name: str, file: Path) -> Path | None:
-    """Return the newest run of the experiment `name` in the folder `runs`."""
     name = _name_in(file) or name
     written = [run for run in runs.glob(f"*/{RUN_FILE}") if not run.parent.is_symlink()]
     found = [run for run in written if run_json_or_empty(run.parent).get("name") == name]
@@ -156,7 +159,7 @@ def _newest(runs: Path, name: str, file: Path) -> Path | None:
 
 
 def _started(run: Path) -> tuple[float, int]:
-    """Return when a run was started: when its clock was set, else when run.json was written."""
+    # the origin of its clock, else the time of run.json
     clock = run_json_or_empty(run.parent).get("clock") or {}
     return float(clock.get("origin_s", 0.0)), run.stat().st_mtime_ns
 
@@ -165,7 +168,9 @@ def _name_in(file: Path) -> str | None:
     import tomllib
 
     try:
-        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get("name")  # as editors of Windows write it
+        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get(
+            "name"
+        )  # editors of Windows write a byte-order mark
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     return name if isinstance(name, str) and name else None

@@ -1,4 +1,4 @@
-"""Having control: asking for it, waiting for it, noticing that it is gone, giving it back."""
+"""Control of the microscope: requesting it, waiting for it, noticing its loss, releasing it."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from afspm.client.experiment_link import ExperimentLink
 from afspm.model import WAIT_FOR_CONTROL, ControlMode, ControlRequest, ControlResponse, Packet, Problem, ProblemNames
 from afspm.transport.process.parent import StopRequested
 
-ASK_AGAIN_S = 10.0  # should a published control state ever not reach us
+ASK_AGAIN_S = 10.0  # in case a published control state was lost
 
 
 class ControlHold:
-    """The component's hold on control, and the problem that it wants it for.
+    """The component's hold on control, and the problem for which it wants control.
 
-    Answers of the scheduler grant control; its published state takes it away, once that has named us. (A state from
-    before the grant may still be under way: it must not be taken for a loss.)
+    Answers of the scheduler grant control. The published state takes it away, but only once it has named this
+    component: an older state, from before the grant, may arrive later and is not a loss.
 
     Attributes:
-        held: we are in control.
-        tenures: how often control was given to us.
-        why_lost: for a person, why we no longer are.
-        gives_back_inherited: give back whatever control an earlier life of this component died with.
-        is_unbroken: in this block control that is lost is not waited for: nothing is asked for in a second tenure.
+        held: the component is in control.
+        tenures: number of grants of control.
+        why_lost: reason of the last loss, for people.
+        gives_back_inherited: release control that an earlier life of this component held at its death.
+        is_unbroken: in this block lost control is an error, so that all requests belong to one tenure.
     """
 
     def __init__(self, link: ExperimentLink, problems: ProblemNames) -> None:
@@ -41,18 +41,18 @@ class ControlHold:
 
     @property
     def was_lost(self) -> bool:
-        """True while control is wanted and not there."""
+        """Return whether control is wanted and not held."""
         return bool(self._wanted) and not self.held
 
     @contextmanager
     def hold(
         self, *, solving: int = Problem.NONE, until_s: float | None = None, unbroken: bool = False
     ) -> Iterator[None]:
-        """Have control in the block; within another such block it is that one's.
+        """Hold control in the block; an inner block shares the control of the outer one.
 
         Raises:
-            ControlLost: it was not given until `until_s`; or, in the block, if `unbroken`, is no longer there.
-            Refused: the problem to be solved is not flagged.
+            ControlLost: control was not given until `until_s`; or, in the block, if `unbroken`, was lost.
+            Refused: the problem to solve is not flagged.
         """
         if self._wanted and solving not in (Problem.NONE, self._wanted[0]):
             raise ControlLost(
@@ -72,7 +72,7 @@ class ControlHold:
             if not self._wanted:
                 self.leave()
             raise
-        except BaseException:
+        except BaseException:  # also Ctrl-C: control must be released on every way out of the block
             self._end_block(quietly=True)
             raise
         else:
@@ -81,10 +81,10 @@ class ControlHold:
             self.is_unbroken = was_unbroken
 
     def regain(self, until_s: float | None = None) -> None:
-        """Be in control: at once if we are, else ask, wait for the control state to change, and ask again.
+        """Return in control: at once if it is held, else request it after each change of the control state.
 
         Raises:
-            ControlLost: not until `until_s`, or what we wanted control for has been solved, or not without a break.
+            ControlLost: not until `until_s`, or the problem has been solved, or the block is unbroken.
         """
         link, solving = self._link, self._solving
         if self.is_unbroken and not self.held:
@@ -109,24 +109,24 @@ class ControlHold:
             link.log.info("in control")
 
     def release_inherited(self) -> None:
-        """Give back control that an earlier life had and nobody wants now: others wait for it."""
+        """Release unneeded control of an earlier life: other components wait for it."""
         state = self._link.view.control
         if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
             self._link.send_only(ControlRequest.RELEASE_CTRL)
 
     def leave(self) -> None:
-        """Give back control, if we have it, without waiting for the answer."""
+        """Release control, if held, without waiting for the answer."""
         if self.held and not self._link.ended:
             self._link.send_only(ControlRequest.RELEASE_CTRL)
         self.held = False
 
     def lost(self, why: str) -> None:
-        """Note that the scheduler says that we are not in control."""
+        """Record that the scheduler denies control."""
         self.held = False
         self.why_lost = why
 
     def obstacle(self, solving: int = Problem.NONE) -> str:
-        """Return what stands between us and control, for a person; empty if nothing does."""
+        """Return the obstacle to control, for people; empty without one."""
         state = self._link.view.control
         if state is None:
             return ""
@@ -143,11 +143,11 @@ class ControlHold:
         return self._wanted[-1] if self._wanted else Problem.NONE
 
     def _ask(self, solving: int, until_s: float | None) -> str | None:
-        """Ask for control once. Returns why it has to be waited for; None: it is ours."""
+        # returns why control must be waited for; None once it is held
         link = self._link
         response = link.request(ControlRequest.REQUEST_CTRL, int(solving), until_s=until_s)
         if response.ok:
-            # the state that names us may have come before the answer
+            # the published state with this holder may arrive before the answer
             self.tenures += 1
             self.held, self._was_named = True, link.view.control is not None and link.view.control.holder == link.name
             return None
@@ -158,11 +158,12 @@ class ControlHold:
         return response.reason or self.obstacle(solving)
 
     def _when_changed(self, solving: int) -> Callable[[], bool]:
-        """Return a condition that holds when another control state than now lets us ask again."""
         view, version = self._link.view, self._link.view.count("ControlState")
 
         def may_ask() -> bool:
-            is_solved = bool(solving) and not self._is_flagged(solving)  # asking says so, for certain
+            is_solved = bool(solving) and not self._is_flagged(
+                solving
+            )  # then the answer to a request says for certain that it is solved
             return view.count("ControlState") != version and (is_solved or not self.obstacle(solving))
 
         return may_ask
@@ -175,7 +176,7 @@ class ControlHold:
         return self._problems.name(problem) if problem else "no problem"
 
     def _on_packet(self, packet: Packet, ours: bool) -> None:
-        state = self._link.view.control  # it is up to date before its listeners are called
+        state = self._link.view.control  # the view takes a packet before its listeners
         if not ours or not packet.envelope.startswith("ControlState") or state is None:
             return
         if not self.held:
@@ -187,14 +188,14 @@ class ControlHold:
             self.lost(self.obstacle(self._solving) or "it was revoked")
 
     def _end_block(self, *, quietly: bool) -> None:
-        """Give control back at the end of the outermost block; `quietly`: another exception is on its way."""
+        # `quietly`: another exception is on its way, and must not be replaced
         self._wanted.pop()
         if self._wanted or not self.held:
             return
         self.held = False
         link = self._link
         try:
-            # that we were not in control any more is fine; on the way out of a failure nothing is waited for long
+            # a refusal (control was lost already) is fine; after a failure, wait only a short time
             with link.interrupts.heeded(), link.interrupts.deferred() if quietly else nullcontext():
                 until_s = link.until(link.request_timeout_s if quietly else None)
                 link.request(ControlRequest.RELEASE_CTRL, until_s=until_s)

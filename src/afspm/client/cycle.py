@@ -1,4 +1,4 @@
-"""One scan or spectrum, followed through what the scheduler publishes. Pure: packets in, an outcome out."""
+"""One scan or spectrum, followed through the published packets. Pure: packets in, an outcome out."""
 
 from __future__ import annotations
 
@@ -14,29 +14,30 @@ class CycleOutcome(Enum):
 
     COMPLETED = auto()
     INTERRUPTED = auto()
-    """The microscope says that it was stopped."""
+    """The microscope reports a stop."""
     VANISHED = auto()
-    """The microscope is free and there is nothing: it was started anew in the middle, say."""
+    """The microscope is free again without a result, e.g. after a restart of its controller."""
     ANOTHER = auto()
-    """The results can't be those asked for: a person at the panel has moved the frame, say."""
+    """The results can't be the requested ones, e.g. since a person at the panel has moved the frame."""
 
 
 class Cycle:
-    """The state `busy`, then results, then FREE.
+    """A measurement as a sequence of states: `busy`, then results, then FREE.
 
-    While a connection was lost the cache may have kept the results and not `busy`: then they are taken for ours, too.
+    After a lost connection the cache may have kept the results but not `busy`; then they count, too.
 
     Args:
-        busy: the state while it runs, SCANNING or SPEC.
-        fits: whether a result can be what was asked for; only those count, whoever seems to be in control: nothing
-            keeps a person, or another program, from the controller itself.
-        since_ns: what is not newer than this belongs to something earlier; None: nothing was published before.
-        resumed: it was asked for in an earlier life of ours; somebody else may have measured since then.
+        busy: the state during the measurement, SCANNING or SPEC.
+        fits: returns whether a result can be the requested one. Only such results count, even while this component is
+            in
+            control: a person, or another program, can always use the controller itself.
+        since_ns: packets up to this time belong to an earlier measurement; None: nothing was published before.
+        resumed: an earlier life of the component requested it; others may have measured since.
 
     Attributes:
-        begun: whether it is seen to have begun.
-        results: that fit.
-        other: the first result that does not, since `busy`.
+        begun: whether its start was seen.
+        results: the results that fit.
+        other: the first result since `busy` that does not fit.
     """
 
     def __init__(
@@ -52,15 +53,15 @@ class Cycle:
         self.other: Any = None
 
     def control_was_lost(self) -> None:
-        """Somebody else may measure from now on, as after an earlier life of ours."""
+        """Take into account that others may measure from now on."""
         self._resumed = True
 
     def on_state(self, state: ScopeState, time_ns: int | None) -> None:
-        """The microscope said what it is doing."""
+        """Take a published state of the microscope."""
         if self.outcome is not None or self._is_old(time_ns):
             return
         if state is self._busy:
-            self.results.clear()  # what came before this began belongs to another
+            self.results.clear()  # results before the start belong to another measurement
             self.other = None
             self.begun = True
         elif not self.begun:
@@ -72,7 +73,7 @@ class Cycle:
             self.outcome = CycleOutcome.COMPLETED if self.results else without
 
     def on_result(self, result: object, time_ns: int | None) -> None:
-        """A channel of a scan, or a spectrum, was published."""
+        """Take a published channel of a scan, or a spectrum."""
         if self.outcome is not None or self._is_old(time_ns):
             return
         if self._fits(result):
@@ -82,6 +83,6 @@ class Cycle:
             self.other = result
 
     def _is_old(self, time_ns: int | None) -> bool:
-        if time_ns is None:  # a peer that does not say: only what we wait for right now can be ours
+        if time_ns is None:  # a peer without times: count it, unless others may have measured since
             return self._resumed
         return self._since_ns is not None and time_ns <= self._since_ns

@@ -1,24 +1,52 @@
-"""Brings packets to the handlers of a component."""
+"""Delivery of packets to the handlers of a component."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import ControlState, Packet
 
 if TYPE_CHECKING:
-    from afspm.client.hosted import HostedComponent
+    from afspm.basics.clock import Clock
+    from afspm.client.scope import Scope
+    from afspm.storage.memory import Memory
+
+
+class HostedComponent(Protocol):
+    """The interface of a component for its loop; see `Component` for each member."""
+
+    longest_step_s: ClassVar[float]
+    period_s: float | None
+    period_time: Literal["experiment", "real"]
+    scope: Scope
+    clock: Clock
+    log: logging.Logger
+    name: str
+    memory: Memory
+    run_dir: Path
+    simulated: bool
+    packet: Packet | None
+    _publish: Callable[[Any, str | None], None]
+
+    def run(self) -> None: ...
+    def on_start(self) -> None: ...
+    def on_problem(self, problem: str, flagged: bool) -> None: ...
+    def on_message(self, envelope: str, message: Any) -> None: ...
+    def on_tick(self) -> None: ...
+    def on_end(self) -> None: ...
 
 
 class MessageDispatcher:
-    """Brings packets to the handlers of `component`, of which `base` has the empty ones.
+    """Calls the handlers of `component` for packets; handlers inherited from `base` are empty.
 
     Args:
-        prefixes: of the envelopes that the component subscribed to; None: all. (More may arrive: what `Scope` needs.)
+        prefixes: prefixes of the envelopes that the component subscribed to; None: all. More packets arrive: `Scope`
+            needs them.
     """
 
     def __init__(
@@ -32,7 +60,7 @@ class MessageDispatcher:
         self._wanted: dict[str, bool] = {}
 
     def wants(self, packet: Packet) -> bool:
-        """Return whether there is a handler for a packet; only those need to be kept."""
+        """Return whether the component has a handler for a packet; only such packets need to be kept."""
         try:
             message = wire.message_of(packet.envelope)
         except WireError:
@@ -48,7 +76,7 @@ class MessageDispatcher:
         return any(map(self._wants_message, wire.known_messages()))
 
     def give(self, packet: Packet) -> None:
-        """Call the handlers of a packet. One that can't be read is logged and dropped."""
+        """Call the handlers of a packet; an unreadable packet is logged and dropped."""
         try:
             message = wire.message_of(packet.envelope)
             thing = wire.decode(message, packet.payload)
@@ -81,10 +109,9 @@ class MessageDispatcher:
         return self._component.on_message if self._has("on_message") else None
 
     def _has(self, name: str) -> bool:
-        """Return whether the component's class has a handler of its own."""
         return hasattr(type(self._component), name) and overrides(self._component, self._base, name)
 
 
 def overrides(thing: object, base: type, name: str) -> bool:
-    """Return whether the class of `thing` has another `name` than `base`."""
+    """Return whether the class of `thing` overrides the attribute `name` of `base`."""
     return getattr(type(thing), name, None) is not getattr(base, name, None)

@@ -1,4 +1,4 @@
-"""Published messages, one after the other, for scripts that look at everything themselves."""
+"""Published messages one after the other, for scripts that look at every message."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from afspm.model import Packet
 
 @dataclass(frozen=True, slots=True)
 class PublishedEvent:
-    """A message that was published.
+    """A published message.
 
     Attributes:
-        envelope: by which it was subscribed to.
+        envelope: its topic.
         message: an object of `afspm.model`, or a generated message.
-        time_ns: when, in the experiment; None if the publisher does not say.
+        time_ns: its time in the experiment; None if the publisher gives none.
     """
 
     envelope: str
     message: Any
     time_ns: int | None
 
-    if not TYPE_CHECKING:  # for the type checker the attributes above are all there is
+    if not TYPE_CHECKING:  # hidden from type checkers, which should see only the attributes above
 
         def __getattr__(self, name: str) -> Any:
             raise AttributeError(
@@ -36,12 +36,12 @@ class PublishedEvent:
 
 
 class Events(Iterator[PublishedEvent]):
-    """Iterates over what is published from now on; nothing is lost while the loop's body is busy.
+    """An iterator over messages published from now on; none is lost while the loop's body is busy.
 
-    Ends with the experiment, or when nothing came for `timeout_s` (a later `for` goes on).
+    It ends with the experiment, or after `timeout_s` without a message (a later `for` continues).
 
     Args:
-        prefixes: of the envelopes wanted; empty: all.
+        prefixes: prefixes of the wanted envelopes; empty: all.
     """
 
     def __init__(self, link: ExperimentLink, prefixes: tuple[str, ...], timeout_s: float | None) -> None:
@@ -49,7 +49,7 @@ class Events(Iterator[PublishedEvent]):
         self._timeout_s = timeout_s
         backlog = self._backlog = PacketBacklog()
 
-        # no reference to self: an iterator that was dropped is forgotten by its __del__
+        # no reference to self, so that a dropped iterator is deleted, and its __del__ removes the listener
         def keep(packet: Packet, ours: bool) -> None:
             if not prefixes or packet.envelope.startswith(prefixes):
                 backlog.put(packet)
@@ -75,7 +75,7 @@ class Events(Iterator[PublishedEvent]):
             return PublishedEvent(packet.envelope, message, packet.time_ns)
 
     def close(self) -> None:
-        """Keep nothing more."""
+        """Drop all waiting messages, and keep no more."""
         self._forget()
         self._backlog.close()
 

@@ -1,28 +1,32 @@
-"""The one place that waits: takes what the port brings to its handlers, and asks the scheduler."""
+"""The only place where a component waits: it passes events of the port to their handlers, and sends requests."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import Clock
-from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.basics.errors import ConfigError, ExperimentEnded, Interrupted, NoResponse, WireError
 from afspm.basics.launch import Launch
-from afspm.client.interrupts import Interrupts
 from afspm.client.published_state import PublishedState
-from afspm.client.request_tracker import RequestTracker
 from afspm.model import (
+    CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
+    RELAY_REQUEST,
     ControlRequest,
     Packet,
+    RelayedMessage,
     Request,
     Response,
     ResponseDetail,
     request_name,
 )
+from afspm.model.sessions import run_of
 from afspm.transport.port import (
     CaughtUp,
     ControlConnected,
@@ -34,23 +38,137 @@ from afspm.transport.port import (
     Port,
     ReplyReceived,
 )
+from afspm.transport.process import signals
 from afspm.transport.process.context import ProcessActivity
 from afspm.transport.process.parent import StopRequested
 
 LONGER_THAN_THE_SCHEDULER = 1.2
-"""Factor on the time that the scheduler waits for the microscope: what it says then is an answer, and a component that
-asks again instead makes the connection anew, as if the scheduler were gone."""
+"""Factor on the time that the scheduler waits for the microscope, so that its NO_RESPONSE arrives before the timeout: a
+repetition opens a new connection, as if the scheduler were gone."""
 CAUGHT_UP_WITHIN_S = 2.0
-"""Before a warning that nothing is heard of what the scheduler publishes."""
-UNHEARD = "the scheduler is there, but nothing is heard of what it publishes"
+"""Time before the warning that the scheduler's packets do not arrive."""
+UNHEARD = "the scheduler is connected, but its packets do not arrive"
+Send = Callable[[Sequence[bytes]], None]
 Listener = Callable[[Packet, bool], None]
+
+
+class Interrupts:
+    """The interrupts (Ctrl-C, the stop button of a notebook) during calls over one port.
+
+    An interrupt is raised where a call waits, so that no request or answer is left half done. A program that handles or
+    ignores SIGINT itself, as components do, is left alone.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._is_deferred = False
+        self._has_come = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt in this block only where `heed` is called, and at its end."""
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield  # components handle SIGINT themselves, as does an outer block of this kind
+            return
+        self._has_come = False
+        with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+            yield
+            self.heed()
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Finish this block, which must be short; further interrupts during it are dropped."""
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = self._has_come = False
+
+    def heed(self) -> None:
+        """Raise KeyboardInterrupt after an interrupt."""
+        if self._has_come and not self._is_deferred:
+            self._has_come = False
+            raise Interrupted
+
+    def interrupt(self) -> None:
+        """Interrupt the present or next call, as Ctrl-C does. From any thread."""
+        self._has_come = True
+        self._port.wake_up()
+
+    def _come(self, _number: int) -> None:
+        self._has_come = True
+
+
+class RequestTracker:
+    """Ids of a component's requests, and their answers. Only one request at a time is waited for.
+
+    Args:
+        session: differs between two lives of a component of the same name.
+
+    Attributes:
+        connections: number of connections to the scheduler so far.
+        answer: answer to the request that is waited for; None until it arrives.
+    """
+
+    def __init__(self, send: Send, name: str, session: str) -> None:
+        self._send = send
+        self._name = name
+        self._session = session
+        self._requests = 0
+        self._asked = ""
+        self._relayed: tuple[str, float] | None = None  # id and time of the unanswered relay request
+        self._waiting: dict[str, RelayedMessage] = {}
+        self.connections = 0
+        self.connected = False
+        self.answer: Response | None = None
+
+    def next_id(self) -> str:
+        """Return an id for a request, unique over all lives of this component."""
+        self._requests += 1
+        return f"{self._name}/{self._session}/{self._requests}"
+
+    def expect(self, request_id: str) -> None:
+        """Wait for the answer to this request; an empty id: for none."""
+        self._asked, self.answer = request_id, None
+
+    def send_only(self, kind: int, subject: object = None) -> str:
+        """Send a request without waiting for its answer, and return its id."""
+        request = Request(kind, subject, id=self.next_id())
+        self._send(wire.encode_request(request))
+        return request.id
+
+    def relay(self, thing: object, now_s: float, timeout_s: float) -> None:
+        """Have the scheduler publish `thing`. While one message is unanswered, only the newest of each kind waits."""
+        relayed = RelayedMessage(*wire.encode(thing))
+        self._waiting[relayed.message] = relayed
+        if self._relayed is None or self._relayed[1] < now_s - timeout_s:
+            self._relay_next(now_s)
+
+    def on_connected(self) -> None:
+        self.connections += 1
+        self.connected = True
+        self._relayed = None  # its answer may be lost with the connection
+        if run_of(self._name, f"{self._name}/{self._session}/0"):
+            self.send_only(CLOCK_REQUEST)  # its id contains the run: the scheduler of another run refuses it
+
+    def on_reply(self, response: Response, now_s: float) -> None:
+        if self._relayed is not None and response.id == self._relayed[0]:
+            self._relayed = None
+            self._relay_next(now_s)
+        elif self._asked and response.id == self._asked:  # otherwise a late answer to a request that was given up
+            self.answer = response
+
+    def _relay_next(self, now_s: float) -> None:
+        if self._waiting:
+            relayed = self._waiting.pop(next(iter(self._waiting)))
+            self._relayed = (self.send_only(RELAY_REQUEST, relayed), now_s)
 
 
 class ExperimentLink:
     """A component's connection to its experiment, for use from one thread.
 
     Args:
-        source: the address of the scheduler's publisher, whose packets tell the state; None: all do.
+        source: address of the scheduler's publisher, whose packets hold the state; None: those of any publisher.
         session: differs between two lives of a component of the same name.
     """
 
@@ -84,7 +202,7 @@ class ExperimentLink:
 
     @classmethod
     def of_launch(cls, launch: Launch, port: Port, session: str, **given: Any) -> ExperimentLink:
-        """Return the link of a process that was launched with a line.
+        """Return the link of a process with a launch line.
 
         Args:
             given: name, activity or log, as to the constructor.
@@ -102,10 +220,10 @@ class ExperimentLink:
     # --- waiting ---
 
     def wait(self, done: Callable[[], bool], until_s: float | None = None) -> bool:
-        """Wait until `done()`, which is tried after whatever arrives; False if `until_s` (monotonic) comes first.
+        """Wait until `done()`, tested after each event; return False if `until_s` (monotonic) comes first.
 
         Raises:
-            ExperimentEnded, StopRequested: there is nothing more to wait for.
+            ExperimentEnded, StopRequested: waiting makes no more sense.
             KeyboardInterrupt: the user interrupts.
         """
         with self.activity.waiting(), self.interrupts.heeded():
@@ -117,7 +235,7 @@ class ExperimentLink:
         return True
 
     def wait_connected(self, done: Callable[[], bool], within_s: float, until_s: float | None = None) -> bool:
-        """Wait until `done()`: while the scheduler is away for as long as that lasts, else for `within_s` at most."""
+        """Wait until `done()`: without limit while the scheduler is away, else for at most `within_s`."""
         while not done():
             if not self.wait(lambda: self.connected or done(), until_s):
                 return False
@@ -127,7 +245,7 @@ class ExperimentLink:
         return True
 
     def pump(self, timeout_s: float | None) -> None:
-        """Wait for what arrives, once, and bring it to its handlers."""
+        """Wait once, and pass all events to their handlers."""
         self.check()
         for incoming in self.port.poll(timeout_s):
             self._take(incoming)
@@ -135,12 +253,12 @@ class ExperimentLink:
         self.check()
 
     def check(self) -> None:
-        """Raise the reason why there is nothing more to wait for, if there is one.
+        """Raise the reason why waiting makes no more sense, if there is one.
 
         Raises:
-            ExperimentEnded, StopRequested: it is over, or we are to stop.
-            NoResponse: we have left.
-            ConfigError: the scheduler is that of another run.
+            ExperimentEnded, StopRequested: the experiment has ended, or the process is being stopped.
+            NoResponse: this link was closed.
+            ConfigError: the scheduler belongs to another run.
         """
         if self._over is not None:
             raise self._over
@@ -148,51 +266,52 @@ class ExperimentLink:
             raise ExperimentEnded(HAS_ENDED, where=self.name)
 
     def leave(self) -> None:
-        """Close the port: nothing is heard any more, and nobody can be asked."""
+        """Close the port; all later calls raise NoResponse."""
         hint = "afspm.connect() joins it again"
         self._over = NoResponse("close() has left the experiment", where=self.name, hint=hint)
         self.port.close()
 
     def wait_caught_up(self, until_s: float | None = None) -> None:
-        """Wait until everything the scheduler has cached is here; once that is so, returns at once.
+        """Wait until all packets of the scheduler's cache have arrived; later calls return at once.
 
-        A scheduler that is away, or whose publisher is not heard, is waited for: its cache may show that we have
-        measured already.
+        The wait lasts while the scheduler is away or its packets do not arrive: its cache may show that the measurement
+        is already done.
 
         Raises:
-            NoResponse: not until `until_s` (monotonic), or it is connected and does not answer.
+            NoResponse: not until `until_s` (monotonic), or the scheduler is connected and does not answer.
         """
-        is_told = False
+        has_warned = False
         while not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s):
             if until_s is not None and self.clock.monotonic_s() >= until_s:
                 raise NoResponse(UNHEARD, where=self._source or self.name, hint="does a firewall block this address?")
-            if not is_told:
-                is_told = True
+            if not has_warned:
+                has_warned = True
                 self.log.warning("%s; waiting for that (%s)", UNHEARD, self._source or "any address")
 
     def is_caught_up(self) -> bool:
         return self._source in self._caught_up if self._source else bool(self._caught_up)
 
     def until(self, timeout_s: float | None) -> float | None:
-        """Return the moment, in monotonic time, when a timeout is over."""
+        """Return the end of a timeout in monotonic time."""
         return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
 
     def earlier(self, timeout_s: float, until_s: float | None) -> float:
-        """Return the moment when a timeout is over, or `until_s` if that comes first."""
+        """Return the end of a timeout, or `until_s` if that comes first."""
         soon_s = self.clock.monotonic_s() + timeout_s
         return soon_s if until_s is None else min(soon_s, until_s)
 
     def or_reconnected(self, done: Callable[[], bool]) -> Callable[[], bool]:
-        """Return a condition that holds when `done()` does, or the scheduler was connected anew."""
+        """Return a condition that holds when `done()` holds, or the scheduler has reconnected."""
         connections = self.connections
         return lambda: done() or self.connections != connections
 
     # --- listening ---
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call `listener(packet, ours)` with every packet from now on; `ours`: it is the scheduler's.
+        """Call `listener(packet, ours)` with every packet from now on; `ours`: the scheduler sent it.
 
-        Returns what ends that.
+        Returns:
+            A function that removes the listener.
         """
         key = object()
         self._listeners[key] = listener
@@ -214,14 +333,14 @@ class ExperimentLink:
     def request(
         self, kind: int, subject: object = None, *, request_id: str = "", until_s: float | None = None
     ) -> Response:
-        """Ask the scheduler and wait for its answer, whatever it is.
+        """Send a request to the scheduler, and return its answer, also a refusal.
 
-        A request that stays unanswered is repeated with its id, which has it executed once. While the scheduler is
-        gone it is waited for.
+        A request without an answer is repeated with its id, so that it is executed once. The wait lasts while the
+        scheduler is away.
 
         Raises:
-            ExperimentEnded: that was the answer.
-            NoResponse: no answer to any repetition, or none until `until_s` (monotonic).
+            ExperimentEnded: the answer is that the experiment has ended.
+            NoResponse: no repetition was answered, or none until `until_s` (monotonic).
         """
         request = Request(kind, subject, id=request_id or self.next_id())
         frames, requests, sent = wire.encode_request(request), self.requests, 0
@@ -239,28 +358,28 @@ class ExperimentLink:
                     return self._checked(requests.answer)
                 if until_s is not None and self.clock.monotonic_s() >= until_s:
                     break
-                # a connection that was lost is the scheduler's restart, not its silence
+                # a lost connection means a restart of the scheduler, which does not count as silence
                 sent += connections == self.connections
                 self.log.debug("asking %s (%s) again", request_name(kind), request.id)
         finally:
             requests.expect("")
         raise NoResponse(
-            f"{request_name(kind)} was not answered, asked {max(sent, 1)} times",
+            f"{request_name(kind)} was not answered, sent {max(sent, 1)} times",
             where=self.name,
-            hint="it may or may not have been carried out",
+            hint="the request may or may not have been carried out",
         )
 
     def send_only(self, kind: ControlRequest, subject: object = None) -> None:
-        """Ask without waiting for the answer, for what is done on the way out."""
+        """Send a request without waiting for the answer, for the last steps before an end."""
         self.requests.send_only(kind, subject)
 
-    def tell(self, thing: object) -> None:
-        """Have the scheduler publish something of ours, and don't wait for it."""
-        self.requests.tell(thing, self.clock.monotonic_s(), self.request_timeout_s)
+    def relay(self, thing: object) -> None:
+        """Have the scheduler publish a message of this component, without waiting."""
+        self.requests.relay(thing, self.clock.monotonic_s(), self.request_timeout_s)
 
     def _checked(self, answer: Response) -> Response:
         if answer.detail is ResponseDetail.EXPERIMENT_ENDED:
-            self.ended = True  # this may come before the signal itself
+            self.ended = True  # this answer may come before the signal KILL
         self.check()
         return answer
 

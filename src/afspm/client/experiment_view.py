@@ -1,4 +1,4 @@
-"""Looking at an experiment: what the microscope does, what is in force, what is published."""
+"""Views of an experiment: state, settings in force, published messages."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from afspm.model import (
 
 
 class ExperimentView:
-    """The part of `Scope` that asks for nothing.
+    """The part of `Scope` that sends no requests.
 
     Args:
-        between: called after each outermost call, when nothing is under way.
+        between: called after each outermost call, outside any measurement.
     """
 
     def __init__(self, link: ExperimentLink, problems: ProblemNames, between: Callable[[], None]) -> None:
@@ -34,65 +34,67 @@ class ExperimentView:
         self.problems = problems
 
     def __repr__(self) -> str:
-        with suppress(AfspmError):  # after the end, say, it tells what was known last
+        with suppress(AfspmError):  # e.g. after the end: show the last known state
             self._catch_up()
         view = self._link.view
         control = view.control or ControlState(ControlMode.UNDEFINED)
         flagged = "".join(f", {self.problems.name(number)} is flagged" for number in control.problems)
-        holder = control.holder or "nobody"
+        holder = control.holder or "no component"
         return f"<Scope {self._link.name!r}: {view.state.name}, {control.mode.name}, {holder} is in control{flagged}>"
 
     @property
     def state(self) -> ScopeState:
-        """The state of the microscope."""
+        """Return the state of the microscope."""
         self._catch_up()
         return self._link.view.state
 
     @property
     def control_state(self) -> ControlState:
-        """Mode, holder and problems."""
+        """Return mode, holder and problems."""
         self._catch_up()
         return self._link.view.control or ControlState(ControlMode.UNDEFINED)
 
     @property
     def mode(self) -> ControlMode:
-        """MANUAL or AUTOMATED."""
+        """Return MANUAL or AUTOMATED."""
         return self.control_state.mode
 
     @property
     def scan_parameters(self) -> ScanParameters | None:
-        """Region and shape of the next scan; None if the microscope has not said."""
+        """Return region and shape of the next scan; None if the microscope has not published them."""
         self._catch_up()
         return self._link.view.scan_parameters
 
     @property
     def feedback(self) -> Feedback | None:
-        """The z feedback; None if the microscope has not said."""
+        """Return the z feedback; None if the microscope has not published it."""
         self._catch_up()
         return self._link.view.feedback
 
     @property
     def probe_position(self) -> ProbePosition | None:
-        """The position of the probe; None if the microscope has not said."""
+        """Return the position of the probe; None if the microscope has not published it."""
         self._catch_up()
         return self._link.view.probe_position
 
     def events(self, *envelopes: str, timeout_s: float | None = None) -> Events:
-        """Iterate over what is published from now on, as `PublishedEvent(envelope, message, time_ns)`.
+        """Iterate over messages published from now on, as `PublishedEvent(envelope, message, time_ns)`.
 
         Args:
-            envelopes: prefixes of those wanted; none: all.
-            timeout_s: ends the iteration when nothing came for that long.
+            envelopes: prefixes of the wanted envelopes; none: all.
+            timeout_s: end the iteration after this time without a message.
         """
         return Events(self._link, envelopes, timeout_s)
 
     def wait_until(self, condition: Callable[[], bool], *, timeout_s: float | None = None) -> bool:
-        """Wait until `condition()`, tried whenever something was published; False when the time is up."""
+        """Wait until `condition()`, tested after each published message; return False after `timeout_s`."""
         with self._call():
             return self._link.wait(condition, self._link.until(timeout_s))
 
     def sleep(self, experiment_s: float) -> None:
-        """Let experiment time pass. Unlike `time.sleep` it follows the experiment's clock, and ends with it."""
+        """Wait for some experiment time. Unlike `time.sleep` this follows the experiment's clock, and ends with the
+        experiment.
+        """
         if not (isinstance(experiment_s, Real) and experiment_s >= 0.0):
             raise InvalidValue(f"can't wait for {experiment_s!r}", hint="a number of seconds, zero or more")
         clock = self._link.clock
@@ -107,7 +109,7 @@ class ExperimentView:
 
     @contextmanager
     def _call(self) -> Iterator[None]:
-        """Around each call of the user; when the outermost is done, what arrived meanwhile is handled."""
+        # after the outermost call, handle the packets that arrived during it
         self._link.check()
         self._depth += 1
         try:
@@ -119,7 +121,7 @@ class ExperimentView:
             self._between()
 
     def _catch_up(self) -> None:
-        """Take in what has arrived, so that what is told is not from before the last computation."""
+        # a long computation may lie between two calls: take in the packets that arrived since
         with self._link.interrupts.heeded():
             self._link.wait_caught_up()
             self._link.pump(0.0)

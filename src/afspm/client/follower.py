@@ -1,4 +1,4 @@
-"""Follows a running experiment: what is published, reduced to an `Overview`, and nothing asked for."""
+"""Following a running experiment: published packets reduced to an `Overview`, without any request."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ HEARD_WITHIN_S = 5.0
 
 
 class Follower:
-    """Follows the run in a folder, from one thread. It can't disturb it: it asks nobody for anything.
+    """A follower of the run in a folder, for one thread. It sends no requests, so it can't disturb the run.
 
     Args:
-        folder: of the run.
-        name: in whose name (and with whose key) it looks on.
-        envelopes: prefixes of the envelopes to subscribe to; None: all that carry no values of scans and spectra.
+        folder: folder of the run.
+        name: name (and owner of the key) of the follower.
+        envelopes: prefixes of the envelopes to subscribe to; None: all without values of scans and spectra.
 
     Attributes:
         ended: the experiment has ended.
-        heard_s: when something came last, in real monotonic time; None before the first.
+        heard_s: real monotonic time of the last packet; None before the first.
 
     Raises:
         FileError: there is no run in the folder.
-        ConfigError: it has nobody to connect to.
+        ConfigError: the run has no scheduler to connect to.
     """
 
     def __init__(self, folder: Path, name: str = "terminal", envelopes: tuple[str, ...] | None = None) -> None:
         guest = guest_of(folder, name)
         register_all(guest.messages)
-        # no control: whoever only looks on need not be known to the scheduler
+        # no socket for requests: a follower sends none, and the scheduler need not know it
         sockets = dataclasses.replace(guest.sockets, control=None)
         envelopes = envelopes or wire.messages_without_values()
         self.launch: Launch = dataclasses.replace(guest, sockets=sockets, envelopes=envelopes)
@@ -55,17 +55,17 @@ class Follower:
         self._link.listen(self._take)
 
     def pump(self, timeout_s: float | None) -> None:
-        """Wait for what comes, once, and take it in."""
+        """Wait once, and take in all events."""
         try:
             self._link.pump(timeout_s)
         except ExperimentEnded:
             self.ended = True
 
     def catch_up(self, within_s: float = HEARD_WITHIN_S) -> None:
-        """Take in all that the scheduler has cached.
+        """Take in all packets of the scheduler's cache.
 
         Raises:
-            NoResponse: nothing came.
+            NoResponse: no packet arrived.
         """
         until_s = self.clock.monotonic_s() + within_s
         while not (self.ended or self._link.is_caught_up()):
@@ -78,15 +78,14 @@ class Follower:
             raise NoResponse("the scheduler does not answer", where=str(self.folder), hint=hint)
 
     def silent_s(self) -> float:
-        """Return the real seconds since anything came."""
+        """Return the real seconds since the last packet."""
         return 0.0 if self.heard_s is None else self.clock.monotonic_s() - self.heard_s
 
     def cut_off(self) -> str:
-        """Return a message for a run that was cut off; empty if it runs, or has ended."""
+        """Return a message for a run that was cut off; empty if it runs or has ended."""
         return cut_off_message(self.folder)
 
     def close(self) -> None:
-        """Stop following."""
         self._port.close()
 
     def __enter__(self) -> Follower:
@@ -103,5 +102,5 @@ class Follower:
             message = wire.message_of(packet.envelope)
             thing = wire.decode(message, packet.payload)
         except WireError:
-            return  # of no interest here; those whom it concerns say so
+            return  # an unreadable packet is logged by the components that need it
         self.overview.take(message, thing, packet.time_ns, packet.envelope)

@@ -1,4 +1,4 @@
-"""Keyed measurements happen exactly once: the intent is on disk before the request, the result after it."""
+"""Keyed measurements, taken exactly once: the intent is on disk before the request, the result after it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LONGEST_KEY = 100
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """The scans or spectra of a measurement, and what interrupted it, for a person."""
+    """The scans or spectra of a measurement, and its interruptions, for people."""
 
     things: list[Any]
     interruptions: list[str]
@@ -43,39 +43,39 @@ class MeasurementResult:
 
 
 class KeyedResults:
-    """The measurements of one component that have a key.
+    """The keyed measurements of one component.
 
     Args:
-        folder: the state folder of the run; None keeps nothing over a restart.
-        name: of the component.
+        folder: state folder of the run; None keeps nothing over a restart.
+        name: name of the component.
     """
 
     def __init__(self, folder: Path | None, name: str) -> None:
         self._folder = folder / f"{name}.results" if folder else None
-        self._outage = OutageLog("what is measured can't be kept", _log)
+        self._outage = OutageLog("keyed measurements can't be saved", _log)
         self._memory = Memory(folder / f"{name}.scope.json" if folder else None)
 
     @property
     def disk_is_full(self) -> bool:
-        """Return whether the disk of the run has no room any more."""
+        """Return whether the disk of the run is full."""
         return self._folder is not None and is_full(self._folder.parent)
 
     @property
     def pending(self) -> Plain | None:
-        """The intent that was written down and not fulfilled: key, plan, attempt, since_ns, interruptions."""
+        """Return the intent without a result: key, plan, attempt, since_ns, interruptions."""
         return self._memory.get("pending")
 
     def intend(self, intent: Plain) -> None:
-        """Write down what is going to be asked for, before it is."""
+        """Save the intent of a measurement, before its request."""
         self._memory["pending"] = intent
         self._memory.save()
 
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:
-        """Return the result of an earlier life, or of an earlier call, with the same key.
+        """Return the result of an earlier life or call with the same key.
 
         Raises:
-            InvalidValue: the key was used for something else.
-            FileError: it can't be read.
+            InvalidValue: the key was used for another measurement.
+            FileError: the result can't be read.
         """
         path = self._path(key)
         if path is None or not path.exists():
@@ -89,7 +89,7 @@ class KeyedResults:
         return MeasurementResult(things, head["interruptions"])
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
-        """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again."""
+        """Save the result of the intent. On a full disk it is lost, and a later life measures again."""
         path = self._path(key)
         if path is not None:
             things = [wire.encode(thing) for thing in result.things]
@@ -103,27 +103,31 @@ class KeyedResults:
         self._memory.save()
 
     def forget(self, key: str) -> None:
-        """Remove what is kept of a key; a component that asks for it again measures again."""
+        """Remove the saved result of a key; the next request with this key measures again."""
         path = self._path(key)
         if path is not None:
-            with suppress(OSError):  # what stays is only space
+            with suppress(OSError):  # a file that stays only takes space
                 path.unlink(missing_ok=True)
 
     def _path(self, key: str) -> Path | None:
         if self._folder is None:
             return None
-        # readable, safe on every file system (no case, no reserved characters), and different for different keys
+        # a readable name that is valid on every file system (no case, no reserved characters), and unique for each key
         plain = re.sub(r"[^a-z0-9.-]+", "_", key.lower()).strip(".")[:60]
         return self._folder / f"{plain}-{zlib.crc32(key.encode()):08x}"
 
 
 def kept_in(state_dir: Path, name: str) -> list[str]:
-    """Return the names of the files that keep a component's measurements."""
+    """Return the names of the files with a component's measurements."""
     return sorted(path.name for path in (state_dir / f"{name}.results").glob("*"))
 
 
 def check_key(key: str) -> str:
-    """Return a key as it may be used in request ids. Raises InvalidValue: it may not."""
+    """Return a key, if it is valid in request ids.
+
+    Raises:
+        InvalidValue: the key is not valid.
+    """
     if not key or len(key.encode()) > LONGEST_KEY or "/" in key or not key.isprintable():
         raise InvalidValue(f"{key!r} can't be a key", hint=f"1 to {LONGEST_KEY} printable characters without '/'")
     return key
@@ -134,10 +138,10 @@ def _read(path: Path) -> tuple[Plain, list[object]]:
         with path.open("rb") as file:
             packets = [entry.packet for entry in iter(lambda: read_packet(file), None)]
         if not packets or packets[0].envelope != _HEAD:
-            raise ValueError("not a result")
+            raise ValueError("the file is not a result")
         head = json.loads(bytes(packets[0].payload))
         if len(packets) != 1 + head["things"]:
-            raise ValueError("not all of it is there")
+            raise ValueError("the file is incomplete")
         return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]
     except (OSError, ValueError, WireError) as error:
-        raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure anew") from error
+        raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure again") from error

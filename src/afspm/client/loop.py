@@ -1,4 +1,4 @@
-"""Runs a component: one thread that waits in one place, and calls one handler at a time."""
+"""The loop of a component: one thread that waits in one place and calls one handler at a time."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from afspm.basics.errors import ConfigError, ExperimentEnded, MeasurementFailed,
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.own_fault import OwnFault
 from afspm.client.backlog import PacketBacklog
-from afspm.client.dispatch import MessageDispatcher, overrides
+from afspm.client.dispatch import HostedComponent, MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
-from afspm.client.hosted import HostedComponent
 from afspm.client.keyed_results import kept_in
 from afspm.client.scope import Scope
 from afspm.model import Frame, Packet, Problem
@@ -26,16 +25,16 @@ from afspm.transport.process.context import ProcessContext
 from afspm.transport.process.fault_file import write_fault
 from afspm.transport.process.parent import StopRequested
 
-AFTER_THE_END_S = 30.0  # to handle what came before it
-AFTER_A_STOP_S = 0.5  # the parent that stops us kills us soon
-AT_ONCE = 16  # packets handled before the port is looked at again: a KILL must not wait for a long backlog
+AFTER_THE_END_S = 30.0  # to handle packets from before the end
+AFTER_A_STOP_S = 0.5  # short: the parent kills a process soon after stopping it
+AT_ONCE = 16  # packets handled between two polls of the port: a KILL must not wait for a long backlog
 
 
 class ComponentLoop:
-    """Runs one component until the experiment ends, it is stopped, or its `run` returns.
+    """The loop of one component until the experiment ends, the process is stopped, or `run` returns.
 
     Args:
-        base: the class whose empty handlers the component overrides.
+        base: class with the empty handlers that the component overrides.
     """
 
     def __init__(self, component: HostedComponent, base: type, context: ProcessContext) -> None:
@@ -46,7 +45,7 @@ class ComponentLoop:
         self._is_script = overrides(component, base, "run")
         self._backlog = PacketBacklog()
         self._has_begun = False
-        self._has_reacted = False  # a handler that had control has returned
+        self._has_reacted = False  # a handler has returned after a tenure of control
         launch = context.launch
         self._dispatcher = MessageDispatcher(component, base, launch.envelopes, context.log)
         self._ticker = None if self._is_script else _ticker(component, context.clock)
@@ -58,16 +57,16 @@ class ComponentLoop:
         self._give_attributes(self._state_dir)
 
     def run(self) -> int:
-        """Return the exit code."""
+        """Run to the end, and return the exit code."""
         try:
             code = self._run_to_the_end()
             self._end()
         except MeasurementFailed as failed:
-            self._call_a_person(failed)
+            self._stop_all_measurements(failed)
             raise
         except ConfigError:
             raise
-        except Exception as error:
+        except Exception as error:  # the component's code may raise anything: it decides between a restart and an end
             if self._state_dir is None or self._may_pass(error):
                 raise
             code = self._fail(error, self._state_dir)
@@ -77,7 +76,6 @@ class ComponentLoop:
         return code
 
     def _fail(self, error: Exception, state_dir: Path) -> ExitCode:
-        """Log an error of the component's own code, and tell the supervisor of it."""
         name = self._context.name
         failure.log(self._context.log, error, name)
         kept = json.dumps([self._component.memory.saved_text, *kept_in(state_dir, name)])
@@ -85,7 +83,8 @@ class ComponentLoop:
         return ExitCode.OWN_FAULT
 
     def _may_pass(self, error: Exception) -> bool:
-        """Return whether a restart may get over an error: another message arrives, or the microscope is well again."""
+        # A handler's error may pass, since the next life gets other messages. Not if control was taken and no handler
+        # has returned since: every life would repeat its requests to the microscope.
         is_reaction = not self._is_script and self._has_begun
         return failure.may_pass(error) or (is_reaction and (self._has_reacted or not self._component.scope.tenures))
 
@@ -103,7 +102,7 @@ class ComponentLoop:
     def _run(self) -> None:
         with self._handler():
             self._component.on_start()
-        if not self._is_script:  # a script may go on with what it held control for
+        if not self._is_script:  # a script may continue the block for which its earlier life held control
             self._component.scope.give_back_inherited()
         self._has_begun = True
         if self._is_script:
@@ -112,14 +111,13 @@ class ComponentLoop:
         else:
             self._serve()
 
-    def _call_a_person(self, failed: MeasurementFailed) -> None:
-        """Flag what keeps everybody from measuring on: started again, the component would scan without end."""
+    def _stop_all_measurements(self, failed: MeasurementFailed) -> None:
+        # the flag keeps all components from measuring: a restarted component would repeat the failing scan without end
         self._context.log.critical("%s. Nothing is measured until a person clears device-malfunction", failed.what)
         with contextlib.suppress(RequestError, ExperimentEnded, StopRequested):
             self._component.scope.flag(Problem.DEVICE_MALFUNCTION)
 
     def _serve(self) -> None:
-        """Handle what comes, and tick, until something ends it."""
         while True:
             due_s = self._ticker.due_in_s() if self._ticker else None
             if due_s is not None and due_s <= 0.0 and self._ticker:
@@ -137,30 +135,30 @@ class ComponentLoop:
             at_most -= 1
 
     def _handle_rest(self, within_s: float) -> None:
-        """Handle what was measured before the end: a table must not lack the last scan."""
+        # measurements before the end still need their handlers: a table must not lack the last scan
         until_s = self._context.clock.monotonic_s() + within_s
         while self._has_begun and len(self._backlog) and self._context.clock.monotonic_s() < until_s:
-            with contextlib.suppress(ExperimentEnded, StopRequested):  # nothing can be asked for any more
+            with contextlib.suppress(ExperimentEnded, StopRequested):  # handlers can send no more requests
                 self._handle_backlog(1)
 
     def _end(self) -> None:
-        """Call `on_end`. What it can't do any more must not hide why we ended."""
+        # an error in `on_end` must not hide why the process ends
         try:
             with self._handler():
                 self._component.on_end()
         except (ExperimentEnded, StopRequested):
-            self._context.log.debug("on_end asked for something after the end")
-        except Exception as error:
+            self._context.log.debug("on_end sent a request after the end")
+        except Exception as error:  # the component's code may raise anything
             self._context.log.error("on_end failed: %s", failure.describe(error, self._context.name))
 
     @contextlib.contextmanager
     def _handler(self) -> Iterator[None]:
-        """Around a handler of the component: what it has put into memory is kept, unless it fails."""
+        # memory is saved when a handler has returned, not when it has failed half way
         tenures = self._component.scope.tenures
         with self._activity.step():
             yield
             self._has_reacted |= self._component.scope.tenures != tenures
-            if not self._is_script:  # a script says itself when what it remembers belongs together
+            if not self._is_script:  # a script itself calls `memory.save` at a consistent moment
                 self._component.memory.save_changes()
 
     def _keep(self, packet: Packet, ours: bool) -> None:
@@ -194,7 +192,7 @@ class ComponentLoop:
 
 
 class _Ticker:
-    """Counts the ticks, by the beat of the first."""
+    """The schedule of ticks, at multiples of the period from the start."""
 
     def __init__(self, period: int, now: Callable[[], int], real_s: Callable[[int], float]) -> None:
         self._period = period
@@ -208,7 +206,7 @@ class _Ticker:
         return self._real_s(left) if left > 0 else 0.0
 
     def done(self) -> None:
-        """Count a tick; those missed meanwhile are not made up for."""
+        """Count a tick, and skip those missed meanwhile."""
         missed = max(0, self._now() - self._next) // self._period
         self._next += (missed + 1) * self._period
 

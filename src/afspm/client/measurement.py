@@ -1,4 +1,4 @@
-"""Taking one scan or spectrum, whatever gets in between, exactly once."""
+"""Taking one scan or spectrum exactly once, over interruptions and restarts."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from afspm.model.sessions import KEYED
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
 BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S
-"""From the success of the action to the state that says so. A connection may be cut just between the two. As long as
-that may not have shown, silence does not tell that nothing was begun: what is asked for anew would be taken twice."""
-STOPPED_WITHIN_S = 10.0  # when the user interrupts
-IDLE_AFTER_S = 5.0  # when the user interrupts what is not seen to have begun
-MOST_FAILURES = 5  # in a row, that nothing explains: then a person should look
+"""Real time from the success of the action to the published state. The connection may be cut between the two. Until a
+cut is certainly noticed, silence does not mean that nothing was begun: a new request would measure twice."""
+STOPPED_WITHIN_S = 10.0  # after an interrupt by the user
+IDLE_AFTER_S = 5.0  # the same, if no start was seen
+MOST_FAILURES = 5  # unexplained ones in a row, before a person has to look
 
 
 class _Watch:
-    """A cycle that takes in what the scheduler publishes, until it is closed."""
+    """A cycle that takes in published packets until it is closed."""
 
     def __init__(self, link: ExperimentLink, target: Target, cycle: Cycle) -> None:
         self._link = link
@@ -73,7 +73,7 @@ class _MeasurementTask:
 
     @property
     def request_id(self) -> str:
-        """The id of the action that begins it: another in every attempt, the same in every life."""
+        """Return the id of the starting action: different for each attempt, the same in every life."""
         return f"{self.stem}/{self.attempt}"
 
     def drop_watch(self) -> None:
@@ -105,23 +105,23 @@ class MeasurementRunner:
         """Measure until there is a complete result; with a key, once in all lives of the component.
 
         Raises:
-            Refused: the microscope, or a limit, says no.
+            Refused: the microscope or a limit refuses.
             NoResponse: not until `until_s`.
             MeasurementFailed: the microscope fails again and again.
             ControlLost: control was not given until `until_s`.
         """
         if key is not None and (found := self._results.find(check_key(key), target.facts())) is not None:
             return found
-        self._link.wait_caught_up(until_s)  # what is cached must not be taken for ours
+        self._link.wait_caught_up(until_s)  # a cached result must not be taken for this measurement's
         task = _MeasurementTask(
             target, key, f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id(), until_s
         )
         try:
             self._take_up(task)
             things = self._finish(task)
-        except BaseException:
+        except BaseException:  # also Ctrl-C and StopRequested: the measurement goes on at the microscope
             if task.key is not None and task.watch is not None and not task.watch.is_over():
-                self._unfinished, task.watch = task.watch, None  # what becomes of it is taken up by its key
+                self._unfinished, task.watch = task.watch, None  # the next call with this key takes it up
             raise
         finally:
             task.drop_watch()
@@ -133,7 +133,7 @@ class MeasurementRunner:
         return result
 
     def _of_earlier_life(self) -> _Watch | None:
-        """Watch, from the first packet on, for what an earlier life asked for and did not get."""
+        # an earlier life may have left a measurement running: watch for its result from the first packet on
         intent = self._results.pending
         if intent is None:
             return None
@@ -142,10 +142,9 @@ class MeasurementRunner:
         return _Watch(self._link, target, Cycle(target.busy, target.fits, since_ns=since_ns, resumed=True))
 
     def _take_up(self, task: _MeasurementTask) -> None:
-        """Continue what an earlier life, or an earlier call, was at, if it was this."""
         intent, watch = self._results.pending, self._unfinished
         if task.key is None and watch is not None:
-            # what comes now is not of it; what has come is kept for the call with its key
+            # results from now on belong to the new measurement; earlier ones are kept for the call with their key
             watch.wait_if_begun(task.until_s)
             watch.close()
             self._unfinished = watch if watch.is_over() else None
@@ -155,14 +154,14 @@ class MeasurementRunner:
             if watch is not None:
                 watch.close()
             return
-        task.attempt = intent["attempt"]  # ids of attempts before are answered, not executed
+        task.attempt = intent["attempt"]  # ids of earlier attempts are answered from the cache, not executed
         task.interruptions = intent["interruptions"]
         task.watch = watch
         if watch is not None:
             self._link.log.info("%s %s: resumed", task.target.what, task.key)
 
     def _finish(self, task: _MeasurementTask) -> list[Any]:
-        """Return the newest result of each name: a restarted translator may have published one twice."""
+        # the newest result of each name: a restarted translator may have published one twice
         if task.watch is not None:
             task.watch.wait_if_begun(task.until_s)
         if task.watch is not None and task.watch.cycle.outcome is CycleOutcome.COMPLETED:
@@ -176,12 +175,11 @@ class MeasurementRunner:
         return list({task.target.name_of(thing): thing for thing in results}.values())
 
     def _measure(self, task: _MeasurementTask) -> Cycle:
-        """Attempt after attempt, until one is complete."""
         watch = task.watch
         if watch is not None and watch.is_over() and watch.cycle.outcome is not CycleOutcome.COMPLETED:
             task.drop_watch()
         elif watch is not None and watch.is_over() and self._is_done(task, watch.cycle):
-            return watch.cycle  # what was begun in an earlier life ended while control was waited for
+            return watch.cycle  # a measurement of an earlier life ended during the wait for control
         while True:
             if task.watch is not None and task.watch.is_over():
                 task.drop_watch()
@@ -194,16 +192,13 @@ class MeasurementRunner:
                 return task.watch.cycle
 
     def _attempt(self, task: _MeasurementTask) -> None:
-        """Prepare and begin once, and follow to the end.
-
-        What was asked for in an earlier life is asked for with the same id, so that it is not executed twice; so is
-        what was left without an answer when control was lost. Leaves no watch where nothing was begun.
-        """
+        # A request of an earlier life, or one whose answer was lost with control, is repeated with its id, so that it
+        # is not executed twice. Leaves no watch if nothing was begun.
         link, target, until_s = self._link, task.target, task.until_s
         self._control.regain(until_s)
         is_new = task.watch is None
         if task.watch is not None and task.watch.is_over():
-            return  # it had begun, and ended while control was waited for
+            return  # the measurement had begun, and ended during the wait for control
         if is_new:
             task.attempt += 1
             self._write_down(task)
@@ -232,7 +227,7 @@ class MeasurementRunner:
         self._get_over(response, states, until_s, is_new=is_new)
 
     def _stop(self, task: _MeasurementTask) -> None:
-        """Stop what was begun, or may have been, and say what became of it. The user has interrupted it."""
+        # after Ctrl-C: stop a measurement that has, or may have, begun, and log the outcome
         target, watch, link = task.target, task.watch, self._link
         if watch is None or watch.is_over():
             return
@@ -250,17 +245,16 @@ class MeasurementRunner:
         response = self._commands.send(ControlRequest.ACTION, target.stop, until_s=until_s)
         if not response.ok:
             return False
-        # an action that was never answered may not have been begun at all
+        # an action without an answer may not have begun at all
         may_be_idle = not self._link.wait(lambda: watch.cycle.begun, self._link.earlier(IDLE_AFTER_S, until_s))
         return may_be_idle or self._link.wait(watch.is_over, until_s)
 
     def _get_over(self, response: Response, states: int, until_s: float | None, *, is_new: bool) -> None:
-        """Wait for what stands in the way of an action, or raise Refused."""
         try:
             self._commands.get_over(ControlRequest.ACTION, response, states, until_s)
         except Refused:
-            # What was asked for before is answered from memory: it was refused then, and nothing was done. What is
-            # answered now, another id tells.
+            # A repeated id is answered from the cache: it was refused then, and nothing was done. The next attempt,
+            # with a new id, gets the present answer.
             if is_new:
                 raise
 
@@ -277,7 +271,6 @@ class MeasurementRunner:
             )
 
     def _follow(self, task: _MeasurementTask, watch: _Watch) -> None:
-        """From the success of the action to the end of it."""
         link, cycle = self._link, watch.cycle
         with link.clock.late():
             begun = link.wait_connected(lambda: cycle.begun or watch.is_over(), BEGUN_WITHIN_S, task.until_s)
@@ -291,7 +284,7 @@ class MeasurementRunner:
             )
 
     def _is_done(self, task: _MeasurementTask, cycle: Cycle) -> bool:
-        """Return whether the result is complete; else note why not, before the next attempt."""
+        # an incomplete result is noted as an interruption, before the next attempt
         target = task.target
         missing = self._channels.get(target.what, frozenset()) - frozenset(map(target.name_of, cycle.results))
         blank = [one.channel for one in cycle.results if isinstance(one, Scan) and one.is_blank]
@@ -303,13 +296,13 @@ class MeasurementRunner:
         if cycle.outcome is CycleOutcome.COMPLETED and is_blank:
             why = "no channel has any value, all are NaN"
         elif cycle.outcome is CycleOutcome.COMPLETED:
-            del self._channels[target.what]  # the same again: then these channels are not recorded any more
+            del self._channels[target.what]  # if they are missing again, the microscope no longer records them
             why = f"without {', '.join(sorted(missing))}, which it had before"
         else:
             why = self._why_failed(target, cycle)
         task.interruptions.append(f"{day_and_time(self._link.clock.now_ns(), UTC)}: {why}")
         self._link.log.warning("%s interrupted: %s; retrying", target.what, why)
-        # losing control explains itself and is waited for; all else must not go on for a night
+        # lost control is a known reason, and comes back; any other failure must not repeat for a night
         task.failures = task.failures + 1 if self._control.held else 0
         if task.failures >= MOST_FAILURES:
             raise MeasurementFailed(f"the {target.what} failed {task.failures} times: {why}", where=self._link.name)
@@ -324,10 +317,10 @@ class MeasurementRunner:
             return "it was stopped at the microscope, or its file is missing; the log of the translator says which"
         if cycle.outcome is CycleOutcome.ANOTHER:
             other = target.describe(cycle.other)
-            return f"not what was asked for was measured, but {other}; who else sets the microscope?"
+            return f"another measurement was taken instead: {other}; does another program use the microscope?"
         return "the microscope is free again without a result; was it restarted?"
 
 
 def _may_have_begun(response: Response, *, is_new: bool) -> bool:
-    """Return whether control was lost before the microscope had answered, now or in the life before."""
+    # control was lost before the microscope had answered, now or in an earlier life
     return response.code == ControlResponse.NO_RESPONSE or (not is_new and response.code in NOT_IN_CONTROL)

@@ -1,4 +1,4 @@
-"""Setting what a measurement needs: region, shape, probe position and kind of spectrum, unless they are set."""
+"""Setting the microscope up for a measurement: region, shape, probe position and kind of spectrum."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePositio
 
 
 class MeasurementSetup:
-    """Sets the microscope up for measurements. Control must be held around every call.
+    """Sets up the microscope for measurements, if the settings are not yet in force. Control must be held around each
+    call.
 
     Args:
-        view: what is in force.
+        view: the published settings in force.
     """
 
     def __init__(self, view: PublishedState, commands: CommandRetry) -> None:
@@ -21,7 +22,7 @@ class MeasurementSetup:
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def prepare(self, target: Target, until_s: float | None) -> None:
-        """Set what a target needs."""
+        """Set everything that a target needs."""
         if isinstance(target, ScanTarget):
             self.set_scan(target.parameters, until_s)
             return
@@ -31,27 +32,27 @@ class MeasurementSetup:
             self.move_probe(target.at_m, until_s)
 
     def move_probe(self, xy_m: XY, until_s: float | None) -> None:
-        """Move the probe to (x, y) in m, unless it stands there."""
+        """Move the probe to (x, y) in m, unless it is there already."""
         now = self._view.probe_position
         if now is None or now.xy_m != xy_m:
             self._commands.set(ControlRequest.SET_PROBE_POS, ProbePosition(xy_m), "ProbePosition", until_s)
 
     def set_scan(self, wanted: ScanParameters, until_s: float | None) -> None:
-        """Set region and shape as a whole, unless they are set."""
+        """Set region and shape together, unless they are in force."""
         if wanted.region is None and wanted.shape is None:
             return
-        # in sample coordinates the same region is another place of the tip a while later
+        # in sample coordinates a region drifts: a while later the same region is elsewhere for the tip
         is_fixed = not (isinstance(wanted.region, Region) and wanted.region.frame is Frame.SAMPLE)
         now = self._view.scan_parameters
         if is_fixed and (is_set(wanted, now, SAME) or (now is not None and (wanted, now) == self._rounded)):
             return
         self._commands.set(ControlRequest.SET_SCAN_PARAMS, wanted, "ScanParameters2d", until_s)
-        # a controller may round: then this is what our wish looks like when it is set; what lies elsewhere is another's
+        # a controller may round: remember the rounded values of this request, unless they are another's setting
         now = self._view.scan_parameters
         self._rounded = (wanted, now) if is_set(wanted, now, FITS) else None
 
     def set_feedback(self, wanted: Feedback, until_s: float | None) -> None:
-        """Set what is given of the feedback; where that changes anything, wait until it is published."""
+        """Set the given fields of the feedback; wait until they are published, if any changes."""
         now = self._view.feedback
         if now and all(value in (None, getattr(now, name)) for name, value in vars(wanted).items()):
             self._commands.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted, until_s=until_s)

@@ -1,4 +1,4 @@
-"""Values of parameters, to and from the text on the wire."""
+"""Conversion of parameter values to and from text on the wire."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Value = float | str | bool
 
 
 def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
-    """Return a value to set: a number with or without `unit` (SI without), a quantity as text ("2 um/s"), True, "on" …
+    """Return a parameter to set, from a number in `unit` (SI without one), a quantity as text ("2 um/s"), True, "on" …
 
     Raises:
-        InvalidValue: a number that is none.
-        UnitError: a number without a unit that is too large to be meant in SI.
+        InvalidValue: the number is not finite.
+        UnitError: a number without a unit is implausibly large in SI.
     """
     if isinstance(value, bool):
         return Parameter(name, "true" if value else "false", unit)
@@ -33,15 +33,15 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
         raise InvalidValue(f"{name} can't be set to {value}")
     if unit is None:
         require_unit(value, BASE_PARAMETERS.get(name) or "")
-    # a numpy number would write itself as "np.float64(…)"
+    # the repr of a numpy number is "np.float64(…)"
     text = repr(int(value)) if isinstance(value, int) else repr(float(value))
     return Parameter(name, text, BASE_PARAMETERS.get(name) if unit is None else unit)
 
 
 def from_parameter(parameter: Parameter, unit: str | None) -> Value:
-    """Return the value in force, in `unit`; without one in SI for the base parameters, else as it came.
+    """Return the value in force in `unit`; without one in SI for base parameters, else as received.
 
-    Text that is no number comes as True, False or text.
+    Text that is not a number becomes True, False or text.
 
     Raises:
         UnitError: the microscope's unit can't be converted to `unit`.
@@ -60,7 +60,7 @@ def from_parameter(parameter: Parameter, unit: str | None) -> Value:
 
 
 def value_in(response: Response, asked: Parameter, unit: str | None) -> Value:
-    """Return the value that a response reports; where a peer only says that it did it, the one that was asked for."""
+    """Return the value in a response; for a peer that only confirms, the requested value."""
     return from_parameter(wire.decode_parameter(response.payload) if response.payload else asked, unit)
 
 

@@ -1,4 +1,4 @@
-"""The newest of each state that the scheduler has published."""
+"""The newest published states of microscope and control."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from afspm.model import ControlState, Feedback, ProbePosition, ScanParameters, S
 
 
 class PublishedState:
-    """The newest published states, and how often each was published, so that a caller can wait for the next."""
+    """The newest published states, and the number of publications of each, so that a caller can wait for the next."""
 
     def __init__(self) -> None:
         self.status: ScopeStatus | None = None
@@ -25,15 +25,15 @@ class PublishedState:
         return self.status.state if self.status else ScopeState.UNDEFINED
 
     def take(self, message: str, thing: object) -> None:
-        """`thing` was published as `message`."""
+        """Take `thing`, published as the message `message`."""
         setattr(self, wire.declaration(message).attribute, thing)
         self._published[message] += 1
 
     def take_time(self, time_ns: int | None) -> None:
-        """The scheduler published something at that time."""
+        """Take the time of a packet of the scheduler."""
         if time_ns is not None and (self.newest_ns is None or time_ns > self.newest_ns):
             self.newest_ns = time_ns
 
     def count(self, message: str) -> int:
-        """Return how often `message` has been published."""
+        """Return the number of publications of `message`."""
         return self._published[message]

@@ -41,26 +41,26 @@ from afspm.model import (
 __all__ = ["Events", "PublishedEvent", "Scope"]
 
 Place = tuple[float | str, float | str]
-ANSWER_S = 60.0  # by default; what waits for control or for a measurement has no limit by default
+ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
 
 class Scope(ExperimentView):
-    """Asks the microscope for scans, spectra, settings and actions. A call returns when that is done.
+    """The handle for scans, spectra, settings and actions; each call returns when it is done.
 
-    Control is asked for by itself and given back after each call; `with scope.control():` keeps it over several. Where
-    it is refused or taken away, calls wait until it is back. Timeouts are in real seconds; None waits for ever.
+    A call requests control and releases it afterwards; `with scope.control():` keeps it over several calls. Without
+    control, calls wait until it is given. Timeouts are in real seconds; None waits for ever.
 
     Every call may raise:
-        Refused: the scheduler, a limit or the microscope said no; `reason` says why.
-        NoResponse: the time given was up, or nobody answers.
-        ControlLost: control was not given within the timeout, or is lost in an unbroken block.
-        ExperimentEnded: there is nothing more to ask.
+        Refused: the scheduler, a limit or the microscope refused; `reason` gives the reason.
+        NoResponse: the time limit has passed, or there is no answer.
+        ControlLost: control was not given within the timeout, or was lost in an unbroken block.
+        ExperimentEnded: the experiment has ended.
 
     Args:
-        link: to the experiment.
-        state_dir: where keyed measurements are kept; None: only in memory.
-        between: called after each outermost call, when nothing is under way.
-        frame: of all places.
+        link: link to the experiment.
+        state_dir: folder for keyed measurements; None: only in memory.
+        between: called after each outermost call, outside any measurement.
+        frame: coordinate system of all places.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Scope(ExperimentView):
     ) -> None:
         super().__init__(link, problems or ProblemNames(), between)
         self._frame = frame
-        self._begun: tuple[int, int] | None = None  # what was done when progress was first told, and when
+        self._begun: tuple[int, int] | None = None  # finished parts, and the time, at the first call of `progress`
         self._control = ControlHold(link, self.problems)
         self._commands = CommandRetry(link, self._control)
         self._setup = MeasurementSetup(link.view, self._commands)
@@ -92,15 +92,15 @@ class Scope(ExperimentView):
     ) -> ScanSet:
         """Take a scan and return all its channels.
 
-        A scan that is interrupted (a problem, MANUAL, a restart of anything) is taken again when control is back;
-        `ScanSet.interruptions` says when and why.
+        A scan that is interrupted (a problem, MANUAL, a restart of any process) is taken again when control is back;
+        `ScanSet.interruptions` gives times and reasons.
 
         Args:
-            region: where; None: what is set.
-            shape: (rows, columns); None: what is set.
-            key: makes it happen once in this run: a component that is killed and started again gets the scan of its
-                earlier life. Keys are the component's own, each for one measurement. What is kept of it takes the space
-                of the scan, until `forget`.
+            region: region to scan; None: the present one.
+            shape: (rows, columns); None: the present one.
+            key: take this scan once in this run: after a restart the component gets the scan of its earlier life. Each
+                component has its own keys, one for each measurement. A saved scan needs its space on disk until
+                `forget`.
         """
         with self._call():
             target = ScanTarget.of(region, shape, self._frame)
@@ -117,21 +117,21 @@ class Scope(ExperimentView):
         """Take a spectrum; interruptions and `key` as with `scan`.
 
         Args:
-            at: (x, y) in m or as text, ("1 um", "0 nm"), where the probe is moved to; None: where it stands.
-            kind: e.g. "IV" (the parameter `x-spec-kind`); None: what is set.
+            at: (x, y) in m or as text, ("1 um", "0 nm"), to move the probe to; None: the present position.
+            kind: e.g. "IV" (the parameter `x-spec-kind`); None: the present kind.
         """
         with self._call():
             target = SpectrumTarget.of(at, kind, self._frame)
             return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
 
     def forget(self, key: str) -> None:
-        """Remove what is kept of a keyed measurement that will not be asked for again, which a long series needs."""
+        """Remove the saved result of a keyed measurement that is no longer needed, to save space in a long series."""
         self._results.forget(check_key(key))
 
     # --- setting and getting ---
 
     def set(self, parameter: str, value: Value, unit: str | None = None, *, timeout_s: float | None = None) -> Value:
-        """Set a parameter and return what is then in force, in the same unit.
+        """Set a parameter and return its value in force, in the same unit.
 
         Args:
             value: a number, in `unit` (SI without one), a quantity as text ("0.5 V"), True, "on" …
@@ -142,7 +142,7 @@ class Scope(ExperimentView):
             return value_in(response, asked, asked.unit)
 
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
-        """Return a parameter's value in `unit`; without one in SI, or as it came if it is not a base parameter."""
+        """Return a parameter's value in `unit`; without one in SI, or as received if it is not a base parameter."""
         with self._call():
             asked = Parameter(parameter)
             response = self._commands.read(ControlRequest.PARAM, asked, self._link.until(timeout_s))
@@ -159,7 +159,7 @@ class Scope(ExperimentView):
         setpoint: float | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Set what is given of the z feedback; the rest stays as it is. It returns when `feedback` tells it.
+        """Set the given fields of the z feedback, and return when `feedback` shows them; the others stay unchanged.
 
         Args:
             on: whether the feedback regulates; off, the tip is held at its height.
@@ -173,7 +173,7 @@ class Scope(ExperimentView):
                 self._setup.set_feedback(feedback, until_s)
 
     def move_probe(self, xy_m: Place, *, timeout_s: float | None = None) -> None:
-        """Move the probe to (x, y), in m or as text, ("1 um", "0 nm"); returns when it stands there."""
+        """Move the probe to (x, y), in m or as text, ("1 um", "0 nm"); return when it is there."""
         with self._call():
             until_s = self._link.until(timeout_s)
             with self._control.hold(until_s=until_s):
@@ -182,9 +182,9 @@ class Scope(ExperimentView):
     def set_scan_region(
         self, region: Region, *, shape: tuple[int, int] | None = None, timeout_s: float | None = None
     ) -> None:
-        """Set where the next scan is taken, and with `shape` (rows, columns) its pixels; returns when it is in force.
+        """Set the region of the next scan, and with `shape` (rows, columns) its pixels; return when they are in force.
 
-        Both are set at once: one after the other, they would be frames of their own, that may be refused.
+        Both are set together: one after the other, they would form another frame in between, which may be refused.
         """
         with self._call():
             until_s = self._link.until(timeout_s)
@@ -192,14 +192,14 @@ class Scope(ExperimentView):
                 self._setup.set_scan(ScanTarget.of(region, shape, self._frame).parameters, until_s)
 
     def action(self, name: str, *, timeout_s: float | None = None) -> None:
-        """Have the microscope do something by its name; returns when it has accepted it."""
+        """Start an action of the microscope by its name; return when the microscope has accepted it."""
         with self._call():
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
 
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
-        """Return whether the microscope has an action of this name, such as "x-retract"; nothing is done.
+        """Return whether the microscope has an action of this name, such as "x-retract", without any effect.
 
-        Ask before `action`, which raises Refused for one that the microscope does not have.
+        Call it before `action`, which raises Refused for an action that the microscope does not have.
         """
         with self._call():
             response = self._commands.read(ControlRequest.ACTION_SUPPORT, action, self._link.until(timeout_s))
@@ -215,18 +215,18 @@ class Scope(ExperimentView):
     def control(
         self, *, solving: int | str | None = None, timeout_s: float | None = None, unbroken: bool = False
     ) -> Iterator[None]:
-        """Keep control over all calls in the block; waits for it first.
+        """Keep control over all calls in the block, after waiting for it.
 
-        Within the block control may still be lost: to a problem, to MANUAL. The next call then waits until it is back.
-        When the problem being solved has been cleared, it raises ControlLost: there is nothing left to do.
+        Within the block control may still be lost: to a problem, or to MANUAL. The next call then waits until it is
+        back. If the problem to solve has been cleared meanwhile, the call raises ControlLost.
 
         Args:
-            solving: the flagged problem that will be solved, by name or number.
-            unbroken: what the block does hangs together, as a pulse does with the place that the probe was moved to.
-                Where control is lost, the next call in the block raises ControlLost, and nothing more is done: begin
-                the block again, whoever was in control meanwhile may have changed anything. `action` raises NoResponse
-                if the loss came before the answer, so that it is not known whether it was done. Within another block,
-                control is waited for when this one begins.
+            solving: the flagged problem to solve, by name or number.
+            unbroken: all calls in the block belong together, as a pulse and the position that the probe was moved to.
+                After a
+                loss of control the next call in the block raises ControlLost, and nothing more is done: begin the block
+                again, since others may have changed anything. `action` raises NoResponse if the loss came before the
+                answer, so that its outcome is unknown. Inside another block, an unbroken block first waits for control.
         """
         number = Problem.NONE if solving is None else self.problems.number(solving)
         with self._control.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
@@ -234,60 +234,60 @@ class Scope(ExperimentView):
 
     @property
     def in_control(self) -> bool:
-        """True if control is ours now."""
+        """Return whether this component is in control now."""
         self._catch_up()
         return self._control.held
 
     def flag(self, problem: int | str) -> None:
-        """Flag a problem, by name or number: control is taken from its holder, until the problem is cleared.
+        """Flag a problem, by name or number: control is taken from its holder until the problem is cleared.
 
         Raises:
-            ExperimentEnded: it is over; the record says nevertheless that the problem was seen.
+            ExperimentEnded: the experiment has ended; the record still notes the problem.
         """
         number = self.problems.number(problem)
         try:
-            self._tell(ControlRequest.ADD_EXP_PRBLM, number)
+            self._ask_scheduler(ControlRequest.ADD_EXP_PRBLM, number)
         except ExperimentEnded:
             self._link.send_only(ControlRequest.ADD_EXP_PRBLM, number)
             raise
 
     def clear(self, problem: int | str) -> None:
-        """Remove the flag of a problem; that it was not flagged is no error."""
-        self._tell(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
+        """Remove the flag of a problem; a problem without a flag is no error."""
+        self._ask_scheduler(ControlRequest.RMV_EXP_PRBLM, self.problems.number(problem))
 
     def clear_all(self) -> tuple[str, ...]:
-        """Remove the flag of every problem that is flagged, and return their names."""
+        """Remove the flags of all problems, and return their names."""
         flagged = sorted(self.control_state.problems)
         for problem in flagged:
             self.clear(problem)
         return tuple(map(self.problems.name, flagged))
 
     def set_mode(self, mode: ControlMode) -> None:
-        """Set MANUAL (nobody has control) or AUTOMATED."""
-        self._tell(ControlRequest.SET_CONTROL_MODE, int(mode))
+        """Set MANUAL (no component has control) or AUTOMATED."""
+        self._ask_scheduler(ControlRequest.SET_CONTROL_MODE, int(mode))
 
     def restart(self, process: str) -> None:
-        """End a process of the experiment and start it anew, also one that was given up."""
-        self._tell(RESTART_REQUEST, process)
+        """Restart a process of the experiment, even one that was given up."""
+        self._ask_scheduler(RESTART_REQUEST, process)
 
     def end_experiment(self) -> None:
-        """End the experiment for everybody, this process included: the next call raises ExperimentEnded."""
-        self._link.wait_caught_up()  # else the signal might pass before we listen
-        with suppress(ExperimentEnded):  # it may come before the answer
-            self._tell(ControlRequest.END_EXPERIMENT, None)
+        """End the experiment for all processes; the next call raises ExperimentEnded."""
+        self._link.wait_caught_up()  # the signal KILL is sent once: the subscription must stand before the request
+        with suppress(ExperimentEnded):  # the signal may come before the answer
+            self._ask_scheduler(ControlRequest.END_EXPERIMENT, None)
 
     def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
-        """Publish how far the component is, for those who look on. It waits for nobody.
+        """Publish the progress of the component, for people who watch. Never waits.
 
         Args:
-            done, of: how many of how many, of whatever is counted.
-            left_s: experiment time that the rest will take; None: as it went since this was first said.
+            done, of: number of finished parts, and of all parts.
+            left_s: experiment time that the rest will take; None: at the rate since the first call.
         """
         now_ns = self._link.clock.now_ns()
         begun, begun_ns = self._begun = self._begun or (done, now_ns)
         if left_s is None and done > begun:
             left_s = (now_ns - begun_ns) * 1e-9 / (done - begun) * (of - done)
-        self._link.tell(Progress(now_ns, self._link.name, done, of, left_s))
+        self._link.relay(Progress(now_ns, self._link.name, done, of, left_s))
 
     def note(self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None) -> None:
         """Write a remark into the record of the run: on a scan, on a moment, or on now. It needs no control.
@@ -296,29 +296,29 @@ class Scope(ExperimentView):
 
         Args:
             text: at most 1000 characters.
-            scan: that it belongs to: a `ScanSet`, a `Scan`, or a row of `Run.scans`.
-            time_ns: the moment that it is about, experiment time; None: when the scan was finished, or now.
+            scan: scan of the note: a `ScanSet`, a `Scan`, or a row of `Run.scans`.
+            time_ns: moment of the note, experiment time; None: the end of the scan, or now.
 
         Raises:
-            InvalidValue: the text is empty or too long, or it is not known when the scan was finished.
+            InvalidValue: the text is empty or too long, or the end of the scan is unknown.
         """
         if scan is not None and scan.time_ns is None:
-            raise InvalidValue("the scan does not say when it was finished", hint="give time_ns instead")
+            raise InvalidValue("the scan has no time of its end", hint="give time_ns instead")
         scan_ns, now_ns = None if scan is None else scan.time_ns, self._link.clock.now_ns()
         about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
-        self._tell(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
+        self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
 
     # --- leaving ---
 
     def interrupt(self) -> None:
-        """End the call that waits in another thread, as Ctrl-C does: a measurement under way is stopped."""
+        """Interrupt the call that waits in another thread, as Ctrl-C does: its measurement is stopped."""
         self._link.interrupts.interrupt()
 
     def close(self) -> None:
-        """Leave the experiment; control that is held is given back. `with afspm.connect() as scope:` does it by itself.
+        """Leave the experiment, and release control. `with afspm.connect() as scope:` does this by itself.
 
-        In a component this is done for you.
+        A component's scope is closed by its loop.
         """
         self._control.leave()
         self._link.leave()
@@ -333,16 +333,15 @@ class Scope(ExperimentView):
 
     @property
     def tenures(self) -> int:
-        """The number of times that we were given control."""
+        """Return the number of grants of control."""
         return self._control.tenures
 
     def give_back_inherited(self) -> None:
-        """Never keep control that an earlier life of this component died with. Called by the component's loop."""
+        """Release control that an earlier life of this component held at its death. Called by the component's loop."""
         self._control.gives_back_inherited = True
         self._control.release_inherited()
 
-    def _tell(self, kind: int, subject: object) -> None:
-        """Ask the scheduler itself, which needs no control."""
+    def _ask_scheduler(self, kind: int, subject: object) -> None:
         with self._call():
             response = self._link.request(kind, subject)
             if not response.ok:

@@ -1,4 +1,4 @@
-"""A scan or a spectrum as it should be taken, and whether a published result is one. Pure."""
+"""Targets: a scan or spectrum to take, and the check of published results against it. Pure."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from afspm.model.snapshot import from_plain, to_plain
 
 XY = tuple[float, float]
 
-SAME = 1e-6  # of the size: closer than any controller positions
-FITS = 1e-2  # of the size: a controller's rounding, not another region
-SPOT_M = 20e-9  # a scanner with sensors reports where the tip was, some nanometres from where it was sent
-MOVED = 0.5  # of the size: where drift is corrected, a scan lies where it turned out to have been taken
-SHEARED = 0.1  # of the size: and is as large, and as turned, as it turned out to be
+# tolerances, as parts of the size of a region
+SAME = 1e-6  # finer than any controller positions
+FITS = 1e-2  # a controller's rounding, not another region
+SPOT_M = 20e-9  # a scanner with sensors reports the real position of the tip, some nanometres from the requested one
+MOVED = 0.5  # with drift correction, a published scan has its measured position
+SHEARED = 0.1  # and its measured size and angle
 
 
 @dataclass(frozen=True)
 class ScanTarget:
-    """A scan to take. None leaves what is set.
+    """A scan to take. None: the present setting.
 
     Attributes:
         shape: (rows, columns).
@@ -50,11 +51,11 @@ class ScanTarget:
         return ScanParameters(self.region, self.shape)
 
     def facts(self) -> Plain:
-        """Return the target in JSON's types, by which a later life of the component recognises it."""
+        """Return the target in JSON's types, so that a later life of the component recognises it."""
         return {"what": self.what, **to_plain(self)}
 
     def fits(self, scan: Scan) -> bool:
-        """Return whether a scan can be this one."""
+        """Return whether a scan can be the requested one."""
         wanted = self.region
         if self.shape is not None and scan.shape != self.shape:
             return False
@@ -66,7 +67,7 @@ class ScanTarget:
         return is_near(wanted, scan.region, FITS)
 
     def name_of(self, scan: Scan) -> str:
-        """Return what is there once in a result: the channel."""
+        """Return the channel: a result has each channel once."""
         return scan.channel
 
     def describe(self, scan: Scan) -> str:
@@ -77,7 +78,7 @@ class ScanTarget:
 
 @dataclass(frozen=True)
 class SpectrumTarget:
-    """A spectrum to take. None leaves what is set, or the probe where it stands."""
+    """A spectrum to take. None: the present kind or probe position."""
 
     at_m: XY | None
     kind: str | None
@@ -94,11 +95,11 @@ class SpectrumTarget:
         return cls(None if at_m is None else xy_of(at_m), kind, frame)
 
     def facts(self) -> Plain:
-        """Return the target in JSON's types, by which a later life of the component recognises it."""
+        """Return the target in JSON's types, so that a later life of the component recognises it."""
         return {"what": self.what, **to_plain(self)}
 
     def fits(self, spectrum: Spectrum) -> bool:
-        """Return whether a spectrum can be this one."""
+        """Return whether a spectrum can be the requested one."""
         if self.kind is not None and spectrum.kind != self.kind:
             return False
         if self.at_m is None or spectrum.position_m is None or self.frame is Frame.SAMPLE:
@@ -106,7 +107,7 @@ class SpectrumTarget:
         return math.dist(self.at_m, spectrum.position_m) <= SPOT_M
 
     def name_of(self, spectrum: Spectrum) -> str:
-        """Return the same for all: there is one in a result, and the next may be of another kind."""
+        """Return the same name for all: a result has only one spectrum."""
         return ""
 
     def describe(self, spectrum: Spectrum) -> str:
@@ -118,14 +119,18 @@ Target = ScanTarget | SpectrumTarget
 
 
 def target_from(facts: Plain) -> Target:
-    """Return the target that gave these facts."""
+    """Return the target with these facts."""
     kind = SpectrumTarget if facts["what"] == SpectrumTarget.what else ScanTarget
     target: Target = from_plain(kind, {name: value for name, value in facts.items() if name != "what"})
     return target
 
 
 def xy_of(xy_m: Any) -> XY:
-    """Return a place, in numbers or as text with units, as two numbers in m. Raises InvalidValue, UnitError."""
+    """Return a position, from numbers or text with units, as (x, y) in m.
+
+    Raises:
+        InvalidValue, UnitError: the position is not valid.
+    """
     try:
         x, y = xy_m
         return si_or_text(x, "m"), si_or_text(y, "m")
@@ -138,7 +143,7 @@ def xy_of(xy_m: Any) -> XY:
 
 
 def is_set(wanted: ScanParameters, now: ScanParameters | None, tolerance: float) -> bool:
-    """Return whether what is in force is what is wanted, within `tolerance` of the size."""
+    """Return whether the wanted parameters are in force, within `tolerance` of the size."""
     if now is None or (wanted.shape is not None and wanted.shape != now.shape):
         return False
     if not isinstance(wanted.region, Region):

@@ -1,15 +1,15 @@
-"""The things that messages are about: scans, spectra, regions, states, requests. Frozen, in SI units, numpy alone.
+"""Scans, spectra, regions, states and requests: frozen values in SI units that need only numpy.
 
-**Theory of operation.** A value of the model is made once and never changes. Arrays are [y, x] with ascending
+**Theory of operation.** A value of the model never changes after its construction. Arrays are [y, x] with ascending
 coordinates; lengths are in m, angles in rad and counter-clockwise, times in ns since the Unix epoch. A name with a
 unit (`center_m`, `time_ns`) is in that unit; a value whose unit varies carries it (`Scan.unit`).
 
     comes in      decoded messages (`wire`), files of controllers (`storage.formats`), values of scripts
     state         none
     goes out      the same values to handlers, drivers, the record
-    always holds  a value that could be made is valid: constructors refuse the rest with InvalidValue
+    always holds  every value is valid: constructors refuse invalid ones with InvalidValue
 
-Beside the values stand the small pure decisions that scheduler and translator share: which connection may speak for
+The model also holds the small pure decisions that scheduler and translator share: which connection may speak for
 a name (`sessions`), which scheduler a translator obeys (`fencing`), and that a request is not executed twice
 (`idempotency_cache`).
 """

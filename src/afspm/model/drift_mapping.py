@@ -1,4 +1,4 @@
-"""Displacement of the sample and its uncertainty, as a `DriftMapping` message says them."""
+"""Displacement of the sample and its uncertainty, from the fields of a `DriftMapping` message."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 class OutcomeFields(Protocol):
-    """The fields of the message that say how the position of its scan is known."""
+    """The fields of the message about the registration of its scan."""
 
     outcome: int
     matched: bool
@@ -30,7 +30,7 @@ def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
 
 
 def drift_knowledge(message: OutcomeFields) -> tuple[RegistrationOutcome, float | None]:
-    """Return how the position of a scan is known, and its largest standard deviation (m); None: not known."""
+    """Return how the position of a scan is known, and its largest standard deviation (m); None if that is unknown."""
     outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
     if len(message.covariance) != 4:
         return outcome, None

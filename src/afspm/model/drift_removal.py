@@ -1,4 +1,4 @@
-"""Scans as they would have been taken in no time: the drift during a scan's own acquisition taken out."""
+"""Scans without the drift during their own acquisition."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Array = NDArray[np.float64]
 
 
 def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Array:
-    """Return values on the same grid as they were at the middle of the scan.
+    """Return values on the same grid as at the middle of the scan.
 
-    Rows are taken one after the other, so what is at the offset S from the centre c when half of the scan is done is
-    found at the offset q with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length
-    duration / height, negative when scanning down. Cubic splines between pixels; NaN where nothing was measured. The
-    arguments are those of `Scan.undistorted`.
+    Rows are taken one after the other. A point at the offset S from the centre c at half time is found at the offset q
+    with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length duration / height,
+    negative when scanning down. Cubic splines between pixels; NaN where nothing was measured. The arguments are those
+    of `Scan.undistorted`.
     """
     ny, nx = values.shape
     along_m, across_m = _per_scan_m(region, velocity_m_s, duration_s, upwards=upwards)
@@ -35,7 +35,7 @@ def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: flo
 
 
 def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool) -> XY:
-    """By how much the sample moves during a scan along the slow and the fast axis, counted from small y to large y."""
+    # motion of the sample during a scan along the slow and the fast axis, counted from small y to large y
     x, y = (float(v) for v in velocity_m_s)
     if not (all(map(math.isfinite, (x, y, duration_s))) and duration_s >= 0.0):
         raise InvalidValue(f"a velocity of ({x}, {y}) m/s during {duration_s} s", hint="finite, and no time below zero")
@@ -45,7 +45,7 @@ def _per_scan_m(region: Region, velocity_m_s: XY, duration_s: float, *, upwards:
 
 
 def _interpolated(values: Array, row: Array, column: Array) -> Array:
-    """Values at positions in pixels; NaN outside and wherever a neighbour is NaN."""
+    # NaN outside, and wherever a neighbour is NaN
     from scipy.ndimage import distance_transform_edt, map_coordinates
 
     ny, nx = values.shape
@@ -53,7 +53,7 @@ def _interpolated(values: Array, row: Array, column: Array) -> Array:
     inside = (row >= -1e-6) & (row <= ny - 1 + 1e-6) & (column >= -1e-6) & (column <= nx - 1 + 1e-6)
     if not known.any():
         return np.full(values.shape, np.nan)
-    if not known.all():  # splines need a number everywhere: the nearest one that was measured
+    if not known.all():  # splines need a number everywhere: take the nearest measured one
         nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
         values = values[tuple(nearest)]
         inside &= map_coordinates((~known).astype(np.float64), (row, column), order=1, mode="nearest") < 1e-6

@@ -1,4 +1,4 @@
-"""Events beside the measurements: requests, states of processes, log lines, progress."""
+"""Published events beside the measurements: requests, states of processes, log lines, progress, notes."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlRespon
 from afspm.model.state import ControlMode
 
 SUPERVISOR = "supervisor"
-"""The name of the key that allows to report on processes; each supervisor adds ":" and a suffix of its own."""
+"""Owner of the key that allows reports on processes; each supervisor adds ":" and its own suffix."""
 LOGGED_AS = "afspm"
-"""The name of the supervisor's own lines in the log."""
+"""Name of the supervisor's own log lines."""
 LONGEST_ANNOUNCEMENT = 256 * 1024
-"""Bytes that a supervisor may send at a time."""
+"""Most bytes of log lines that a supervisor sends in one message."""
 PERSON = ":"
-"""Between a component and the person that it acts for: "dashboard:Ada"."""
+"""Separates a component from the person it acts for: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
-"""In bytes: it is also the name of files, on every system."""
+"""In bytes: files are named after processes, on every system."""
 LONGEST_NOTE = 1000
 """In characters."""
 _NOT_REFUSED = (None, ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE, ControlResponse.NOT_FREE)
@@ -29,12 +29,12 @@ _PROCESS_NAME = re.compile(r"\w([\w .+-]*[\w+-])?")
 
 
 def is_process_name(name: str) -> bool:
-    """Return whether a process may be called so: letters, digits, _, -, +, dots and spaces between them."""
+    """Return whether a name is valid for a process: letters, digits, _, -, +, with dots and spaces between them."""
     return _PROCESS_NAME.fullmatch(name) is not None and len(name.encode()) <= LONGEST_PROCESS_NAME
 
 
 def component_of(who: str) -> str:
-    """Return the component in whose name something was asked, without the person."""
+    """Return the component in a name of the form "component:person"."""
     return who.partition(PERSON)[0]
 
 
@@ -47,22 +47,22 @@ class Role(Enum):
 
 
 class ProcessCondition(IntEnum):
-    """The condition of a process; the numbers of the wire."""
+    """The condition of a process; numbers as on the wire."""
 
     UNDEFINED = 0
     STARTING = 1
     ALIVE = 2
     BUSY = 3
-    """It works on a step."""
+    """The process works on a step."""
     SILENT = 4
-    """It should have been heard of."""
+    """A heartbeat is overdue."""
     RESTARTING = 5
     ENDED = 6
     GIVEN_UP = 7
 
 
 class ControlEvent(IntEnum):
-    """A change of control, mode or problems; the numbers of the wire."""
+    """A change of control, mode or problems; numbers as on the wire."""
 
     UNDEFINED = 0
     STARTED = 1
@@ -77,23 +77,24 @@ class ControlEvent(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """Something that happened. Programs go by the codes; `what` and `reason` are for people.
+    """One event of the run. Programs use the codes; `what` and `reason` are for people.
 
     Attributes:
         time_ns: experiment time, ns since the Unix epoch.
-        kind: "request", "control" (holder, mode or problems changed) or "order" (of a person, to start anew …).
-        who: the component; "component:person" where it acts for one.
+        kind: "request", "control" (holder, mode or problems changed) or "order" (of a person, e.g. to restart a
+            process).
+        who: the component; "component:person" if it acts for a person.
         what: in words, with units.
-        response: the number of a ControlResponse; None where nothing was asked.
-        reason: why it was refused, or why it happened.
-        took_s: real, from the question to the answer; None where nothing was asked.
-        event: what changed, of the kind "control".
-        request: the number of the ControlRequest that was asked; None where nothing was, or it could not be read.
-        problem: the number of the problem that was flagged, cleared or is to be solved.
-        mode: the new mode, of a MODE_CHANGED.
-        late: the answer came after the client had been told that there was none.
-        sent_ns: when it was passed on to the translator; None where it was not.
-        key: of a measurement that is taken exactly once.
+        response: the number of a ControlResponse; None for an event without a request.
+        reason: why a request was refused, or the cause of the event.
+        took_s: real time from request to answer; None for an event without a request.
+        event: the change, for entries of the kind "control".
+        request: the number of the ControlRequest; None without a request, or for an unreadable one.
+        problem: the number of the problem that was flagged or cleared, or that the request names to solve.
+        mode: the new mode, for a MODE_CHANGED.
+        late: the answer came after the client had received a NO_RESPONSE.
+        sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
+        key: key of a measurement that is taken exactly once.
     """
 
     time_ns: int
@@ -113,9 +114,9 @@ class JournalEntry:
 
     @property
     def refused(self) -> bool:
-        """True if it was asked for, and the answer was no.
+        """Return whether a request was refused.
 
-        To wait for control or for a busy microscope, and to get no answer, is not to be refused.
+        Waiting for control or for a busy microscope, and a missing answer, are no refusals.
         """
         waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
         return not waits and self.response not in _NOT_REFUSED
@@ -127,11 +128,11 @@ class ProcessState:
 
     Attributes:
         role: "scheduler", "translator", "component" …
-        since_ns: since when it is in this condition, experiment time.
-        step_age_s: real, for how long it has been working on its step.
-        starts: how often it was started.
-        pid: of the operating system; 0 if there is none.
-        last_exit: how it ended last, in words.
+        since_ns: start of this condition, experiment time.
+        step_age_s: age of the current step, in real time.
+        starts: number of starts.
+        pid: process id of the operating system; 0 if the process is not running.
+        last_exit: last end of the process, in words.
     """
 
     name: str
@@ -146,7 +147,7 @@ class ProcessState:
 
 @dataclass(frozen=True, slots=True)
 class ProcessStates:
-    """All processes of one supervisor, of which there is one on each computer."""
+    """All processes of one supervisor; each computer has one supervisor."""
 
     time_ns: int
     supervisor: str
@@ -155,7 +156,7 @@ class ProcessStates:
 
 @dataclass(frozen=True, slots=True)
 class LogLine:
-    """Something that a process said; `level` is a name of the logging module."""
+    """A log line of a process; `level` is a name of the logging module."""
 
     time_ns: int
     name: str
@@ -165,25 +166,25 @@ class LogLine:
 
 @dataclass(frozen=True, slots=True)
 class JournalEntries:
-    """Some that happened, oldest first; what a scheduler publishes at a time."""
+    """Entries that a scheduler publishes together, oldest first."""
 
     entries: tuple[JournalEntry, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class LogLines:
-    """Some that were said, oldest first; what a supervisor tells at a time."""
+    """Log lines that a supervisor sends together, oldest first."""
 
     lines: tuple[LogLine, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """The progress of the component `name` with what it set out to do.
+    """The progress of the component `name` with its task.
 
     Attributes:
-        done, of: how many of how many, of whatever it counts.
-        left_s: experiment time that the rest will take, if it goes on as it does; None if it does not say.
+        done, of: number of finished parts, and of all parts.
+        left_s: experiment time that the rest will take at the present rate; None if unknown.
     """
 
     time_ns: int
@@ -193,12 +194,12 @@ class Progress:
     left_s: float | None = None
 
     def remaining_ns(self, now_ns: int) -> int | None:
-        """Return how long it will still take, told now; None if it does not say."""
+        """Return the remaining time at the moment `now_ns`; None if unknown."""
         return None if self.left_s is None else max(0, round(self.left_s * 1e9) - max(0, now_ns - self.time_ns))
 
 
 class HasTime(Protocol):
-    """Something that was measured, and says when it was finished; None if it does not know."""
+    """A measurement with the time of its end; None if unknown."""
 
     @property
     def time_ns(self) -> int | None: ...
@@ -206,13 +207,13 @@ class HasTime(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A remark of a person, or of a component, on a scan or on a moment.
+    """A remark of a person or a component on a scan or a moment.
 
     Attributes:
-        time_ns: the moment that it is about; of a scan: when that was finished.
-        who: the author; "component:person" where a person wrote it.
-        scan_ns: of the scan that it belongs to, as in `Scan.time_ns`; None: it belongs to none.
-        written_ns: when it was written, experiment time; after the end of the experiment real time.
+        time_ns: the moment that the note is about; for a scan, the time of its end.
+        who: the author; "component:person" if a person wrote the note.
+        scan_ns: the scan of the note, as in `Scan.time_ns`; None if the note is not about a scan.
+        written_ns: time of writing, experiment time; real time after the end of the experiment.
 
     Raises:
         InvalidValue: the text is empty or too long, or has control characters besides line feeds and tabs.
@@ -235,9 +236,9 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class RelayedMessage:
-    """A message that the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress, Note.
+    """A message that the scheduler publishes for another process: ProcessStates, LogLines, Progress or Note.
 
-    Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.
+    Its envelope is the name of the message; for ProcessStates and Progress "_" and the sender's name follow.
     """
 
     message: str

@@ -1,7 +1,7 @@
-"""The one scheduler that a translator obeys: that of its own run, in its newest life.
+"""The fence of a translator: it obeys only the scheduler of its own run, in that scheduler's newest life.
 
-A scheduler puts its epoch before each request. Two experiments with
-the same addresses would else command one microscope, and neither would notice.
+A scheduler puts its epoch before each request. Without it, two experiments at the same addresses would command one
+microscope unnoticed.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ class Epoch:
 
     Attributes:
         run: the identity of the run.
-        life: grows from one life to the next.
-        simulated: whether its experiment is called so.
+        life: a number that grows from life to life.
+        simulated: whether the experiment file declares a simulation.
     """
 
     run: str
@@ -30,7 +30,7 @@ class Epoch:
     simulated: bool = False
 
     def is_followed_by(self, epoch: Epoch | None, run: str) -> bool:
-        """True for the same scheduler, a later life of it, and a component of its run."""
+        """Return whether a sender is this scheduler, a later life of it, or a component of its run."""
         return run == self.run and (epoch is None or epoch.life >= self.life)
 
     def encode(self) -> bytes:
@@ -38,17 +38,17 @@ class Epoch:
 
     @classmethod
     def decode(cls, frame: bytes) -> Epoch | None:
-        """Return what `encode` was given; None: it is something else."""
+        """Return the epoch in a frame; None if the frame holds none."""
         found = _EPOCH.fullmatch(frame)
         return None if found is None else cls(found[1].decode(), int(found[2]), found[3] == b"1")
 
 
 class SchedulerFence:
-    """Decides whether a translator obeys who asks.
+    """Decision whether a translator obeys a sender.
 
     Args:
-        run: the identity of the translator's run; empty: the scheduler that asks first is obeyed while it is connected.
-        simulated: whether its microscope is.
+        run: the identity of the translator's run; empty: the first scheduler is obeyed while it stays connected.
+        simulated: whether the microscope is simulated.
     """
 
     def __init__(self, run: str, *, simulated: bool) -> None:
@@ -57,12 +57,12 @@ class SchedulerFence:
         self._obeyed: Epoch | None = None
 
     def refusal(self, epoch: Epoch | None, run: str, is_connected: Callable[[], bool]) -> str:
-        """Why who asks is not obeyed; empty: it is.
+        """Return why a sender is refused; empty if the translator obeys it.
 
         Args:
-            epoch: of a scheduler that told it.
-            run: else that of a component that asks by itself, as its id says; empty: nothing is known.
-            is_connected: says whether the scheduler that was obeyed last still has its connection.
+            epoch: epoch in the request; None without one.
+            run: identity of the run in the id of a component's own request; empty: unknown.
+            is_connected: returns whether the scheduler that was obeyed last is still connected.
         """
         if epoch is not None and epoch.simulated and not self._simulated:
             return NOT_SIMULATED

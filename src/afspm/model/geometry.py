@@ -25,7 +25,7 @@ XY = tuple[float, float]
 
 
 class Frame(Enum):
-    """Which coordinate system a position is in."""
+    """The coordinate system of a position."""
 
     TIP = "tip"
     SAMPLE = "sample"
@@ -37,7 +37,7 @@ class Region:
 
     Attributes:
         center_m: (x, y) in m.
-        size_m: (width, height) in m before it is turned; both above zero.
+        size_m: (width, height) in m before the rotation; both above zero.
         angle_rad: counter-clockwise.
         frame: tip or sample coordinates.
 
@@ -45,7 +45,7 @@ class Region:
 
     Raises:
         InvalidValue: a value is not finite, or a size not above zero.
-        UnitError: text that is no length or angle, or has no unit.
+        UnitError: text without a length or angle, or without a unit.
     """
 
     center_m: XY
@@ -72,30 +72,34 @@ class Region:
             )
         if values[2] <= 0.0 or values[3] <= 0.0:
             raise InvalidValue(f"a region of {area_text(values[2:4])} is empty", hint="both sizes are above zero")
+        # the class is frozen; text was converted to numbers above
         object.__setattr__(self, "center_m", values[:2])
         object.__setattr__(self, "size_m", values[2:4])
         object.__setattr__(self, "angle_rad", values[4])
 
     @classmethod
     def from_top_left(cls, top_left_m: XY, size_m: XY, angle_rad: float = 0.0, frame: Frame = Frame.TIP) -> Region:
-        """Return a region by the corner of smallest x and y of the unrotated rectangle, as the wire has it."""
+        """Return a region from the corner of smallest x and y of the unrotated rectangle, as on the wire."""
         center_m = (top_left_m[0] + size_m[0] / 2, top_left_m[1] + size_m[1] / 2)
         return cls(center_m, size_m, angle_rad, frame)
 
     @property
     def top_left_m(self) -> XY:
-        """(x, y) of the unrotated rectangle's corner of smallest x and y."""
+        """Return (x, y) of the corner of smallest x and y of the unrotated rectangle."""
         return (self.center_m[0] - self.size_m[0] / 2, self.center_m[1] - self.size_m[1] / 2)
 
     def corners_m(self) -> NDArray[np.float64]:
-        """Return the four corners as turned, shape (4, 2), counter-clockwise from that of smallest x and y."""
+        """Return the four corners after the rotation, shape (4, 2), counter-clockwise from the corner of smallest x and
+        y.
+        """
+        # imported late, as in all of model: processes without values start in half the time without numpy
         import numpy as np
 
         half = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * np.asarray(self.size_m)
         return np.stack(self._in_space(half[:, 0], half[:, 1]), axis=-1)
 
     def contains(self, xy_m: XY) -> bool:
-        """Return whether a point, in the same frame, lies inside or on the border."""
+        """Return whether a point, in the same frame, lies inside the region or on its border."""
         x, y = xy_m[0] - self.center_m[0], xy_m[1] - self.center_m[1]
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return bool(abs(cos * x + sin * y) <= self.size_m[0] / 2 and abs(cos * y - sin * x) <= self.size_m[1] / 2)
@@ -111,18 +115,18 @@ class Region:
         return self._in_space(u_m, v_m)
 
     def moved_to(self, center_m: XY) -> Region:
-        """Return the same size and angle about another centre."""
+        """Return a region of the same size and angle around another centre."""
         return replace(self, center_m=center_m)
 
     def _in_space(self, u_m: Floats, v_m: Floats) -> tuple[Floats, Floats]:
-        """x and y of places that lie so far from the centre along the sides."""
+        # from offsets along the rotated sides to x and y
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
         return cos * u_m - sin * v_m + self.center_m[0], sin * u_m + cos * v_m + self.center_m[1]
 
 
 @dataclass(frozen=True)
 class RegionChange:
-    """Part of a region, as a request may give it: None is not to be changed. In m and rad, before turning."""
+    """Some fields of a region, as a request may give them, in m and rad before the rotation; None stays unchanged."""
 
     left_m: float | None = None
     low_m: float | None = None
@@ -131,10 +135,10 @@ class RegionChange:
     angle_rad: float | None = None
 
     def onto(self, region: Region) -> Region:
-        """Return `region` with what is given here changed.
+        """Return `region` with the given fields changed.
 
         Raises:
-            InvalidValue: that is no region.
+            InvalidValue: the result is not a valid region.
         """
         (left, low), (width, height) = region.top_left_m, region.size_m
         return Region.from_top_left(

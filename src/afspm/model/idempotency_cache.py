@@ -1,9 +1,9 @@
 """The idempotency cache: the outcome of each request id, so that a repeated request is not carried out twice.
 
-Memory is bounded, so outcomes are forgotten. A forgotten request is not carried out again: numbers rise within a
+Memory is bounded, so old outcomes are forgotten. A forgotten request is not carried out again: numbers rise within a
 session, and an unknown id is refused at and below the highest forgotten number of its session (its floor). Ids without
-a rising number (attempts at a measurement, and a client's own forms) are remembered apart, so that other requests do
-not displace them.
+a rising number (attempts at a measurement, and a client's own forms) are kept apart, so that other requests do not
+displace them.
 """
 
 from __future__ import annotations
@@ -25,32 +25,33 @@ _SENT_REMEMBERED = 100
 
 
 class RequestStatus(Enum):
-    """The state of a request that has no answer to repeat."""
+    """The state of a request without an answer to repeat."""
 
     PENDING = auto()
-    """It waits or is with the translator: whoever asks again gets the same answer."""
+    """Waiting, or sent to the translator: a repetition gets the same answer."""
     UNKNOWN = auto()
-    """It was sent and nobody knows whether it was carried out."""
+    """Sent, with an unknown outcome."""
     FORGOTTEN = auto()
-    """Its number is not above one that was forgotten: it may have been carried out."""
+    """At or below the floor of its session: it may have been carried out."""
 
 
 _Outcomes = Mapping[str, tuple[int, RequestStatus | Response]]
 _NONE: tuple[_Outcomes, _Outcomes] = ({}, {})
-_PART = 8  # a part of those remembered is new, and copied with each
+# the state is immutable, so each new id copies a dict: ids are added to a small dict (an eighth), and merged when full
+_PART = 8
 SentAction = tuple[str, str, int]
 """An action that was sent: client, request id, fingerprint."""
 _Shelf = tuple[str, bool]
-"""A client, and whether its ids there have numbers."""
+"""A client, and whether the ids have numbers."""
 
 
 @dataclass(frozen=True)
 class Floors:
-    """The highest number that was forgotten of each session: at and below it no id is new.
+    """The highest forgotten number of each session: ids at or below it are never new.
 
     Attributes:
-        most: sessions remembered.
-        numbers: by client and session; the one that changed last is last.
+        most: maximum number of sessions.
+        numbers: by client and session, in the order of their last change.
     """
 
     most: int = 1000
@@ -66,7 +67,7 @@ class Floors:
         return replace(self, numbers=dict([*raised.items()][-self.most :]))
 
     def is_below(self, client: str, request_id: str) -> bool:
-        """Return whether an id may have been forgotten."""
+        """Return whether an id may belong to a forgotten request."""
         numbered = number_of(request_id)
         return numbered is not None and numbered[1] <= self.numbers.get(f"{client} {numbered[0]}", -1)
 
@@ -76,12 +77,12 @@ class IdempotencyCache:
     """The status or answer of the latest request ids of each client.
 
     Attributes:
-        per_client: most ids remembered of a client, with numbers and without.
-        table: of each client the older ids and the latest.
+        per_client: maximum number of ids for each client, separately for ids with and without numbers.
+        clients: maximum number of clients.
+        sent_actions: actions that were sent to the translator, kept over a restart. The translator would not repeat
+            them, but the scheduler must not move the microscope in preparation for an action that is already done.
         floors: kept over a restart, as far as they were saved.
-        clients: most clients.
-        sent_actions: those that only we know of, kept over a restart. The translator would not do them again, but for
-            an action that was done already the microscope must not be moved.
+        table: the older and the latest ids of each client.
     """
 
     per_client: int = 256
@@ -91,9 +92,10 @@ class IdempotencyCache:
     table: Mapping[_Shelf, tuple[_Outcomes, _Outcomes]] = field(default_factory=dict)
 
     def look_up(self, client: str, request: Request) -> RequestStatus | Response | None:
-        """Return the status or answer of an id; None: it is new, or there is none."""
+        """Return the status or answer of an id; None for a new id, or without one."""
         older, latest = self.table.get(_shelf(client, request.id), _NONE)
         entry = latest.get(request.id) or older.get(request.id) if request.id else None
+        # an id at or below its floor may have been executed, so it is not new
         if entry is None:
             return RequestStatus.FORGOTTEN if self.floors.is_below(client, request.id) else None
         if entry[0] != fingerprint(request):
@@ -101,18 +103,18 @@ class IdempotencyCache:
         return entry[1]
 
     def noted(self, client: str, request: Request, outcome: RequestStatus | Response) -> IdempotencyCache:
-        """Remember the status or answer of a request that has an id."""
+        """Remember the status or answer of a request with an id."""
         return self._with(client, request.id, fingerprint(request), outcome) if request.id else self
 
     def forgotten(self, client: str, request: Request) -> IdempotencyCache:
-        """Forget a request that was not carried out: it may be tried anew."""
+        """Forget a request that was not carried out, so that it may be tried again."""
         shelf = _shelf(client, request.id)
         parts = self.table.get(shelf, _NONE)
         older, latest = ({id_: one for id_, one in part.items() if id_ != request.id} for part in parts)
         return replace(self, table={**self.table, shelf: (older, latest)})
 
     def sent(self, client: str, request: Request) -> IdempotencyCache:
-        """Remember an action over a restart."""
+        """Remember a sent action over a restart."""
         others = (one for one in self.sent_actions if one[:2] != (client, request.id))
         actions = (*others, (client, request.id, fingerprint(request)))
         floors = self.floors
@@ -121,7 +123,7 @@ class IdempotencyCache:
         return replace(self, sent_actions=actions[-_SENT_REMEMBERED:], floors=floors)
 
     def not_sent(self, client: str, request: Request) -> IdempotencyCache:
-        """Forget a request, and the action that it was."""
+        """Forget a request and its sent action."""
         rest = tuple(one for one in self.sent_actions if one[:2] != (client, request.id))
         return replace(self.forgotten(client, request), sent_actions=rest)
 
@@ -129,7 +131,7 @@ class IdempotencyCache:
         return any(one[:2] == (client, request.id) for one in self.sent_actions)
 
     def restored(self, sent_actions: Iterable[SentAction], floors: Mapping[str, int]) -> IdempotencyCache:
-        """Take up the actions that were sent before a restart: nobody knows whether they were carried out."""
+        """Take up the actions that were sent before a restart, whose outcome is unknown."""
         cache = replace(self, sent_actions=tuple(sent_actions), floors=replace(self.floors, numbers=dict(floors)))
         for client, request_id, print_ in cache.sent_actions:
             cache = cache._with(client, request_id, print_, RequestStatus.UNKNOWN)
@@ -137,9 +139,9 @@ class IdempotencyCache:
 
     def _with(self, client: str, request_id: str, print_: int, outcome: RequestStatus | Response) -> IdempotencyCache:
         table, floors, shelf = dict(self.table), self.floors, _shelf(client, request_id)
-        older, latest = table.pop(shelf, ({}, {}))  # the client heard last is last
+        older, latest = table.pop(shelf, ({}, {}))  # clients in the order of their last request: the first is dropped
         latest = {**latest, request_id: (print_, outcome)}
-        if len(latest) * _PART > self.per_client:  # few are copied each time
+        if len(latest) * _PART > self.per_client:  # merge the small dict into the large one
             all_ = [*{**older, **latest}.items()]
             floors = floors.forgetting(client, (id_ for id_, _ in all_[: -self.per_client]))
             older, latest = dict(all_[-self.per_client :]), {}
@@ -155,5 +157,5 @@ def _shelf(client: str, request_id: str) -> _Shelf:
 
 
 def fingerprint(request: Request) -> int:
-    """Return a number that tells requests apart that were given the same id; the same in every process."""
+    """Return a checksum that distinguishes requests with the same id; equal in every process."""
     return zlib.crc32(request.payload, request.kind)

@@ -1,7 +1,7 @@
-"""Levelling of scans: a polynomial surface is fitted to the heights and taken away. Pure.
+"""Levelling of scans: subtract a polynomial surface fitted to the heights. Pure.
 
-Heights are fitted over x and y from -1 to 1, so that the result does not depend on the scan's size. What was not
-measured (NaN) takes no part.
+Heights are fitted over x and y from -1 to 1, so that the result does not depend on the scan's size. NaN (not measured)
+is left out of the fit.
 """
 
 from __future__ import annotations
@@ -19,18 +19,19 @@ from afspm.model.line_levelling import Levelling
 
 Floats = NDArray[np.float64]
 _MOST_PIXELS: Final = 4096
-"""Robust fits look at so many pixels at most, spread over the scan."""
+"""Most pixels of a robust fit, spread over the scan."""
 _ROUNDS: Final = 50
 _TRIALS: Final = 200
+# Huber's constant: 95 % of the efficiency of least squares for normally distributed noise
 _HUBER: Final = 1.345
 _MAD: Final = 1.4826
-"""From the median of absolute deviations to a standard deviation."""
+"""Standard deviation of a normal distribution, in median absolute deviations."""
 
 
 def levelled(
     values: Floats, order: int = 1, fit: str = "least-squares", quantile: float = 0.5, rows: str | None = None
 ) -> Floats:
-    """Return values [y, x], NaN where nothing was measured, without a polynomial surface; see `Scan.levelled`."""
+    """Return values [y, x] without a polynomial surface, NaN where nothing was measured; see `Scan.levelled`."""
     if fit not in FITS:
         raise InvalidValue(f"there is no fit {fit!r}", hint=f"one of {', '.join(sorted(FITS))}")
     if order not in range(4) or not 0.0 < quantile < 1.0:
@@ -45,7 +46,7 @@ def levelled(
     if known.sum() < 2 * len(terms):
         raise InvalidValue("too little was measured to level it")
     columns, heights = terms[:, known].T, values[known]
-    scale = float(np.ptp(heights)) or 1.0  # heights are nanometres: in units of their range, limits hold for all
+    scale = float(np.ptp(heights)) or 1.0  # in units of their range: one set of limits fits any height
     solve = partial(_quantile, quantile=quantile) if fit == "quantile" else FITS[fit]
     coefficients = solve(columns, (heights - heights.mean()) / scale)
     surface: Floats = np.tensordot(coefficients, terms, 1) * scale + heights.mean()
@@ -53,7 +54,7 @@ def levelled(
 
 
 def _terms(shape: tuple[int, ...], order: int) -> Floats:
-    """[term, y, x]: 1, x, y, x² … up to the order."""
+    # [term, y, x]: 1, x, y, x² … up to the order
     y, x = (np.linspace(-1.0, 1.0, count) for count in shape)
     powers = [(i, j) for total in range(order + 1) for i in range(total + 1) for j in [total - i]]
     return np.stack([np.outer(y**j, x**i) for i, j in powers])
@@ -70,7 +71,6 @@ def _weighted(columns: Floats, heights: Floats, weights: Floats) -> Floats:
 
 
 def _reweighted(columns: Floats, heights: Floats, weigh: Callable[[Floats], Floats]) -> Floats:
-    """Iteratively reweighted least squares."""
     columns, heights = _few(columns, heights)
     coefficients = _least_squares(columns, heights)
     for _ in range(_ROUNDS):
@@ -82,6 +82,7 @@ def _reweighted(columns: Floats, heights: Floats, weigh: Callable[[Floats], Floa
 
 def _huber(columns: Floats, heights: Floats) -> Floats:
     def weigh(residuals: Floats) -> Floats:
+        # the floors keep a perfectly flat scan from a division by zero
         sigma = max(_MAD * float(np.median(np.abs(residuals))), 1e-9)
         return np.minimum(1.0, _HUBER * sigma / np.maximum(np.abs(residuals), 1e-12))
 
@@ -96,14 +97,15 @@ def _quantile(columns: Floats, heights: Floats, quantile: float) -> Floats:
 
 
 def _samples(columns: Floats, heights: Floats) -> Floats:
-    """Exact fits, [trial, term], each through as few pixels as it takes; the choice is always the same."""
+    # [trial, term]: exact fits through the fewest pixels that determine a surface; with a fixed seed, so that levelling
+    # the same scan twice gives the same values
     chance = np.random.default_rng(0)
     rows = [chance.choice(len(heights), columns.shape[1], replace=False) for _ in range(_TRIALS)]
     return np.array([_least_squares(columns[row], heights[row]) for row in rows])
 
 
 def _theil_sen(columns: Floats, heights: Floats) -> Floats:
-    """After Theil and Sen: the median of what small samples say, term by term, and then of the height."""
+    # Theil and Sen: the median over small samples, term by term, then of the height
     columns, heights = _few(columns, heights)
     coefficients = np.median(_samples(columns, heights), axis=0).astype(np.float64)
     coefficients[0] += np.median(heights - columns @ coefficients)
@@ -111,7 +113,7 @@ def _theil_sen(columns: Floats, heights: Floats) -> Floats:
 
 
 def _ransac(columns: Floats, heights: Floats) -> Floats:
-    """Return the surface that most pixels agree with, within their scatter; fitted to those."""
+    # RANSAC: the surface with the most pixels within the scatter, fitted again to these pixels
     columns, heights = _few(columns, heights)
     residuals = np.abs(heights - _samples(columns, heights) @ columns.T)
     limit = max(2.5 * _MAD * float(np.median(residuals, axis=1).min()), 1e-9)
@@ -121,12 +123,13 @@ def _ransac(columns: Floats, heights: Floats) -> Floats:
 
 def _few(columns: Floats, heights: Floats) -> tuple[Floats, Floats]:
     step = max(1, len(heights) // _MOST_PIXELS)
+    # spread over the scan by chance, but with a fixed seed: the same scan is always levelled alike
     chosen = np.random.default_rng(1).permutation(len(heights))[::step] if step > 1 else slice(None)
     return columns[chosen], heights[chosen]
 
 
 ROWS: Final = {"median": Levelling.MEDIANS, "difference": Levelling.DIFFERENCES, "line": Levelling.LINES}
-FITS: Final[dict[str, Callable[..., Floats]]] = {  # from the terms, [pixel, term], and the heights to coefficients
+FITS: Final[dict[str, Callable[..., Floats]]] = {  # (terms [pixel, term], heights) -> coefficients
     "least-squares": _least_squares,
     "huber": _huber,
     "quantile": _quantile,

@@ -1,4 +1,4 @@
-"""Level scans for looking at them; what is published stays as it is."""
+"""Levelling of scans for display; published values stay unchanged."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+# standard deviation of a normal distribution, in median absolute deviations
 _SD_PER_MAD = 1.4826
 _OUTLIERS_SD = 4.0
 
@@ -17,18 +18,18 @@ class Levelling(Enum):
 
     NONE = "none"
     PLANE = "plane"
-    """The plane that fits best (least squares)."""
+    """The best-fitting plane (least squares)."""
     LINES = "lines"
-    """Of each line, the straight line along the fast axis that fits best."""
+    """The best-fitting straight line of each row."""
     MEDIANS = "medians"
-    """Of each line, its median."""
+    """The median of each row."""
     DIFFERENCES = "differences"
-    """Of each line, the median of its differences from the line before, added up: features longer than half a line
-    do no harm."""
+    """The median difference of each row from the row before, summed up: features longer than half a row do no
+    harm."""
 
 
 def levelled(values: Array, how: Levelling) -> Array:
-    """Return values [y, x] without their background; what is not finite stays, and counts for nothing."""
+    """Return values [y, x] without their background; values that are not finite stay and are left out of the fit."""
     if how is Levelling.NONE or not values.size:
         return values
     finite = np.isfinite(values)
@@ -38,7 +39,7 @@ def levelled(values: Array, how: Levelling) -> Array:
 
 
 def flattened(values: Array) -> Array:
-    """Return values with their lines brought to one height and without their plane: as small pictures show them.
+    """Return values with all lines at one height and without a plane, as for small pictures.
 
     Outliers are masked: neither a scar nor a high particle tilts its neighbours.
     """
@@ -48,12 +49,12 @@ def flattened(values: Array) -> Array:
         return flat
     from_middle = np.abs(flat - np.median(flat[finite]))
     near = finite & (from_middle <= _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
-    # more than half of the values lie within: a plane through them always exists
+    # at least half of the values are within this limit, so there is always a plane through them
     return flat - _plane(flat, near)
 
 
 def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:
-    """The plane through the finite values, by the normal equations in coordinates about their middle."""
+    # normal equations in coordinates about the mean position, which keep the sums small
     weights = finite.astype(np.float64)
     known = np.where(finite, values, 0.0)
     x, y = (np.arange(n, dtype=np.float64) for n in reversed(values.shape))
@@ -65,7 +66,7 @@ def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:
     xx, yy, xy = columns @ x**2, rows @ y**2, y @ weights @ x
     by_column, by_row = known.sum(axis=0), known.sum(axis=1)
     matrix = np.array([[xx, xy], [xy, yy]])
-    # one row or column alone has no slope across it: the least of all that fit
+    # lstsq, not solve: a single row or column leaves one slope undetermined, which then is zero
     slope_x, slope_y = np.linalg.lstsq(matrix, np.array([by_column @ x, by_row @ y]), rcond=1e-12)[0]
     return np.asarray(mean + slope_x * x[None, :] + slope_y * y[:, None])
 
@@ -85,13 +86,14 @@ def _lines(values: Array, finite: NDArray[np.bool_]) -> Array:
 
 def _medians(values: Array, finite: NDArray[np.bool_]) -> Array:
     medians = np.zeros((len(values), 1))
+    # numpy warns of a median over no values
     some = finite.any(axis=1)
     medians[some] = np.nanmedian(np.where(finite, values, np.nan)[some], axis=1, keepdims=True)
     return medians
 
 
 def _differences(values: Array, finite: NDArray[np.bool_]) -> Array:
-    some = finite.any(axis=1)  # the line before is the last that has values
+    some = finite.any(axis=1)  # rows without values are skipped: the previous row is the last with values
     known, there = np.where(finite, values, 0.0)[some], finite[some]
     offsets = np.zeros((len(values), 1))
     offsets[some] = np.cumsum([[0.0], *_medians(np.diff(known, axis=0), there[1:] & there[:-1])], axis=0)

@@ -1,4 +1,4 @@
-"""The microscope as far as it is known: what it does, whether it can be trusted, and what endangers its tip."""
+"""The known status of the microscope: its activity, whether its controller is lost, and the danger to its tip."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from afspm.basics.frozen import replace
 from afspm.model import Feedback, Parameter, Request, ScopeState, names
 
 FEEDBACK_OFF = "feedback-off"
-"""The name of the dangerous state in which the feedback is known to be switched off."""
+"""Name, among the dangerous states, of a feedback that is known to be off."""
 STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
-"""The actions that stop what runs."""
+"""Actions that stop a running scan or spectrum."""
 STARTS = {names.START_SCAN: names.STOP_SCAN, names.START_SPEC: names.STOP_SPEC}
-"""The actions that start something, with those that stop it."""
-_OFF = names.OFF_WORDS | {"0.0"}  # a translator that is not ours may take a number
+"""Actions that start a scan or spectrum, with the actions that stop it."""
+_OFF = names.OFF_WORDS | {"0.0"}  # translators of other makes may take a number
 
 
 @dataclass(frozen=True)
@@ -22,8 +22,8 @@ class TipRisk:
     """The part of the status that endangers the tip; it survives a restart.
 
     Attributes:
-        state: the last that is known; a microscope that is lost goes on with it.
-        feedback_on: None: not known.
+        state: the last known state; a microscope whose controller is lost goes on with it.
+        feedback_on: None if unknown.
         tip_away: the tip is withdrawn: neither the coarse motor nor a feedback that is off does harm.
     """
 
@@ -38,14 +38,14 @@ class MicroscopeStatus:
 
     Attributes:
         dangerous: names of ScopeState, and "feedback-off".
-        patience_s: how long (real) the controller may be lost before that is a problem: one that is found again within
-            that time costs nothing, what runs there goes on.
-        state: as it was told last; UNDEFINED of a microscope whose controller is gone or makes no sense.
-        states_seen: how many states have been told.
-        lost_since_s: since when (real) nothing is known of it.
-        feedback_before: what the feedback was before a request of unknown outcome.
+        patience_s: real time that the controller may be lost before that is a problem. A controller that returns within
+            this time costs nothing: its scan goes on.
+        state: the last published state; UNDEFINED for a controller that is gone or answers nonsense.
+        states_seen: number of states received.
+        lost_since_s: real time since when nothing is known of the microscope.
+        feedback_before: the feedback before a request of unknown outcome.
         in_doubt: there is such a request.
-        told: the danger that was logged.
+        logged: the danger that was logged last.
     """
 
     dangerous: Collection[str] = ()
@@ -56,27 +56,27 @@ class MicroscopeStatus:
     risk: TipRisk = TipRisk()
     feedback_before: bool | None = None
     in_doubt: bool = False
-    told: str | None = None
+    logged: str | None = None
 
     @property
     def is_free(self) -> bool:
-        """True while it does nothing, as far as is known."""
+        """Return whether the microscope is free, as far as is known."""
         return self.state is ScopeState.FREE or not self.states_seen
 
     @property
     def lost_at_s(self) -> float | None:
-        """When, real, it has been lost for too long; None: it is not lost."""
+        """Return the real time at which a loss becomes a problem; None if the microscope is not lost."""
         return None if self.lost_since_s is None else self.lost_since_s + self.patience_s
 
     def with_state(self, state: ScopeState, now_s: float) -> MicroscopeStatus:
-        """Take the state that the translator told."""
-        told = replace(self, state=state, states_seen=self.states_seen + 1)
+        """Take a state that the translator published."""
+        changed = replace(self, state=state, states_seen=self.states_seen + 1)
         if state is ScopeState.UNDEFINED:
-            return replace(told, lost_since_s=now_s) if self.lost_since_s is None else told
-        return replace(told, lost_since_s=None)._with_risk(replace(self.risk, state=state))
+            return replace(changed, lost_since_s=now_s) if self.lost_since_s is None else changed
+        return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
-        """Take what is known of the feedback now."""
+        """Take the present feedback."""
         if feedback.on is None:
             return self
         certain = replace(self, in_doubt=False)
@@ -86,14 +86,14 @@ class MicroscopeStatus:
         return certain._with_risk(replace(self.risk, feedback_on=feedback.on, tip_away=away))
 
     def feedback_may_be_off(self) -> MicroscopeStatus:
-        """Reckon with a feedback that is off: a request switches it off, or may have done so."""
+        """Assume that the feedback is off: a request switches it off, or may have done so."""
         changed = self.with_feedback(Feedback(on=False))
         if changed.risk.feedback_on is self.risk.feedback_on:
             return changed
         return replace(changed, feedback_before=self.risk.feedback_on, in_doubt=True)
 
     def feedback_was_left(self) -> MicroscopeStatus:
-        """Undo `feedback_may_be_off`: the request was refused."""
+        """Undo `feedback_may_be_off` after a refusal of the request."""
         if not self.in_doubt:
             return self
         return replace(self, in_doubt=False)._with_risk(replace(self.risk, feedback_on=self.feedback_before))
@@ -102,7 +102,8 @@ class MicroscopeStatus:
         return self._with_risk(replace(self.risk, tip_away=away))
 
     def after_action(self, action: str, *, is_away: bool) -> MicroscopeStatus:
-        """Take an action that was, or may have been, carried out: what does not just start or stop may move the tip."""
+        """Take an action that was, or may have been, carried out: all but starts and stops may move the tip."""
+        # to start or stop a scan or spectrum neither engages nor withdraws the tip
         only_runs = action in STARTS or action in STOPS.values()
         return self if only_runs else self.with_tip(away=is_away)
 
@@ -113,7 +114,7 @@ class MicroscopeStatus:
 
     @property
     def danger(self) -> str | None:
-        """The danger that the tip is in, in words; None: none, or it was seen to."""
+        """Return the danger to the tip, in words; None if there is none, or it is averted."""
         if self.risk.tip_away:
             return None
         if self.endangered_by_feedback:
@@ -122,17 +123,17 @@ class MicroscopeStatus:
         return f"the microscope is in {name}" if name in self.dangerous else None
 
     def telling(self) -> tuple[MicroscopeStatus, str | None]:
-        """Return the danger if it was not logged yet: each once."""
+        """Return the danger if it was not logged yet, so that each is logged once."""
         danger = self.danger
-        return replace(self, told=danger), None if danger == self.told else danger
+        return replace(self, logged=danger), None if danger == self.logged else danger
 
     def _with_risk(self, risk: TipRisk) -> MicroscopeStatus:
         changed = replace(self, risk=risk)
-        return replace(changed, told=None) if changed.danger is None else changed
+        return replace(changed, logged=None) if changed.danger is None else changed
 
 
 def feedback_of(request: Request) -> Feedback | None:
-    """Return the feedback that a request sets; None: it sets none of it."""
+    """Return the feedback that a request sets; None if it sets none."""
     subject = request.subject
     if isinstance(subject, Parameter) and subject.name == names.FEEDBACK_ON and subject.value is not None:
         return Feedback(on=subject.value.strip().lower() not in _OFF)

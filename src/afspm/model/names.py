@@ -1,4 +1,4 @@
-"""Names of actions and parameters. Those beginning with `x-` are extensions to those of the paper."""
+"""Names of actions and parameters. Names that begin with `x-` are extensions to those of the paper."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STOP_SPEC: Final = "stop-spec"
 
 BASE_ACTIONS: Final = (START_SCAN, STOP_SCAN, START_SPEC, STOP_SPEC)
 
-# Tip preparation and safety, where a microscope has them.
+# Tip preparation and safety, on microscopes with these actions.
 PULSE: Final = "x-pulse"
 CRASH: Final = "x-crash"
 RETRACT: Final = "x-retract"
@@ -20,7 +20,7 @@ ENGAGE: Final = "x-engage"
 EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
 
 AT_PROBE: Final = frozenset({START_SPEC, PULSE, CRASH})
-"""What is done at the probe position."""
+"""The kind of spectroscopy at the probe position."""
 
 SCAN_TOP_LEFT_X: Final = "scan-top-left-x"
 SCAN_TOP_LEFT_Y: Final = "scan-top-left-y"
@@ -71,13 +71,13 @@ SPEC_KIND: Final = "x-spec-kind"
 FEEDBACK_ON: Final = "x-feedback-on"
 ON_WORDS: Final = frozenset({"true", "1", "on", "yes"})
 OFF_WORDS: Final = frozenset({"false", "0", "off", "no"})
-"""How a peer may say what a switch is to be, in lower case."""
+"""Texts that a peer may send for a switch, in lower case."""
 ENGAGED: Final = "x-engaged"
-"""Whether the tip is at the sample, where a microscope tells; it can only be read."""
+"""Whether the tip is at the sample, if the microscope reports it; read-only."""
 CONTROLLER: Final = "x-controller"
-"""The controller's name and version, as a text that can only be read."""
+"""The controller's name and version as a text; read-only."""
 
-# Of the slow axis: "up" (small y first) or "down".
+# Direction of the slow axis: "up" (small y first) or "down".
 SCAN_DIRECTION: Final = "x-scan-direction"
 UP: Final = "up"
 DOWN: Final = "down"
@@ -86,6 +86,6 @@ EXTENSION_PARAMETERS: Final = (
     FEEDBACK_ON, SPEC_KIND, SCAN_DIRECTION, PULSE_VOLTAGE, PULSE_DURATION, CRASH_SPEED, CRASH_DEPTH, CONTROLLER,
 )  # fmt: skip
 
-# The velocity with which a controller moves its tip along with a sample that drifts.
+# Velocity with which a controller moves its tip to follow a drifting sample.
 DRIFT_RATE_X: Final = "x-drift-rate-x"
 DRIFT_RATE_Y: Final = "x-drift-rate-y"

@@ -1,4 +1,4 @@
-"""A published packet, and its header, which is known without reading its values."""
+"""A published packet, and its header, which can be read without the values."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ class Packet:
     """A published message.
 
     Attributes:
-        envelope: the text by which it is subscribed to.
+        envelope: the topic of the packet, to which receivers subscribe.
         payload: the serialised message.
-        time_ns: when it was first published, ns since the Unix epoch; None from peers that do not say.
+        time_ns: time of its first publication, ns since the Unix epoch; None from peers that give none.
     """
 
     envelope: str
@@ -22,11 +22,11 @@ class Packet:
 
 
 class LoggedPacket(NamedTuple):
-    """A packet as it stands in the packet log.
+    """A packet with its fields in the packet log.
 
     Attributes:
-        source_ns: the time that the translator gave it; None: it is the scheduler's own.
-        history: how many packets of its envelope the scheduler's cache keeps; 0: this one is not cached.
+        source_ns: the translator's time of the packet; None for the scheduler's own packets.
+        history: number of packets of its envelope that the scheduler's cache keeps; 0: not cached.
     """
 
     packet: Packet
@@ -40,10 +40,10 @@ class PacketHeader:
 
     Attributes:
         message: the name of the message, e.g. "Scan2d".
-        channel: of a scan or a list of places.
+        channel: channel of a scan or a list of places.
         size_m: (x, y) of a scan's region.
-        kind: of a spectrum, e.g. "IV".
-        time_ns: when it was measured, ns since the Unix epoch, if it says.
+        kind: kind of a spectrum, e.g. "IV".
+        time_ns: time of measurement, ns since the Unix epoch; None if the message has none.
     """
 
     message: str

@@ -1,4 +1,4 @@
-"""Where the scan and the probe are, in tip coordinates, and the parameters that are a part of that."""
+"""Position of scan and probe in tip coordinates, and the parameters that are parts of it."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ REGION_CHANGES: dict[str, Callable[[float], RegionChange]] = {
 
 _CORNER_AND_SIZE = REGION_CHANGES.keys() - {names.SCAN_ANGLE}
 _ANYWHERE = Region((0.0, 0.0), (1.0, 1.0))
-"""A placeholder, every part of which is replaced at once."""
+"""A placeholder: every field is replaced at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class KnownPosition:
-    """The place of the scan and of the probe, as far as it was set or published.
+    """The position of scan and probe, as far as it was set or published.
 
     Attributes:
         region, shape: of the scan; the shape as (rows, columns).
@@ -46,16 +46,16 @@ class KnownPosition:
     probe_m: XY | None = None
 
     def learn(self, subject: object) -> KnownPosition:
-        """Take a place, or a part of one, that was set or told."""
-        with suppress(InvalidValue):  # a part of a region that is not known yet
+        """Take a position, or a part of one, that was set or published."""
+        with suppress(InvalidValue):  # a part of an unknown region
             return self.onto(subject)
         return self
 
     def onto(self, subject: object) -> KnownPosition:
-        """Return the places after a place, or a part of one, was set.
+        """Return the positions after a position, or a part of one, was set.
 
         Raises:
-            InvalidValue: a part of a region that is not known, or no region.
+            InvalidValue: a part of an unknown region, or an invalid region.
         """
         if isinstance(subject, ScanParameters):
             scan = subject.onto(ScanParameters(self.region, self.shape))
@@ -68,7 +68,7 @@ class KnownPosition:
         return self
 
     def learn_values(self, values: Iterable[tuple[str, float]]) -> KnownPosition:
-        """Take single parameters, by their names, in SI; what is no place is not learned."""
+        """Take single parameters by name, in SI; parameters that are no position are ignored."""
         known = self
         with suppress(InvalidValue):
             for change in changes_by(values):
@@ -78,10 +78,10 @@ class KnownPosition:
     def was_read(self, values: Mapping[str, float | None]) -> KnownPosition:
         """Take the values of single parameters, read together; a parameter that is missing keeps its value.
 
-        A frame without an angle, on a microscope that has no such parameter, is not turned.
+        On a microscope without an angle parameter a frame counts as unrotated.
 
         Args:
-            values: None where the microscope answered no number.
+            values: None for a parameter that the microscope answered with no number.
         """
         wrong = [name for name, value in values.items() if value is None]
         known = self.without(wrong)
@@ -98,12 +98,12 @@ class KnownPosition:
             try:
                 for change in changes_by(given):
                     known = known.onto(change)
-            except InvalidValue:  # a frame of no size, half a pixel: what the microscope answered is no place
+            except InvalidValue:  # the microscope answered nonsense: a frame without size, half a pixel
                 known = known.without([name for name, _ in given])
         return known
 
     def without(self, names_: Collection[str]) -> KnownPosition:
-        """Forget the places of unknown parameters."""
+        """Forget the positions that depend on the named parameters."""
         return KnownPosition(
             None if REGION_CHANGES.keys() & names_ else self.region,
             None if SHAPE_CHANGES.keys() & names_ else self.shape,
@@ -112,10 +112,10 @@ class KnownPosition:
 
 
 def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | ScanParameters]:
-    """Return how single parameters, set together, move the probe and the scan.
+    """Return the changes of probe and scan by single parameters that are set together.
 
     Raises:
-        InvalidValue: a number of pixels that is none.
+        InvalidValue: a number of pixels that is not a whole number.
     """
     given: dict[type, Plain] = {}
     for name, value in values:
@@ -143,12 +143,12 @@ def changes_by(values: Iterable[tuple[str, float]]) -> list[PositionChange | Sca
 
 
 def moved(xy_m: XY, change: PositionChange) -> XY:
-    """Where the probe is after it was moved along one axis, or both."""
+    """Return the probe position after a move along one axis or both."""
     return (xy_m[0] if change.x_m is None else change.x_m, xy_m[1] if change.y_m is None else change.y_m)
 
 
 def scan_values(wanted: ScanParameters) -> list[tuple[str, float]]:
-    """The parameters that a request for a scan sets, with their values in SI."""
+    """Return the parameters that a request for a scan sets, with values in SI."""
     region, values = wanted.region, list[tuple[str, float]]()
     if isinstance(region, Region):
         (left, low), (width, height) = region.top_left_m, region.size_m

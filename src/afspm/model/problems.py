@@ -1,4 +1,4 @@
-"""Problems by name: those of the wire, and those that an experiment file adds."""
+"""Problems by name: the problems of the wire, and further ones of an experiment file."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from enum import IntEnum
 
 from afspm.basics.errors import InvalidValue
 
-HIGHEST_PROBLEM = 255  # a problem travels as one byte
+HIGHEST_PROBLEM = 255  # one byte on the wire
 
 
 class Problem(IntEnum):
-    """Problems of an experiment. Experiment files name more of them, with numbers above these."""
+    """Problems of every experiment. Experiment files name more, with higher numbers."""
 
     NONE = 0
     TIP_SHAPE_CHANGED = 1
@@ -22,10 +22,10 @@ class Problem(IntEnum):
 
 
 class ProblemNames(Mapping[str, int]):
-    """The problems that an experiment knows: name -> number, and back.
+    """The problems of an experiment: name -> number, and back.
 
     Args:
-        named: the problems of the experiment file, names and numbers (5 to 255).
+        named: names and numbers (5 to 255) of the problems in the experiment file.
 
     Raises:
         InvalidValue: a number or name is taken or out of range.
@@ -52,7 +52,7 @@ class ProblemNames(Mapping[str, int]):
         """Return the number of a problem given by number or by name ("tip-shape-changed", "EP_TIP_SHAPE_CHANGED").
 
         Raises:
-            InvalidValue: no such problem.
+            InvalidValue: there is no such problem.
         """
         if isinstance(problem, str):
             number = self._numbers.get(_plain(problem))
@@ -68,7 +68,7 @@ class ProblemNames(Mapping[str, int]):
         return int(problem)
 
     def name(self, number: int) -> str:
-        """Return the name of a problem; a number that nobody named is told as such."""
+        """Return the name of a problem; "problem 7" for a number without a name."""
         return self._names.get(number, f"problem {number}")
 
     def __getitem__(self, name: str) -> int:
@@ -82,5 +82,5 @@ class ProblemNames(Mapping[str, int]):
 
 
 def _plain(name: str) -> str:
-    """ "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" as "tip-shape-changed"."""
+    # "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" become "tip-shape-changed"
     return name.strip().lower().replace("_", "-").replace(" ", "-").removeprefix("ep-")

@@ -11,11 +11,11 @@ class RegistrationOutcome(IntEnum):
     """How the position of a scan is known; numbers as on the wire."""
 
     REGISTERED = 1
-    """Recognised in an earlier scan, or the first scan of all."""
+    """Matched with an earlier scan, or the first scan of all."""
     COARSE = 2
     """The estimator failed, and a coarse estimate took its place."""
     REFUSED = 3
-    """Recognised in none of the earlier scans of its place: the position is dead reckoning."""
+    """Matched with none of the earlier scans of its place: the position is dead reckoning."""
     FAILED = 4
     """Not registered because of an error, a time limit or a missing channel: the position is dead reckoning."""
     NEW = 5
@@ -23,13 +23,19 @@ class RegistrationOutcome(IntEnum):
 
     @classmethod
     def of(cls, number: int, *, matched: bool) -> RegistrationOutcome:
-        """Return the outcome on the wire; of a peer that does not publish one, by whether the scan was matched."""
+        """Return the outcome for a number of the wire. A peer without outcomes publishes only whether the scan was
+        matched.
+        """
         known = {one.value for one in cls}
         return cls(number) if number in known else cls.REGISTERED if matched else cls.REFUSED
 
     @classmethod
     def from_label(cls, label: str) -> RegistrationOutcome:
-        """Return the outcome of a table. Raises ValueError: there is no such outcome."""
+        """Return the outcome for a label in a table.
+
+        Raises:
+            ValueError: there is no such outcome.
+        """
         for one in cls:
             if one.label == label:
                 return one
@@ -37,7 +43,7 @@ class RegistrationOutcome(IntEnum):
 
     @property
     def is_registered(self) -> bool:
-        """Return whether the position was measured; else it is dead reckoning."""
+        """Return whether the position was measured, and not by dead reckoning."""
         return self in (RegistrationOutcome.REGISTERED, RegistrationOutcome.COARSE)
 
     @property
@@ -55,7 +61,7 @@ _NOTES = {
 
 
 def registration_summary(outcomes: Iterable[RegistrationOutcome]) -> str:
-    """Return the counts as people read them: "registered 5 of 12 scans, 6 failed, 1 not recognised"."""
+    """Return the counts as a text: "registered 5 of 12 scans, 6 failed, 1 not recognised"."""
     counts = Counter(outcomes)
     registered = sum(count for outcome, count in counts.items() if outcome.is_registered)
     notes = [note.format(counts[outcome]) for outcome, note in _NOTES.items() if counts[outcome]]

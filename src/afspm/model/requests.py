@@ -1,4 +1,4 @@
-"""Requests and responses, as components, scheduler and translator speak of them."""
+"""Requests and responses between components, scheduler and translator."""
 
 from __future__ import annotations
 
@@ -28,25 +28,26 @@ class ControlRequest(IntEnum):
     ACTION_SUPPORT = 12
 
 
+# numbers from 100 on are extensions of afspm, unknown to the published implementation
 CLOCK_REQUEST = 101
-"""A request of ours: what time it is in the experiment."""
+"""Request for the experiment time; an extension of afspm."""
 RELAY_REQUEST = 102
-"""A request of ours: a supervisor has something to publish; its answer are orders to it."""
+"""Request to publish a message of the sender; the answer to a supervisor holds orders. An extension of afspm."""
 RESTART_REQUEST = 103
-"""A request of ours: a process is to be started anew; its subject is the process's name."""
+"""Request to restart the process named by its subject; an extension of afspm."""
 LEASE_REQUEST = 104
-"""A request of ours: the holder loses control when it has let so many real seconds pass without
-another command or another of these, whatever the microscope does; its subject is that number."""
+"""Request of the holder to lose control after a time without another command or lease request, also while a scan is
+running; the subject is this time in real seconds. An extension of afspm."""
 LONGEST_LEASE_S = 86_400.0
 
 OTHER_RUN_RESPONSE = 100
-"""A response of ours, and only to those who named their run: it is not that of the scheduler."""
+"""Response to a component that named another run than the scheduler's; an extension of afspm."""
 
 _OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART", LEASE_REQUEST: "LEASE"}
 
 
 def request_name(kind: int) -> str:
-    """Return a request in words."""
+    """Return the name of a request for people."""
     known = next((request.name for request in ControlRequest if request == kind), None)
     return known or _OURS.get(kind, f"request {kind}")
 
@@ -72,27 +73,27 @@ class ControlResponse(IntEnum):
 WAIT_FOR_CONTROL = frozenset(
     {ControlResponse.ALREADY_UNDER_CONTROL, ControlResponse.WRONG_CONTROL_MODE, ControlResponse.WRONG_EXP_PROBLEM}
 )
-"""Answers to a request for control that will be granted later: nothing was refused, the component waits."""
+"""Answers to a request for control that are no refusals: the component waits for control."""
 
 
 class RescanKind(IntEnum):
-    """Requests to a Rescanner; a message of ours."""
+    """Requests to a Rescanner, a message that only afspm has."""
 
     AGAIN = 1
-    """The same region."""
+    """Scan the same region again."""
     OPPOSITE = 2
-    """In the other direction of the slow axis."""
+    """Scan it in the other direction of the slow axis."""
     SEARCH = 3
-    """A wider region, until the sample is found."""
+    """Scan a wider region, until the sample is found."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter by name. Without a value it is asked for; with one it is set, or told.
+    """A parameter by name: without a value in a request to read it, with a value when it is set or published.
 
     Attributes:
-        value: as text, in `unit`; None to get it.
-        unit: None if none was given: SI then.
+        value: as text, in `unit`; None to read it.
+        unit: None if none was given; then SI.
     """
 
     name: str
@@ -106,10 +107,10 @@ class Request:
 
     Attributes:
         kind: the number of a ControlRequest.
-        subject: what it is about: a ScanParameters, Feedback, ProbePosition or Parameter, the name of an action,
-            the number of a problem or control mode; None if nothing.
-        payload: the subject as it came, in bytes.
-        id: the same for every repetition of one request; empty if it may not be repeated.
+        subject: a ScanParameters, Feedback, ProbePosition or Parameter, the name of an action, or the number of a
+            problem or control mode; None for requests without a subject.
+        payload: the subject in bytes, as received.
+        id: the same for every repetition of one request; empty if the request may not be repeated.
     """
 
     kind: int
@@ -119,7 +120,7 @@ class Request:
 
 
 class ResponseDetail(IntEnum):
-    """The detail of a response that a program needs beside its code; the numbers of the wire."""
+    """The detail of a response that a program needs beside its code; numbers as on the wire."""
 
     NONE = 0
     NOT_SENT = 1
@@ -136,9 +137,9 @@ class Response:
     Attributes:
         code: the number of a ControlResponse.
         payload: an object in bytes (a parameter's value), mostly empty.
-        reason: for a person, why it is not a success.
-        id: of the request that it answers, if that had one.
-        detail: what a program must know beside the code.
+        reason: why the request failed, for people.
+        id: id of the answered request, if it had one.
+        detail: further facts for programs.
     """
 
     code: int

@@ -1,4 +1,4 @@
-"""Scans: what is asked for, one channel of what was measured, and all channels together."""
+"""Scans: their parameters, one measured channel, and all channels together."""
 
 from __future__ import annotations
 
@@ -23,13 +23,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ShapeChange:
-    """Part of a shape, as a request may give it: None is not to be changed."""
+    """Rows, columns or both of a shape, as a request may give them; None stays unchanged."""
 
     rows: int | None = None
     columns: int | None = None
 
     def onto(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """Return `shape` with what is given here changed."""
         return (
             shape[0] if self.rows is None else self.rows,
             shape[1] if self.columns is None else self.columns,
@@ -38,12 +37,12 @@ class ShapeChange:
 
 @dataclass(frozen=True)
 class ScanParameters:
-    """Where a scan is taken and in how many pixels. In a request, None is not to be changed.
+    """Region and pixels of a scan. In a request, None stays unchanged.
 
     Attributes:
-        region: the rectangle that is scanned; in a request perhaps only a part of what describes it.
+        region: the scanned rectangle; in a request perhaps only some of its fields.
         shape: pixels as (rows, columns), the order of numpy; in a request perhaps only one of them.
-        unit: of the values of a scan; None for the microscope's own.
+        unit: unit of the scan's values; None for the microscope's own.
     """
 
     region: Region | RegionChange | None = None
@@ -73,10 +72,10 @@ class ScanParameters:
         object.__setattr__(self, "shape", (rows, columns))
 
     def onto(self, current: ScanParameters) -> ScanParameters:
-        """Return what is in force after these were asked for while `current` were.
+        """Return the parameters in force after this request, if `current` were in force before.
 
         Raises:
-            InvalidValue: a part of a region is asked for where there is no region yet, or the result is none.
+            InvalidValue: a part of a region without a region before, or an invalid result.
         """
         region = current.region if self.region is None else self.region
         if isinstance(region, RegionChange):
@@ -96,13 +95,13 @@ class Scan:
     """One channel of a scan.
 
     Attributes:
-        region: where it was taken.
+        region: the scanned region.
         channel: e.g. "Height Retrace".
-        unit: of the values.
-        values: [y, x], both ascending, float64; empty where only the parameters came.
-        time_ns: when it was finished, ns since the Unix epoch; None if it is not known.
-        filename: where the controller saved it; empty if it did not.
-        pixels: (rows, columns) that it has where no values came to say so; None if that was not said either.
+        unit: unit of the values.
+        values: [y, x], both ascending, float64; empty if only the parameters arrived.
+        time_ns: time of its end, ns since the Unix epoch; None if unknown.
+        filename: the controller's own file; empty if there is none.
+        pixels: (rows, columns) of a scan without values; None if unknown.
     """
 
     region: Region
@@ -118,29 +117,32 @@ class Scan:
             raise InvalidValue(f"a scan needs values as [y, x], not of shape {self.values.shape}")
         if self.pixels is None:
             return
+        # raises InvalidValue for pixels that no scan can have
         ScanParameters(shape=self.pixels)
         if self.values.size and self.values.shape != self.pixels:
             raise InvalidValue(f"a scan of {self.pixels} pixels with values of shape {self.values.shape}")
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns), with or without values; one of them 0 where neither came."""
+        """Return (rows, columns), with or without values; a zero if neither arrived."""
         rows, columns = self.values.shape
         return (rows, columns) if self.values.size or self.pixels is None else self.pixels
 
     @property
     def parameters(self) -> ScanParameters:
-        """The parameters that it was taken with; without a shape where that is not known."""
+        """Return the parameters of the scan, without a shape if it is unknown."""
         return ScanParameters(self.region, self.shape if all(self.shape) else None, self.unit)
 
     @property
     def time(self) -> datetime | None:
-        """When it was finished, UTC."""
+        """Return the time of its end, UTC."""
         return None if self.time_ns is None else utc_time(self.time_ns)
 
     @property
     def lines_missing(self) -> int:
-        """The number of lines without any value: it was broken off. All of them where no values came."""
+        """Return the number of lines without any value, as in a scan that was broken off; all lines if no values
+        arrived.
+        """
         if not self.values.size:
             return self.shape[0]
         import numpy as np
@@ -149,11 +151,11 @@ class Scan:
 
     @property
     def is_blank(self) -> bool:
-        """Return whether all values are NaN: nothing was measured. False where no values came."""
+        """Return whether all values are NaN: nothing was measured. False if no values arrived."""
         return bool(self.values.size) and self.lines_missing == self.shape[0]
 
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
-        """Return the scan as at the middle of its acquisition, without the drift meanwhile.
+        """Return the scan as at the middle of its acquisition, without the drift during it.
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
@@ -165,7 +167,7 @@ class Scan:
             The same region and pixels; NaN where nothing was measured.
 
         Raises:
-            InvalidValue: what is not finite, or a sample as fast as the scan.
+            InvalidValue: an argument is not finite, or the sample is as fast as the scan.
         """
         from afspm.model.drift_removal import undistorted
 
@@ -179,14 +181,14 @@ class Scan:
 
         Args:
             order: 0 for a height, 1 for a plane, 2 and 3 for curved surfaces.
-            fit: "least-squares", or one that particles and steps do not lead astray: "huber", "theil-sen", "ransac" or
+            fit: "least-squares", or a fit that is robust against particles and steps: "huber", "theil-sen", "ransac" or
                 "quantile".
-            quantile: of the last: which part of the pixels lies below the surface.
-            rows: how each row is levelled before: by its "median", by the median "difference" from the row below it,
-                which long features do not mislead, or by a straight "line"; None: not at all.
+            quantile: for the fit "quantile": the part of the pixels below the surface.
+            rows: levelling of each row before the fit: by its "median", by the median "difference" from the row below
+                it, which long features do not mislead, or by a straight "line"; None: not at all.
 
         Raises:
-            InvalidValue: there is no such fit or order, or too little was measured.
+            InvalidValue: there is no such fit or order, or too few pixels were measured.
         """
         from afspm.model.levelling import levelled
 
@@ -205,14 +207,14 @@ class Scan:
 
         Args:
             kind: "image", "contour" or "surface" (in three dimensions).
-            axes: to draw in, over what is there; for a surface they need `projection="3d"`. None: a figure of its own.
-            colorbar: whether to draw the colour bar, as high as the picture. Beside other axes it needs the room that
+            axes: axes to draw into; for a surface they need `projection="3d"`. None: a new figure.
+            colorbar: whether to draw the colour bar, as high as the picture. Beside other axes it needs the space that
                 `plt.subplots(…, layout="constrained")` makes.
             vmin, vmax: values at the ends of the colours, in the unit of the values; None: the robust range of this
                 scan, 1 to 99 %. Give both to compare scans.
 
         Returns:
-            The axes. Their coordinates are in m, with ticks in the unit that suits them: what is drawn into them next,
+            The axes. Their coordinates are in m, with ticks in a suitable unit: anything drawn into them next,
             another scan or `axes.plot(*spectrum.position_m, "o")`, lies where it was measured.
 
         Raises:
@@ -224,7 +226,7 @@ class Scan:
     def to_sidpy(self) -> sidpy.Dataset:
         """Return the scan as a `sidpy.Dataset`, for programs of the pycroscopy ecosystem (needs sidpy).
 
-        Its axes are x and y in m, those of the unrotated rectangle; angle, frame, time and file are in
+        Its axes are x and y of the unrotated rectangle, in m; angle, frame, time and file are in
         `original_metadata["afspm"]`.
         """
         return required(DISPLAYS, "to_sidpy")(self)
@@ -234,7 +236,7 @@ class Scan:
         """Return a two-dimensional `sidpy.Dataset` as a scan; axes in any unit of length.
 
         Raises:
-            InvalidValue: it is not an image, or its axes are not lengths.
+            InvalidValue: the data are not an image, or the axes are not lengths.
         """
         scan: Scan = required(DISPLAYS, "from_sidpy")(dataset)
         return scan
@@ -242,8 +244,7 @@ class Scan:
     def to_xarray(self) -> xarray.DataArray:
         """Return an xarray DataArray with coordinates in m (needs the extra `xarray`).
 
-        The coordinates x and y are those of the unrotated rectangle; `angle_rad` is in the attributes. NaN where no
-        values came.
+        The coordinates are x and y of the unrotated rectangle; `angle_rad` is in the attributes. NaN without values.
         """
         import numpy as np
         import xarray
@@ -272,10 +273,10 @@ class Scan:
 
 
 class ScanSet(Mapping[str, Scan]):
-    """All channels of one scan: `scans["Height"]`, or `.first` where one is as good as another.
+    """All channels of one scan: `scans["Height"]`, or `.first` for any channel.
 
     Attributes:
-        interruptions: what got in between before it could be taken, oldest first, for a person.
+        interruptions: the interruptions before the scan could be taken, oldest first, for people.
     """
 
     def __init__(self, scans: Iterable[Scan], interruptions: Iterable[str] = ()) -> None:
@@ -286,22 +287,22 @@ class ScanSet(Mapping[str, Scan]):
 
     @property
     def first(self) -> Scan:
-        """The channel that was published first."""
+        """Return the channel that was published first."""
         return next(iter(self._scans.values()))
 
     @property
     def region(self) -> Region:
-        """Where it was taken."""
+        """Return the scanned region."""
         return self.first.region
 
     @property
     def time(self) -> datetime | None:
-        """When it was finished, UTC."""
+        """Return the time of its end, UTC."""
         return self.first.time
 
     @property
     def time_ns(self) -> int | None:
-        """When it was finished, ns since the Unix epoch."""
+        """Return the time of its end, ns since the Unix epoch."""
         return self.first.time_ns
 
     def __getitem__(self, channel: str) -> Scan:
@@ -332,15 +333,15 @@ class ScanSet(Mapping[str, Scan]):
 
 @dataclass(frozen=True, eq=False)
 class ScanLines:
-    """Some neighbouring rows of one channel, published while the scan goes on.
+    """Some neighbouring rows of one channel, published while the scan is running.
 
     Attributes:
         region: of the whole scan.
         shape: of the whole scan, (rows, columns).
         channel, unit: of the values.
         first_row: index in the whole scan of the first of these rows.
-        values: [rows, columns], y and x ascending, whatever the order in which they are scanned.
-        began_ns: when the scan began, ns since the Unix epoch: the same for all lines of a scan.
+        values: [rows, columns], y and x ascending, independent of the scan direction.
+        began_ns: start of the scan, ns since the Unix epoch: the same for all lines of a scan.
     """
 
     region: Region
@@ -360,10 +361,10 @@ class ScanLines:
             )
 
     def into(self, picture: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Return a picture of the whole scan with these lines in it; rows that are not there yet are NaN.
+        """Return a picture of the whole scan with these lines in it; rows not yet scanned are NaN.
 
         Args:
-            picture: [y, x] with the lines before, which is changed; None: these are the first.
+            picture: [y, x] with the earlier lines, changed in place; None for the first lines.
         """
         import numpy as np
 

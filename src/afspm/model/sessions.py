@@ -1,16 +1,17 @@
-"""Which connection may speak for which name: restarts, and two processes under one name.
+"""Sessions: the connection that may speak for a name, over restarts, and with two processes under one name.
 
-A name belongs to one session at a time: one life of one process. Its first connection binds it. It is recognised on
-later connections by the token in its request ids ("<name>/<token>/<n>"); of peers without ids the connection is the
-session.
+A name belongs to one session at a time: one life of one process. Its first connection binds the name. Later
+connections show the session's token in their request ids ("<name>/<token>/<n>"). For peers without ids, the connection
+is the session.
 
-ROUTER hands a name over to its newest connection, and the owner, who hears no more answers, connects anew. So when a
-second process takes a name that is in use, the first is disconnected *after* the second was accepted, while a process
-that is restarted connects after its former life was disconnected. That tells the impostor, who is refused, from the
-restarted, who is the same client. A former life that speaks again was none: it was first, and has its name back.
+A ROUTER socket hands an identity over to its newest connection. The owner then gets no more answers and connects
+again. So when a second process takes a name in use, the first is disconnected *after* the second was accepted, while a
+restarted process connects after its former life was disconnected. This order distinguishes an impostor, which is
+refused, from a restart, which is the same client. A former life that speaks again was alive all the time: it was first,
+and gets its name back.
 
-Peers without ids close their connection and open another whenever an answer is late; which of the two is seen first is
-chance. Such a newcomer is asked to wait a moment (`Hearing.UNCLEAR`), and has the name if the older connection closes.
+Peers without ids close their connection and open another when an answer is late; the order of these two events is
+chance. Such a connection has to wait a moment (`Hearing.UNCLEAR`), and gets the name if the older connection closes.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from afspm.basics.frozen import replace
 
 K = TypeVar("K")
 V = TypeVar("V")
+# tokens of earlier sessions of a name that may still come back
 _FORMERS = 8
 _RUN = re.compile("[0-9a-f]{16}")
 
@@ -35,40 +37,41 @@ class Hearing(Enum):
 
     ACCEPTED = auto()
     STALE = auto()
-    """The connection is closed already: there is nobody to answer, and whoever sent it will ask again."""
+    """The connection is closed already: no answer is possible, and the sender will repeat its request."""
     TAKEN = auto()
     """Another live process has this name."""
     UNCLEAR = auto()
-    """The same, but the two may be one: hear it again when the other's connection closes, or a moment later."""
+    """As TAKEN, but both may be one process: judge again when the other connection closes, or a moment later."""
 
 
 @dataclass(frozen=True)
 class _Session:
     token: str | None
     connection: int | None
-    formers: tuple[str, ...] = ()  # the tokens of those that it replaced
+    formers: tuple[str, ...] = ()  # tokens of the sessions that it replaced
     lost_order: int = 0
     lost_s: float = 0.0
-    has_ids: bool = True  # until it has asked for something without one
-    since_s: float = -math.inf  # its connection spoke first
+    has_ids: bool = True  # until its first request without an id
+    since_s: float = -math.inf  # first message of its connection
 
 
 KEYED = "key"
-"""Stands where the token would in ids that are the same in every life: "<name>/key/<key>/<n>"."""
+"""In place of the token in ids that are the same in every life: "<name>/key/<key>/<n>"."""
 
 
 def token_of(name: str, request_id: str) -> str | None:
-    """Return the session's token in a request id; None if the id has none (a caller's own key)."""
+    """Return the session's token in a request id; None for an id without one (a caller's own key)."""
     who, *rest = request_id.split("/")
     if who != name or not 2 <= len(rest) <= 3 or rest[0] == KEYED:
         return None
-    return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps that of an attempt
+    return rest[0] if all(map(str.isdigit, rest[1:])) else None  # a number, and perhaps the number of an attempt
 
 
 def number_of(request_id: str) -> tuple[str, int] | None:
-    """Return session and number of an id "<name>/<token>/<n>", which rise in each session; None for other forms.
+    """Return session and number of an id "<name>/<token>/<n>"; None for other forms.
 
-    The ids of a measurement have two numbers more, or a key: its attempts come hours after one another.
+    Numbers rise within a session. The ids of a measurement have two numbers more, or a key, and never count here: its
+    attempts come hours apart.
     """
     session, _, number = request_id.rpartition("/")
     name, _, token = session.partition("/")
@@ -77,14 +80,14 @@ def number_of(request_id: str) -> tuple[str, int] | None:
 
 
 def key_of(name: str, request_id: str) -> str:
-    """Return the key of a measurement in a request id, "<name>/key/<key>/<n>"; empty if it has none."""
+    """Return the key of a measurement in a request id, "<name>/key/<key>/<n>"; empty if there is none."""
     who, _, rest = request_id.partition("/")
     parts = rest.split("/")
     return parts[1] if who == name and len(parts) == 3 and parts[0] == KEYED else ""
 
 
 def run_of(name: str, request_id: str) -> str:
-    """Return the identity of the run in a request id, "<name>/<run>-<life>/<n>"; empty if it has none."""
+    """Return the identity of the run in a request id, "<name>/<run>-<life>/<n>"; empty if there is none."""
     run, dash, _ = (token_of(name, request_id) or "").partition("-")
     return run if dash and _RUN.fullmatch(run) else ""
 
@@ -94,10 +97,10 @@ class SessionTable:
     """The names in use.
 
     Attributes:
-        takeover_s: for how long (real) a name that was handed over is kept for its owner to come back. A peer whose
-            connection died without our noticing is restarted under its name after that long at the latest.
-        keep: most names remembered that are not connected.
-        opened: open connections, with when, in order, each was opened.
+        takeover_s: real time for which a name that was handed over is kept for its owner. A peer whose connection died
+            unnoticed can be restarted under its name after this time at the latest.
+        keep: maximum number of names without a connection.
+        opened: open connections, with the order of their opening.
         lost: names without a connection, oldest first.
     """
 
@@ -111,13 +114,12 @@ class SessionTable:
     lost: tuple[str, ...] = ()
 
     def connected(self, connection: int) -> SessionTable:
-        """Register a new connection."""
         order = self.order + 1
         highest = max(self.highest, connection)
         return replace(self, order=order, opened={**self.opened, connection: order}, highest=highest)
 
     def disconnected(self, connection: int, now_s: float) -> tuple[SessionTable, str | None]:
-        """Drop a connection. Returns also the name whose session lost its connection by that, if one did."""
+        """Drop a connection; return also the name whose session lost its connection, if any."""
         table = replace(self, order=self.order + 1, opened=_without(self.opened, connection))
         name = self.name_of.get(connection)
         if name is None:
@@ -129,10 +131,10 @@ class SessionTable:
         return replace(table, names=names, lost=lost, name_of=_without(self.name_of, connection)), name
 
     def hear(self, connection: int, name: str, request_id: str | None, now_s: float) -> tuple[SessionTable, Hearing]:
-        """Judge a message from `name` by `connection`, and bind the name where it is accepted.
+        """Judge a message from `name` by `connection`, and bind the name if it is accepted.
 
         Args:
-            request_id: of the request, empty if it has none; None: it only said its name.
+            request_id: id of the request, empty without one; None for a message that only carries the name.
         """
         session = self.names.get(name)
         has_ids, token = request_id != "", token_of(name, request_id or "")
@@ -153,35 +155,35 @@ class SessionTable:
         return table.bound(name, token, connection, has_ids=has_ids, since_s=now_s), Hearing.ACCEPTED
 
     def connection_of(self, name: str) -> int | None:
-        """Return the connection by which to answer `name`; None while it has none."""
+        """Return the connection for answers to `name`; None if it has none."""
         session = self.names.get(name)
         return session.connection if session is not None else None
 
     def lost_since_s(self, name: str) -> float | None:
-        """Return since when (real) a known name is without a connection; None if it has one, or is unknown."""
+        """Return the real time since when a known name has no connection; None if it has one, or is unknown."""
         session = self.names.get(name)
         if session is None or session.connection is not None or session.lost_s == -math.inf:
             return None
         return session.lost_s
 
     def since_s(self, name: str) -> float:
-        """Return since when (real) a name speaks by its newest connection; -inf: it was not heard of yet."""
+        """Return the real time of the first message by the newest connection of a name; -inf for an unknown name."""
         session = self.names.get(name)
         return -math.inf if session is None else session.since_s
 
     def tokens(self) -> dict[str, str]:
-        """Return the tokens of the connected sessions, to be kept over a restart."""
+        """Return the tokens of the connected sessions, to save over a restart."""
         return {name: s.token for name, s in self.names.items() if s.token is not None and s.connection is not None}
 
     def restored(self, tokens: Mapping[str, str]) -> SessionTable:
-        """Add the sessions that were connected before a restart; whether they still live will be seen."""
+        """Add the sessions that were connected before a restart; they may have ended since."""
         restored = {name: _Session(token, None, lost_s=-math.inf) for name, token in tokens.items()}
         return replace(self, names={**self.names, **restored})
 
     def _gives_way(
         self, session: _Session, token: str | None, connection: int, now_s: float, *, without_ids: bool
     ) -> bool:
-        # its owner; or the one before, who was taken for dead, and was first
+        # the owner; or the owner before, which was presumed dead, and was first
         if token is not None and (token == session.token or token in session.formers):
             return True
         if session.connection is not None:
@@ -194,11 +196,10 @@ class SessionTable:
     def bound(
         self, name: str, token: str | None, connection: int, *, has_ids: bool = True, since_s: float = -math.inf
     ) -> SessionTable:
-        """Bind a name to a connection."""
         former, name_of, formers = self.names.get(name), dict(self.name_of), tuple[str, ...]()
         if former is not None and former.connection is not None:
             name_of.pop(former.connection, None)
-        # one that is back leaves whoever came in between without a claim
+        # an owner that is back deletes the claims of the sessions in between
         if former is not None and (token is None or token not in (former.token, *former.formers)):
             formers = (*former.formers, *filter(None, [former.token]))[-_FORMERS:]
         session = _Session(token, connection, formers, has_ids=has_ids, since_s=since_s)

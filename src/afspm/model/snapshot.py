@@ -1,7 +1,7 @@
-"""Snapshots: trees of dataclasses as plain data, and back, with the kind and the version that they are of.
+"""Snapshots: trees of dataclasses as plain data and back, with a kind and a version.
 
-Plain data are what JSON holds (bytes as base64), and numpy arrays, which the caller stores beside it (or asks for as
-lists). Only the types of the fields say what is read: nothing in a snapshot names code.
+Plain data are JSON's types (bytes as base64) and numpy arrays, which the caller stores beside the JSON (or converts to
+lists). The types of the fields alone determine how they are read: a snapshot never names code.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ def snapshot(state: object, kind: str, version: int, *, lists: bool = False) -> 
     """Return a dataclass as plain data.
 
     Args:
-        kind, version: what `restored` asks for.
-        lists: arrays become lists, so that JSON can hold all of it.
+        kind, version: labels that `restored` checks.
+        lists: convert arrays to lists, so that JSON can hold everything.
     """
     return {"kind": kind, "version": version, **to_plain(state, lists=lists)}
 
 
 def restored(type_: type[T], plain: Mapping[str, object], kind: str, version: int) -> T:
-    """Return the dataclass that `snapshot` was made of.
+    """Return the dataclass of a snapshot.
 
     Raises:
-        InvalidValue: of another kind or version, or damaged.
+        InvalidValue: the snapshot is of another kind or version, or damaged.
     """
     if (plain.get("kind"), plain.get("version")) != (kind, version):
         found = f"{plain.get('kind')!r}, version {plain.get('version')!r}"
@@ -49,7 +49,7 @@ def restored(type_: type[T], plain: Mapping[str, object], kind: str, version: in
 
 
 def _numpy() -> Any:
-    """The module, if it is loaded: without it there are no arrays, and most processes need none."""
+    # without a loaded numpy there are no arrays, and most processes do not load it
     return sys.modules.get("numpy")
 
 
@@ -69,20 +69,22 @@ def to_plain(value: object, *, lists: bool = False) -> Any:
     if isinstance(value, Mapping):
         if all(isinstance(key, str) for key in value):
             return {key: to_plain(one, lists=lists) for key, one in value.items()}
+        # JSON has only text as keys: other mappings become pairs
         return [[to_plain(key, lists=lists), to_plain(one, lists=lists)] for key, one in value.items()]
     if isinstance(value, list | tuple | deque):
         return [to_plain(one, lists=lists) for one in value]
     if isinstance(value, set | frozenset):
+        # sorted, so that equal states give equal snapshots
         return sorted(to_plain(one, lists=lists) for one in value)
     return value
 
 
 def from_plain(type_: Any, plain: Any) -> Any:
-    """Return plain data as a type says: the inverse of `to_plain`.
+    """Return plain data as a value of a type: the inverse of `to_plain`.
 
     Raises:
         KeyError: a field without a default is missing.
-        TypeError, ValueError: something else than the type says.
+        TypeError, ValueError: a value does not fit its type.
     """
     origin, arguments = get_origin(type_), get_args(type_)
     if type_ is Any:
@@ -101,6 +103,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
         return type_(plain)
     if origin is not None:
         return _from_collection(origin, arguments, plain)
+    # a whole number in JSON is an int
     if type_ is float:
         return float(plain)
     if type_ is bytes:
@@ -111,7 +114,7 @@ def from_plain(type_: Any, plain: Any) -> Any:
 
 
 def _from_union(arguments: Sequence[object], plain: object) -> object:
-    """Of `X | None` alone: which of several a value was, plain data do not say."""
+    # only `X | None`: plain data do not show the class of a value
     if plain is None and types.NoneType in arguments:
         return None
     (only,) = (one for one in arguments if one is not types.NoneType)

@@ -23,14 +23,14 @@ class Spectrum:
     """Several variables measured together, point by point.
 
     Attributes:
-        position_m: (x, y) of the probe in m; None if it is not known.
-        kind: what was done, e.g. "IV" or "force".
-        names: of the variables; the first is by custom the one that was swept.
-        units: of the variables.
+        position_m: (x, y) of the probe in m; None if unknown.
+        kind: kind of spectroscopy, e.g. "IV" or "force".
+        names: names of the variables; by custom the first was swept.
+        units: units of the variables.
         values: shape (points, variables), float64.
-        time_ns: when it was taken, ns since the Unix epoch; None if it is not known.
-        filename: where the controller saved it; empty if it did not.
-        frame: of the position.
+        time_ns: time of measurement, ns since the Unix epoch; None if unknown.
+        filename: the controller's own file; empty if there is none.
+        frame: coordinate system of the position.
 
     Raises:
         InvalidValue: names, units and values do not fit together.
@@ -55,11 +55,11 @@ class Spectrum:
 
     @property
     def time(self) -> datetime | None:
-        """When it was taken, UTC."""
+        """Return the time of measurement, UTC."""
         return None if self.time_ns is None else utc_time(self.time_ns)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
-        """One variable by its name, shape (points,)."""
+        """Return one variable by its name, shape (points,)."""
         if name not in self.names:
             raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]

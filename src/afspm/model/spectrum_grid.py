@@ -1,4 +1,4 @@
-"""Where each spectrum of a grid belongs, and which curves are the two ways of one variable."""
+"""Positions of spectra in a grid, and the forward and backward curves of each variable."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ DIRECTIONS: Final = ("forward", "backward")
 _BACKWARD = re.compile(r"\s*(?:\[bwd\]|\bretrace\b|\bbackward\b|\bbwd\b)", re.IGNORECASE)
 _FORWARD = re.compile(r"\s*(?:\[fwd\]|\btrace\b|\bforward\b|\bfwd\b)", re.IGNORECASE)
 _TOLERANCE: Final = 0.1
-"""Of the spacing: so far a position may be from its point of the grid."""
+"""Largest distance of a position from its grid point, as a part of the spacing."""
 _LEAST_FILLED: Final = 0.5
-"""Of the points of a grid: so many positions are there at least, or it is a list of places."""
+"""Least part of the grid points that is measured: below it the positions are a list of places, not a grid."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class PointGrid:
     """A rectangular grid, and the cell of each position in it.
 
     Attributes:
-        x_m, y_m: coordinates of columns and rows, of the grid before it was turned about `center_m`.
+        x_m, y_m: coordinates of columns and rows, before the rotation about `center_m`.
         cells: (row, column) of each position.
     """
 
@@ -41,7 +41,7 @@ class PointGrid:
     cells: tuple[tuple[int, int], ...] = ()
 
     def position_m(self, row: int, column: int) -> XY:
-        """Return where a point of the grid is."""
+        """Return the position of a grid point."""
         x, y = self.center_m
         along, across = float(self.x_m[column]) - x, float(self.y_m[row]) - y
         cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
@@ -49,10 +49,10 @@ class PointGrid:
 
 
 def grid(positions_m: Sequence[XY]) -> PointGrid:
-    """Return the rectangular grid that positions lie on; it may be turned, and points of it may be missing.
+    """Return the rectangular grid of some positions; it may be rotated, and points may be missing.
 
     Raises:
-        InvalidValue: they do not lie on one.
+        InvalidValue: the positions do not lie on a grid.
     """
     given = np.array(positions_m, dtype=np.float64).reshape(-1, 2)
     center = (given.min(axis=0) + given.max(axis=0)) / 2.0
@@ -71,10 +71,11 @@ def grid(positions_m: Sequence[XY]) -> PointGrid:
 
 
 def _nearest(places: Floats) -> tuple[float, float]:
-    """Return the distance of neighbours, and the angle, -45° to 45°, of the grid that they are neighbours in."""
+    # spacing of neighbours, and the angle of the grid, -45° to 45°
     from scipy.spatial import cKDTree
 
     extent = float(np.ptp(places, axis=0).max())
+    # positions within a thousandth of the extent are repeats at one point
     same = 1e-3 * extent
     distinct = places[np.unique(np.round(places / same), axis=0, return_index=True)[1]] if extent else places[:1]
     if len(distinct) < 2:
@@ -82,24 +83,23 @@ def _nearest(places: Floats) -> tuple[float, float]:
     found = cKDTree(distinct).query(distinct, k=min(5, len(distinct)))
     distances, others = np.asarray(found[0]), np.asarray(found[1])
     spacing_m = float(np.median(distances[:, 1]))
+    # without diagonal neighbours, which are 1.41 spacings away
     one, rank = np.nonzero((distances > 0.0) & (distances < 1.3 * spacing_m))
     between = distinct[others[one, rank]] - distinct[one]
     angles = np.arctan2(between[:, 1], between[:, 0])
-    return spacing_m, float(np.angle(np.exp(4j * angles).mean()) / 4.0)  # a quarter turn makes no difference
+    # four times the angle: a grid turned by a quarter is the same grid
+    return spacing_m, float(np.angle(np.exp(4j * angles).mean()) / 4.0)
 
 
 def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the coordinates of evenly spaced lines, and the line of each position.
-
-    Raises:
-        InvalidValue: the positions are not evenly spaced.
-    """
+    # the coordinates of evenly spaced lines, and the line of each position
     order = np.sort(along_m)
     gaps = np.diff(order)
     steps = gaps[gaps > _TOLERANCE * spacing_m]
     if not steps.size:
         return np.array([float(order.mean())]), np.zeros(len(along_m), np.int64)
     step = float(steps.min())
+    # the mean step over the whole extent: a single step has the error of two positions
     count = round(float(order[-1] - order[0]) / step)
     step = float(order[-1] - order[0]) / count
     lines = np.round((along_m - order[0]) / step).astype(np.int64)
@@ -111,7 +111,7 @@ def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]
 
 
 def repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
-    """Return how many were measured at the same point before, for each."""
+    """Return for each cell how often it has occurred before."""
     seen: dict[tuple[int, int], int] = {}
     found = []
     for cell in cells:
@@ -121,7 +121,12 @@ def repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
 
 
 def alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
-    """Return the first, after which all others are measured."""
+    """Return the first spectrum, if all others were measured in the same way.
+
+    Raises:
+        InvalidValue: there are no spectra, a position is unknown, or two differ in kind, variables, frame or, with
+            `swept_alike`, in their sweep.
+    """
     if not spectra:
         raise InvalidValue("there are no spectra to stack")
     first = spectra[0]
@@ -152,17 +157,21 @@ def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
 
 
 def columns_of(spectrum: Spectrum) -> list[dict[str, str]]:
-    """Return the column of each variable by direction; one direction where a sweep goes there and back in one."""
+    """Return the column of each variable by direction; one direction if one sweep goes there and back."""
     names = spectrum.names[1:]
     plain = {_FORWARD.sub("", name) or name: name for name in names if not _BACKWARD.search(name)}
     back = {_BACKWARD.sub("", name): name for name in names if _BACKWARD.search(name)}
     if _turning_point(spectrum.values[:, 0]) is not None or not back.keys() <= plain.keys():
-        return [{name: name for name in names}]  # a way back without its way there stays under its own name
+        return [{name: name for name in names}]  # a backward curve without a forward one keeps its full name
     return [plain, back] if back else [plain]
 
 
 def common_sweep(sweeps: Sequence[Floats]) -> Floats:
-    """Return evenly spaced values, ascending, over which all were swept. Raises InvalidValue: there are none."""
+    """Return evenly spaced values, ascending, within all sweeps.
+
+    Raises:
+        InvalidValue: the sweeps do not overlap.
+    """
     low, high = max(float(one.min()) for one in sweeps), min(float(one.max()) for one in sweeps)
     if not low < high:
         raise InvalidValue("the sweeps have no values in common")
@@ -170,17 +179,18 @@ def common_sweep(sweeps: Sequence[Floats]) -> Floats:
 
 
 def at(common: Floats, swept: Floats, values: Floats) -> Floats:
-    """Return a curve at other values of what was swept, linear between its points."""
+    """Return a curve at other values of the swept variable, linear between its points."""
     order = np.argsort(swept)
     return np.interp(common, swept[order], values[order])
 
 
 def _turning_point(swept: Floats) -> int | None:
-    """Return the half of a sweep that goes there and back over the same values; None: it goes one way."""
+    # half of a sweep that goes there and back over the same values; None for a one-way sweep
     half, odd = divmod(len(swept), 2)
     extent = float(np.ptp(swept)) if half else 0.0
     if odd or half < 2 or not np.allclose(swept[:half], swept[half:][::-1], rtol=0.0, atol=1e-3 * extent):
         return None
+    # the way there must cover most of the range: a one-way sweep of equal values has no turning point
     return half if abs(swept[half] - swept[0]) > 0.5 * extent else None
 
 

@@ -1,4 +1,4 @@
-"""The spectra of a grid as arrays over place, repeat, direction and what was swept; maps of them."""
+"""The spectra of a grid as arrays over position, repeat, direction and swept variable, and maps of them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 DIMENSIONS: Final = ("y", "x", "repeat", "direction", "z")
 Quantity = str | Callable[[Spectrum], float]
-"""A variable, or what is made of the curves of one spectrum."""
+"""The name of a variable, or a function of one spectrum."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class SpectrumStack:
         directions: "forward", and "backward" if the sweep went both ways.
         curves: by variable, shape (y, x, repeat, direction, z); NaN where nothing was measured.
         units: by variable.
-        names: the columns of each spectrum as it was measured, without the first, which was swept.
-        columns: of each variable, by direction; one where a sweep went there and back in one.
-        times: when each was measured, shape (y, x, repeat); NaT where that is not known.
+        names: the measured columns of each spectrum, without the swept one.
+        columns: columns of each variable by direction; one direction if one sweep goes there and back.
+        times: times of measurement, shape (y, x, repeat); NaT if unknown.
     """
 
     kind: str
@@ -91,7 +91,7 @@ def stacked(spectra: Sequence[Spectrum], *, interpolate: bool = False) -> Spectr
     """Return the curves of a grid as arrays; see `SpectrumTable.stack`.
 
     Raises:
-        InvalidValue: these spectra do not form a grid, or were not measured alike.
+        InvalidValue: the spectra do not form a grid, or were not measured in the same way.
     """
     first = alike(spectra, swept_alike=not interpolate)
     points, repeat_of = _grid_of(spectra)
@@ -150,7 +150,7 @@ def _unit(spectrum: Spectrum, variable: str) -> str:
 
 
 def _value_at(variable: str, value: float, direction: str, spectrum: Spectrum) -> float:
-    """Return a variable where the sweep had a value, linear between its points."""
+    # linear between the points of the sweep
     swept, curves = ways(spectrum)
     name, unit = spectrum.names[0], spectrum.units[0]
     by_direction = dict(zip(DIRECTIONS, curves, strict=False))
@@ -171,7 +171,7 @@ def _grid_of(spectra: Sequence[Spectrum]) -> tuple[PointGrid, list[int]]:
 
 
 def mean_over_repeats(values: Floats) -> Floats:
-    """Return the mean over the third axis; NaN where none was measured."""
+    """Return the mean over the third axis; NaN where nothing was measured."""
     known = np.isfinite(values)
     count = known.sum(axis=2)
     total = np.where(known, values, 0.0).sum(axis=2)

@@ -9,7 +9,7 @@ from afspm.model.geometry import XY
 
 
 class _NamedEnum(IntEnum):
-    """An enumeration that is shown by its names."""
+    """An enumeration whose members are shown by name."""
 
     def __str__(self) -> str:
         return self.name
@@ -29,7 +29,7 @@ class ScopeState(_NamedEnum):
 
 
 class ControlMode(_NamedEnum):
-    """Components control the microscope (AUTOMATED), or only the person at it (MANUAL)."""
+    """Who may control the microscope: components (AUTOMATED), or only the person at it (MANUAL)."""
 
     UNDEFINED = 0
     MANUAL = 1
@@ -41,7 +41,7 @@ class ScopeStatus:
     """The activity of the microscope.
 
     Attributes:
-        paused: a scan is running but stands still; None if the microscope does not say.
+        paused: a scan is running but stands still; None if the microscope does not report it.
     """
 
     state: ScopeState
@@ -50,10 +50,10 @@ class ScopeStatus:
 
 @dataclass(frozen=True)
 class Feedback:
-    """The z feedback. None is what is not said, or in a request not to be changed.
+    """The z feedback. None: unknown, or in a request unchanged.
 
     Attributes:
-        on: whether it acts.
+        on: whether the feedback regulates.
         proportional_gain, integral_gain, setpoint: in the units of the microscope's operating mode.
     """
 
@@ -65,14 +65,14 @@ class Feedback:
 
 @dataclass(frozen=True)
 class ProbePosition:
-    """Where the probe stands when it does not scan: (x, y) in m, tip coordinates unless a component maps them."""
+    """The position of the probe between scans: (x, y) in m, in tip coordinates unless a component maps them."""
 
     xy_m: XY
 
 
 @dataclass(frozen=True)
 class PositionChange:
-    """Part of a probe position, as a request may give it: None is not to be changed. In m."""
+    """One axis or both of a probe position in a request, in m; None stays unchanged."""
 
     x_m: float | None = None
     y_m: float | None = None
@@ -80,12 +80,12 @@ class PositionChange:
 
 @dataclass(frozen=True)
 class ControlState:
-    """The holder of control, and the problems that stand in the way.
+    """The holder of control, and the problems that withhold it.
 
     Attributes:
         mode: automated or manual.
-        holder: the name of the component in control; None if nobody is.
-        problems: the numbers of the problems that are flagged, ascending.
+        holder: the name of the component in control; None if no component is.
+        problems: the numbers of the flagged problems, ascending.
     """
 
     mode: ControlMode = ControlMode.AUTOMATED

@@ -27,9 +27,9 @@ from afspm.basics.clock import iso_utc
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import Scan, Spectrum
 from afspm.record import nxspm
+from afspm.record.nexus_reader import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 from afspm.record.nxspm import group, values
 from afspm.storage.formats import hdf5
-from afspm.storage.formats.nexus import ABOUT, BIAS_SPECTRUM, DEFINITION, VENDOR, about_of
 
 if TYPE_CHECKING:
     import h5py

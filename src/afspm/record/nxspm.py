@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import Region, Scan, Spectrum
-from afspm.storage.formats.nexus import BIAS_SPECTRUM, DEFINITION
+from afspm.record.nexus_reader import BIAS_SPECTRUM, DEFINITION
 
 if TYPE_CHECKING:
     import h5py

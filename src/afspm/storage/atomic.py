@@ -1,4 +1,4 @@
-"""Files that are replaced atomically: a reader finds the old content or the new."""
+"""Atomic replacement of files: a reader finds the old content or the new."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTask, DiskThread, Di
 T = TypeVar("T")
 
 PERIOD_S = 1.0
-"""Real time between two generations that are made sure to be on the disk."""
+"""Real time between two synced copies of a generation."""
 _DAMAGED = (ValueError, KeyError, TypeError)
 LONGEST = 1 << 20
-"""Bytes of a file with its generations, before it is begun anew."""
+"""Size of a file of generations, in bytes, at which it is replaced."""
 SLOW_S = 3.0
-"""How long a disk may be busy, in real time, before that is worth a warning."""
+"""Real time that a disk may be busy before a warning."""
 _TRIES, _AGAIN_S = 50, 0.01
 _ANYONE = 0o666
 
@@ -38,21 +38,23 @@ def replace_file(
     aside: Path | None = None,
     mode: int = _ANYONE,
 ) -> None:
-    """Write a file so that it is there completely or as it was before, whenever the process is killed.
+    """Write a file so that it is complete or unchanged, even if the process is killed.
 
     Args:
-        synced: the same of a power cut; that waits for the disk.
-        aside: where it is written before it has its name; None: under a hidden name of this process beside it.
-        mode: of the file, before the umask; 0o600 for secrets: it never has another, not even for a moment.
+        synced: hold this over a power cut too, which needs a wait for the disk.
+        aside: temporary path of the file; None: a hidden name of this process beside it.
+        mode: mode of the file, before the umask; 0o600 for secrets, from its creation on.
 
     Raises:
-        OSError: it can't be written.
+        OSError: the file can't be written.
     """
     aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(exist_ok=True)  # and no more: under a drive that is away there may be an empty folder
+        path.parent.mkdir(
+            exist_ok=True
+        )  # not its parents: where a drive is not mounted, they would be created on the system disk
         if mode != _ANYONE:
-            aside.unlink(missing_ok=True)  # one that was left there has a mode of its own
+            aside.unlink(missing_ok=True)  # a file left by a killed process keeps its old mode
         with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.writelines(parts)
             if synced:
@@ -68,7 +70,7 @@ def replace_file(
 
 
 def _rename(aside: Path, path: Path) -> None:
-    """Give a file its name. Windows refuses that while another program, a virus scanner say, reads the old one."""
+    # Windows refuses to replace a file while another program, such as a virus scanner, reads it
     for left in reversed(range(_TRIES)):
         try:
             aside.replace(path)
@@ -76,11 +78,15 @@ def _rename(aside: Path, path: Path) -> None:
         except PermissionError:
             if sys.platform != "win32" or not left:
                 raise
-        threading.Event().wait(_AGAIN_S)  # nobody tells when the reader has closed it
+        threading.Event().wait(_AGAIN_S)  # Windows has no event for the close of another program's file
 
 
 def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
-    """Replace a file. Raises FileError: it can't be written."""
+    """Replace a file.
+
+    Raises:
+        FileError: the file can't be written.
+    """
     try:
         replace_file(path, parts, synced=synced)
     except OSError as error:
@@ -88,10 +94,10 @@ def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: boo
 
 
 class FileBatch:
-    """New files that get their names together; each is synced in a thread while the next is made.
+    """New files that get their names together; each is synced in a thread while the next one is written.
 
     Args:
-        suffix: of a file that has not got its name yet.
+        suffix: suffix of a file until it gets its name.
     """
 
     def __init__(self, suffix: str) -> None:
@@ -100,7 +106,11 @@ class FileBatch:
         self._files: list[tuple[DiskTask, Path, Path]] = []
 
     def write(self, path: Path, data: bytes) -> None:
-        """Write a file under another name. Raises OSError."""
+        """Write a file under a temporary name.
+
+        Raises:
+            OSError: the file can't be written.
+        """
         path.parent.mkdir(exist_ok=True)
         aside = path.with_name(path.name + self._suffix)
         with aside.open("wb") as file:
@@ -109,7 +119,11 @@ class FileBatch:
         self._files.append((self._disk.submit(lambda: _sync_and_close(descriptor)), aside, path))
 
     def finish(self) -> None:
-        """Give all files their names, once they are on the disk; then these are, too. Raises OSError."""
+        """Rename all files once they are on the disk, then sync their folders.
+
+        Raises:
+            OSError: a file can't be synced or renamed.
+        """
         for task, aside, path in self._files:
             task.wait()
             _rename(aside, path)
@@ -118,7 +132,7 @@ class FileBatch:
         self._files.clear()
 
     def discard(self) -> None:
-        """Remove the files that have no name yet."""
+        """Remove the files that still have a temporary name."""
         for task, aside, _ in self._files:
             with contextlib.suppress(OSError):
                 task.wait()
@@ -139,15 +153,15 @@ def _sync_and_close(descriptor: int) -> None:
 
 
 class OutageLog:
-    """Logs once that writing fails, until it works again: a disk that is full or away must not end an experiment.
+    """A log of failed writes, once for each outage: a disk that is full or away must not end an experiment.
 
-    A disk that is slow is logged as a warning, after `SLOW_S`: an ordinary busy disk takes a moment now and then, and
-    what waits for it is still written. A disk that refuses to write, or has so much waiting that something is never
-    written, is CRITICAL at once.
+    A slow disk is logged as a warning after `SLOW_S`: a busy disk takes a moment now and then, and its writes are only
+    late. A disk that refuses to write, or has so much waiting that something will never be written, is CRITICAL at
+    once.
 
     Args:
         loss: the consequence, for people.
-        monotonic_s: real time.
+        monotonic_s: clock of real time.
     """
 
     def __init__(self, loss: str, log: logging.Logger, monotonic_s: Callable[[], float] = time.monotonic) -> None:
@@ -155,13 +169,14 @@ class OutageLog:
         self._log = log
         self._monotonic_s = monotonic_s
         self._slow_since_s: float | None = None
-        self._logged: int | None = None  # the level, of this outage
+        self._logged: int | None = None  # log level of the present outage
 
     @contextlib.contextmanager
     def trying(self) -> Iterator[None]:
-        """Enclose a write that raises FileError or OSError; both are logged and not passed on."""
+        """Enclose a write; its FileError or OSError is logged and not passed on."""
         try:
             yield
+        # a DiskBacklogFull is a DiskTimeout, so it comes first: its data are lost, not late
         except DiskBacklogFull as error:
             self._fails(error)
         except DiskTimeout:
@@ -195,17 +210,17 @@ class OutageLog:
 
 
 def previous_generation(path: Path) -> Path:
-    """Return the file with the generation before."""
+    """Return the path of the previous generation of a file."""
     return path.with_name(f"{path.name}.old")
 
 
 class CheckpointFile:
-    """A small text that is saved too often to wait for the disk each time, and is to outlive a power cut all the same.
+    """A small text that is saved too often to wait for the disk each time, but survives a power cut.
 
-    Each generation is a line that is appended: that takes ten microseconds, twenty times less than to replace the file,
-    which is done when it has grown to `longest` bytes. What was saved last outlives a kill of any process, and a
-    moment later a power cut (see `disk`). One that comes while the file is begun anew may leave it empty; then there is
-    the generation before, some `period_s` older, which a thread has made sure of.
+    Each generation is an appended line: that takes ten microseconds, a twentieth of a replacement of the file, which
+    happens only when it has grown to `longest` bytes. The last line survives a kill of any process, and a moment later
+    a power cut (see `disk`). A power cut during a replacement may leave the file empty. Then the previous generation is
+    read, at most about `period_s` older, which a thread syncs.
     """
 
     def __init__(self, path: Path, period_s: float = PERIOD_S, longest: int = LONGEST) -> None:
@@ -220,7 +235,11 @@ class CheckpointFile:
         self._thread: threading.Thread | None = None
 
     def save(self, content: bytes) -> None:
-        """Add a generation, a text without line breaks that is told from a part of itself. Raises FileError."""
+        """Add a generation: a text without line breaks and without a valid prefix.
+
+        Raises:
+            FileError: the text can't be written.
+        """
         line = content + b"\n"
         try:
             self._append(line)
@@ -234,7 +253,7 @@ class CheckpointFile:
             self._thread.start()
 
     def close(self) -> None:
-        """Make sure of what was saved last. Safe to repeat."""
+        """Sync the last generation. Safe to repeat."""
         self._closing.set()
         with self._changed:
             self._changed.notify()
@@ -258,8 +277,8 @@ class CheckpointFile:
         except OSError:
             with contextlib.suppress(OSError):
                 if written:
-                    self._file.truncate(self._size)  # what was saved before is the last again
-            self._let_go()  # a drive that was away is not found again by a file that was open on it
+                    self._file.truncate(self._size)  # remove the part: the generation before is the last again
+            self._let_go()  # after a drive returns, files that were open on it stay dead
             raise
         self._size += written
         SYNCER.soon(self._file.fileno())
@@ -277,33 +296,33 @@ class CheckpointFile:
                 newest, self._newest = self._newest, None
             if newest is None:
                 return
-            with contextlib.suppress(FileError):  # a full disk is told of by who saves
+            with contextlib.suppress(FileError):  # `save` reports a full disk
                 write_atomic(previous_generation(self.path), [newest])
             self._closing.wait(self._period_s)
 
 
 def _is_there(file: io.FileIO) -> bool:
-    """Return whether an open file still has a name: it may have been removed."""
+    # an open file that was removed has no link left
     return os.fstat(file.fileno()).st_nlink > 0
 
 
 def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, str]:
-    """Return what `CheckpointFile` saved last; None if there is no such file.
+    """Return the last generation in a file of `CheckpointFile`; None if there is no such file.
 
     Args:
-        read: makes something of a generation; raises ValueError, KeyError or TypeError if it is damaged.
+        read: converts a generation; raises ValueError, KeyError or TypeError for a damaged one.
 
     Returns:
-        What was read, and what was wrong with the last generation, if it is one before: "" else.
+        The converted generation, and the damage of the last one if an earlier one was read: "" else.
 
     Raises:
-        FileError: the file can't be read, and there is no generation before that can; or its folder is away.
+        FileError: no generation can be read, or the folder does not exist.
     """
     try:
         generations = path.read_bytes().splitlines() or [b""]
     except FileNotFoundError as error:
         if not any(folder.is_dir() for folder in (path.parent, path.parent.parent)):
-            # a drive of another computer: what is on it must not be begun anew
+            # the drive is not mounted: its file may exist, and must not be replaced by an empty one
             raise FileError(f"the folder of the run does not exist: {error}", where=str(path)) from error
         return None, ""
     except OSError as error:
@@ -321,5 +340,5 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
     raise FileError(
         f"can't be read, and no earlier version of it exists: {damage}",
         where=str(path),
-        hint="delete it to start anew",
+        hint="delete it to start with an empty one",
     )

@@ -1,10 +1,10 @@
-"""Work for a disk, in threads of its own: a disk that hangs delays no process for longer than a moment.
+"""Threads for work with a disk: a disk that hangs delays a process for a moment only.
 
-Control, retraction and notification never wait for a disk. What must be written before something is told is waited for,
-`DEADLINE_S` at most; then that is said, and the process goes on. The work is still done once the disk answers again.
+Control, retraction and notification never wait for a disk. A write that must precede a publication is awaited for at
+most `DEADLINE_S`; then the process logs it and goes on. The disk still does the work once it answers again.
 
-What is written is handed to the system at once, so that it outlives a kill of all processes, and is on the disk
-`SYNC_PERIOD_S` later, so that it outlives a power cut.
+Written data are handed to the system at once, so that they survive a kill of all processes, and are on the disk
+`SYNC_PERIOD_S` later, so that they survive a power cut.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ T = TypeVar("T")
 DEADLINE_S = 0.2
 SYNC_PERIOD_S = 0.1
 MOST_BYTES = 256 << 20
-"""So much may wait for a disk that hangs; what comes beyond is not written."""
+"""Most bytes that wait for a disk that hangs; further data are not written."""
 MOST_TASKS = 10_000
 FULL_BYTES = 1 << 20
-"""With less room a disk counts as full: it takes no scan any more."""
+"""Free bytes below which a disk counts as full: no scan fits."""
 _log = logging.getLogger("afspm.disk")
 
 
 class DiskTimeout(OSError):
-    """The disk has not answered in time."""
+    """The disk did not answer in time."""
 
     def __init__(self, within_s: float = DEADLINE_S) -> None:
         super().__init__(f"the disk did not answer within {within_s:g} s")
 
 
 class DiskBacklogFull(DiskTimeout):
-    """So much waits for the disk that this is never written."""
+    """The data were never written, since too many wait for the disk."""
 
 
 class DiskTask:
-    """Something to do; `done` is held until it is."""
+    """A task of a disk thread; `done` is locked until the task is finished."""
 
     __slots__ = ("done", "error", "size", "work")
 
@@ -55,17 +55,17 @@ class DiskTask:
         self.done.acquire()
 
     def wait(self) -> None:
-        """Wait until it is done, however long that takes. Raises what `work` raised."""
+        """Wait until the task is finished, without a time limit. Raises any exception of `work`."""
         with self.done:
             if self.error is not None:
                 raise self.error
 
 
 class DiskThread:
-    """A thread that does one task after the other.
+    """A thread that runs one task after the other.
 
     Attributes:
-        hangs: something was not done in time, and is not done yet: nothing is waited for until it is.
+        hangs: a task was not finished in time; until it is, no caller waits.
     """
 
     def __init__(self, deadline_s: float = DEADLINE_S, most_bytes: int = MOST_BYTES) -> None:
@@ -78,17 +78,18 @@ class DiskThread:
         self._thread: threading.Thread | None = None
 
     def run(self, work: Callable[[], object], size: int = 0) -> None:
-        """Have something done, and wait for it.
+        """Run a task and wait for it.
 
         Args:
-            size: bytes that it keeps in memory until then.
+            size: bytes that the task keeps in memory.
 
         Raises:
-            DiskTimeout: not in time; it is done later.
-            DiskBacklogFull: too much waits; it is never done.
-            Exception: what `work` raises.
+            DiskTimeout: not in time; the task runs later.
+            DiskBacklogFull: too much waits; the task never runs.
+            Exception: any exception of `work`.
         """
         task = self.submit(work, size)
+        # while the disk hangs no caller waits again: each would lose the deadline
         if not task.done.acquire(timeout=0.0 if self.hangs else self._deadline_s):
             self.hangs = True
             raise DiskTimeout(self._deadline_s)
@@ -96,7 +97,11 @@ class DiskThread:
             raise task.error
 
     def submit(self, work: Callable[[], object], size: int = 0) -> DiskTask:
-        """Have something done, and wait for nothing. Raises DiskBacklogFull."""
+        """Queue a task without waiting.
+
+        Raises:
+            DiskBacklogFull: too much waits; the task never runs.
+        """
         with self._lock:
             if self._count and (self._bytes + size > self._most_bytes or self._count >= MOST_TASKS):
                 self.hangs = True
@@ -111,7 +116,7 @@ class DiskThread:
         return task
 
     def close(self, within_s: float) -> bool:
-        """Do what waits, if that does not take too long; returns whether all was done. Safe to repeat."""
+        """Finish the queued tasks within a time limit; return whether all are finished. Safe to repeat."""
         if self._thread is None:
             return True
         self._tasks.put(None)
@@ -122,7 +127,7 @@ class DiskThread:
         while (task := self._tasks.get()) is not None:
             try:
                 task.work()
-            except Exception as error:
+            except Exception as error:  # the work may be any code; the caller that waits raises its error
                 task.error = error
             with self._lock:
                 self._bytes -= task.size
@@ -133,11 +138,11 @@ class DiskThread:
 
 
 def run_bounded(work: Callable[[], T], within_s: float) -> T:
-    """Do something with the disk in a thread, once.
+    """Run a disk operation once, in a new thread, within a time limit.
 
     Raises:
-        DiskTimeout: not in time; what becomes of it then is not known.
-        Exception: what `work` raises.
+        DiskTimeout: not in time; the outcome is unknown.
+        Exception: any exception of `work`.
     """
     found: list[T] = []
     DiskThread(within_s).run(lambda: found.append(work()))
@@ -145,10 +150,10 @@ def run_bounded(work: Callable[[], T], within_s: float) -> T:
 
 
 class Syncer:
-    """Makes sure, in a thread, that what was written is on the disk a moment later.
+    """A thread that syncs written data to the disk a moment later.
 
-    A disk that refuses is logged, once until it syncs again. What it has refused is lost in a power cut, also if it
-    syncs later: the system forgets it with the error.
+    An error of the disk is logged once, until a sync succeeds again. Data of a failed sync would be lost in a power cut
+    even if a later sync succeeds: the system drops them with the error.
     """
 
     def __init__(self, period_s: float = SYNC_PERIOD_S) -> None:
@@ -157,32 +162,37 @@ class Syncer:
         self._written: dict[tuple[int, int], int] = {}
         self._urgent = False
         self._asked = self._done = 0
-        self._failure: OSError | None = None  # not raised yet
+        self._failure: OSError | None = None  # raised by the next `now`
         self._is_failing = False
         self._thread: threading.Thread | None = None
 
     def soon(self, file: int) -> None:
-        """Have what was written to a file, by its descriptor, on the disk within the period."""
+        """Sync the data written to an open file within the period."""
+        # by inode: a file that is written often, or through several descriptors, is synced once a period
         found = os.fstat(file)
         with self._changed:
             if (key := (found.st_dev, found.st_ino)) in self._written:
                 return
-            self._written[key] = os.dup(file)  # it may be closed before
+            self._written[key] = os.dup(file)  # the caller may close its own descriptor before the sync
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="syncer", daemon=True)
                 self._thread.start()
             self._changed.notify_all()
 
     def folder_soon(self, folder: Path) -> None:
-        """Do the same for the names of the files in a folder. Raises OSError."""
+        """Sync the names of the files in a folder within the period.
+
+        Raises:
+            OSError: the folder can't be opened.
+        """
         _with_folder(folder, self.soon)
 
     def now(self, within_s: float) -> None:
-        """Wait until all that was written until now is on the disk.
+        """Wait until all data written so far are on the disk.
 
         Raises:
             DiskTimeout: not in time.
-            OSError: some of what was written since the last call can't be made sure of.
+            OSError: some data written since the last call can't be synced.
         """
         with self._changed:
             if self._thread is None:
@@ -205,23 +215,23 @@ class Syncer:
                 asked, self._urgent = self._asked, False
             failures = [error for descriptor in written.values() if (error := _sync_and_close(descriptor)) is not None]
             if written:
-                self._tell(failures)
+                self._log_change(failures)
             with self._changed:
                 self._failure = self._failure or next(iter(failures), None)
                 self._done = asked
                 self._changed.notify_all()
 
-    def _tell(self, failures: list[OSError]) -> None:
+    def _log_change(self, failures: list[OSError]) -> None:
         was_failing, self._is_failing = self._is_failing, bool(failures)
         if failures and not was_failing:
-            _log.critical("what was written in the last moment may not outlive a power cut: %s", failures[0])
+            _log.critical("the data written in the last moment may be lost in a power cut: %s", failures[0])
         elif was_failing and not failures:
             _log.info("the disk syncs again")
 
 
 def is_full(folder: Path) -> bool:
-    """Return whether a disk has no room for a file any more; False also if that can't be told."""
-    import shutil  # imported late: it is asked when something has failed
+    """Return whether a disk has no room for another file; False also if that is unknown."""
+    import shutil  # imported late: needed only after a failure
 
     try:
         return shutil.disk_usage(folder).free < FULL_BYTES
@@ -230,11 +240,11 @@ def is_full(folder: Path) -> bool:
 
 
 SYNCER = Syncer()
-"""Of this process."""
+"""The one syncer of this process."""
 
 
 _CAN_NOT_SYNC = (errno.EINVAL, errno.ENOTSUP)
-"""From file systems of other computers, for folders: there is nothing to be synced."""
+"""Errors of network file systems for the sync of a folder: they have nothing to sync."""
 
 
 def _sync_and_close(descriptor: int) -> OSError | None:
@@ -248,22 +258,36 @@ def _sync_and_close(descriptor: int) -> OSError | None:
 
 
 def sync_data(descriptor: int) -> None:
-    """Wait until what was written to a file is on the disk, where it can be found. Raises OSError."""
-    getattr(os, "fdatasync", os.fsync)(descriptor)  # Windows and macOS have the one that does more
+    """Wait until the data of a file are on the disk.
+
+    Raises:
+        OSError: the disk refuses.
+    """
+    getattr(os, "fdatasync", os.fsync)(
+        descriptor
+    )  # Windows and macOS have only fsync, which also syncs the times of the file
 
 
 def sync_file(descriptor: int) -> None:
-    """Wait until a new file is on the disk, all but its name. Raises OSError."""
+    """Wait until a new file is on the disk, except its name.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     os.fsync(descriptor)
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names of the files in a folder are on the disk. Raises OSError."""
+    """Wait until the names of the files in a folder are on the disk.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     _with_folder(folder, os.fsync)
 
 
 def _with_folder(folder: Path, sync: Callable[[int], None]) -> None:
-    """Call `sync` with the descriptor of a folder; not on Windows, where there is none to wait for."""
+    # Windows can't open folders, and needs no sync of them
     if sys.platform == "win32":
         return
     descriptor = os.open(folder, os.O_RDONLY)

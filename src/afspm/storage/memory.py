@@ -1,4 +1,4 @@
-"""A component's memory: a dict on disk that is there again after a crash or a kill."""
+"""A component's memory: a dict on disk that survives a crash or kill."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.basics.plain_data import Plain
 from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, write_atomic
 from afspm.storage.disk import DEADLINE_S, DiskThread
 
-SYNCED_WITHIN_S = 5.0  # longest wait for the disk; one that hangs counts as full
+SYNCED_WITHIN_S = 5.0  # longest wait; a disk that hangs counts as full
 _log = logging.getLogger("afspm.memory")
 
 
@@ -22,21 +22,21 @@ class Memory(MutableMapping[str, Any]):
 
     Args:
         path: the file; None keeps nothing over a restart.
-        synced: whether saving waits for the disk, ten milliseconds and more, so that all of it outlives a power cut. If
-            not, what was saved a moment before a power cut outlives that. A kill, of any process, it outlives anyway.
+        synced: whether saving waits for the disk, ten milliseconds and more, so that it survives a power cut. Otherwise
+            a power cut may undo the last save. A kill of any process undoes nothing in either case.
 
     Attributes:
-        damage: what was wrong with the file, where the generation before was taken up in its place; "" else.
+        damage: the damage of the file, if an earlier generation was read instead; "" else.
 
     Raises:
-        FileError: the file can't be read, or holds something else.
+        FileError: the file can't be read, or holds no JSON object.
     """
 
     def __init__(self, path: Path | None, *, synced: bool = True) -> None:
         self._path = path
         self._generations = CheckpointFile(path) if path and not synced else None
         self._disk = DiskThread(SYNCED_WITHIN_S if synced else DEADLINE_S)
-        self._told = OutageLog("a restart would not know what was done until now", _log)
+        self._outage = OutageLog("a restart would not know what was done until now", _log)
         self.damage = ""
         self._values: Plain = {}
         if path is not None:
@@ -45,13 +45,13 @@ class Memory(MutableMapping[str, Any]):
         self._saved = json.dumps(self._values, ensure_ascii=False)
 
     def save(self) -> bool:
-        """Write everything to disk; when this returns it survives a kill, and, if synced, a power cut.
+        """Write all values to disk, so that they survive a kill and, if synced, a power cut.
 
-        A disk that is full, away or hangs must not end the experiment: it is logged. A caller that does something that
-        must not happen twice looks at what is returned, and doesn't do it.
+        A disk that is full, away or hangs must not end the experiment: it is logged. A caller must check the result
+        before an action that must not happen twice.
 
         Returns:
-            True if it was written.
+            True if the values were written.
 
         Raises:
             InvalidValue: a value is not of JSON's types.
@@ -59,17 +59,18 @@ class Memory(MutableMapping[str, Any]):
         return self._write(self._text())
 
     def save_changes(self) -> None:
-        """`save`, if anything is other than it was saved last, however deep within."""
+        """Save if any value differs from the last save, at any depth."""
         if (text := self._text()) != self._saved:
             self._write(text)
 
     @property
     def saved_text(self) -> str:
-        """Everything that survives a restart, as JSON."""
+        """Return all saved values as JSON."""
         return self._saved
 
     def _write(self, text: str) -> bool:
-        with self._told.trying():
+        # after a failure `_saved` keeps the old text, so the next `save_changes` writes again
+        with self._outage.trying():
             if (generations := self._generations) is not None:
                 self._disk.run(lambda: generations.save(text.encode()))
             elif (path := self._path) is not None:
@@ -90,7 +91,7 @@ class Memory(MutableMapping[str, Any]):
         return self._values[key]
 
     def __setitem__(self, key: str, value: Any) -> None:
-        if not isinstance(key, str):  # JSON would turn it into a string, and it would not be found again
+        if not isinstance(key, str):  # JSON turns keys into strings: after a restart the key would be another
             raise InvalidValue(f"a key must be a text, not {key!r}", where="memory")
         self._values[key] = value
 
@@ -108,7 +109,7 @@ class Memory(MutableMapping[str, Any]):
 
 
 def _number(value: Any) -> Any:
-    """Return a number of numpy as one of Python's."""
+    # numpy's scalars become Python's numbers
     if getattr(value, "shape", None) == ():
         return value.item()
     raise TypeError(f"it is of the type {type(value).__name__}")
@@ -117,5 +118,5 @@ def _number(value: Any) -> Any:
 def _read(content: bytes) -> Plain:
     values = json.loads(content)
     if not isinstance(values, dict):
-        raise ValueError("it is not what a component remembers")
+        raise ValueError("the file is not the memory of a component")
     return values

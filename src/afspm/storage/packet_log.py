@@ -1,11 +1,11 @@
-"""The packet log: everything that the scheduler publishes, appended before it is published.
+"""The packet log: everything that the scheduler publishes, appended before its publication.
 
-It is what a run knows for certain. The cache of a restarted scheduler is read from it, the recorder follows it, and the
-record (HDF5 files and an SQLite journal) derives from it. The system takes a packet at once, which outlives a kill of
-all processes; a moment later it is on the disk, which outlives a power cut (see `disk`).
+It is the only source of truth of a run. A restarted scheduler reads its cache from it, the recorder follows it, and the
+record (HDF5 files and an SQLite journal) derives from it. An appended packet is handed to the system at once, which
+survives a kill of all processes; a moment later it is on the disk, which survives a power cut (see `disk`).
 
-The log is bounded. The recorder commits the position up to which everything is in the record and on the disk; segments
-before it are written over, after what the scheduler still caches of them is appended anew.
+The log is bounded. The recorder commits the position up to which everything is in the record and on the disk. Segments
+before it are overwritten, after the packets that the scheduler still caches have been appended again.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from afspm.storage.disk import SYNCER
 from afspm.storage.segment import SUFFIX, SegmentWriter, number_of, path_of, read_segment, segments
 
 LOG_FOLDER = "packets"
-"""In the state folder of a run."""
+"""Folder of the log, in the state folder of a run."""
 COMMITTED_FILE = "recorded"
-"""In the log's folder, if the run is recorded: the position up to which it is."""
+"""File in the log's folder with the committed position, if there is a recorder."""
 SEGMENT_BYTES = 16 << 20
 CAPACITY_BYTES = 64 << 20
-"""The log is not made smaller than this; nor than twice what is cached."""
+"""Smallest size of the log; it is also never smaller than twice the cached packets."""
 MOST_UNRECORDED_BYTES = 1 << 30
 SPARE_BYTES = 256 << 20
-"""So much room is kept to be written over: what a flood takes until it is recorded."""
+"""Bytes kept in spare files: what a flood of packets needs until it is recorded."""
 SYNCED_WITHIN_S = 5.0
 _SPARE_SUFFIX = ".spare"
 
@@ -46,11 +46,11 @@ START = Position(0, 0)
 
 
 class PacketLog:
-    """Appends packets. One process writes a log; any number read it meanwhile.
+    """A writer of packets. One process writes a log; any number of processes may read it meanwhile.
 
     Args:
-        folder: made when the first packet is appended.
-        most_unrecorded_bytes: how much may wait for the recorder; beyond it the oldest is given up.
+        folder: created with the first packet.
+        most_unrecorded_bytes: most bytes that wait for the recorder; beyond it the oldest are given up.
 
     Attributes:
         has_grown: a segment was filled since the last `clean`.
@@ -63,15 +63,16 @@ class PacketLog:
         self._full = deque((path, path.stat().st_size) for path in segments(folder))
         self._done_with: list[Path] = []
         self._spare = sorted(folder.glob(f"*{_SPARE_SUFFIX}"))
+        # numbers are never used twice: they distinguish new packets from remains in an overwritten file
         used = [number_of(path) for path in (*self._spare, *(path for path, _ in self._full))]
         self._number = max([*used, (committed(folder) or START).segment])
         self.has_grown = True
 
     def append(self, entry: LoggedPacket) -> None:
-        """Write a packet behind the others; when this returns it outlives a kill.
+        """Append a packet, so that it survives a kill.
 
         Raises:
-            OSError: the disk is full …; nothing of it is in the log then.
+            OSError: the disk refuses (full …); then no part of the packet is in the log.
         """
         if self._segment is not None and self._segment.size >= SEGMENT_BYTES:
             self.close()
@@ -80,14 +81,14 @@ class PacketLog:
             segment.append(entry)
         except OSError:
             if not segment.take_back():
-                self.close()  # half a packet at the end of a segment is no harm, in the middle it would be
+                self.close()  # readers skip half a packet at the end of a segment, but not in the middle
             raise
 
     def clean(self, cached: Iterable[LoggedPacket]) -> bool:
-        """Free the oldest segments while the log is too large. What is `cached` stays in the log.
+        """Free the oldest segments while the log is too large; packets in `cached` stay in the log.
 
         Returns:
-            False: packets were given up that the recorder has not had.
+            False if packets were given up before they were recorded.
 
         Raises:
             OSError: the disk is full, or does not sync.
@@ -103,6 +104,7 @@ class PacketLog:
             if not is_recorded and self._size <= limit + self._most_unrecorded_bytes:
                 break
             all_recorded = all_recorded and is_recorded
+            # before the segment is freed, else a power cut loses the packets
             self._carry_forward(path, live)
             self._full.popleft()
             self._done_with.append(path)
@@ -110,7 +112,7 @@ class PacketLog:
         return all_recorded
 
     def close(self) -> None:
-        """Finish the segment that is being written. Safe to repeat; `append` begins another."""
+        """Finish the present segment. Safe to repeat; `append` begins another."""
         if self._segment is not None:
             self._full.append((self._segment.path, self._segment.size))
             self._segment.close()
@@ -126,7 +128,7 @@ class PacketLog:
         self._number += 1
         path = path_of(self._folder, self._number)
         if self._spare:
-            with contextlib.suppress(OSError):  # a reader has it open, where such files can't be renamed
+            with contextlib.suppress(OSError):  # Windows renames no file that a reader has open
                 return SegmentWriter(path, self._spare.pop())
         return SegmentWriter(path)
 
@@ -135,15 +137,15 @@ class PacketLog:
         for entry in carried:
             self.append(entry)
         if carried:
-            SYNCER.now(SYNCED_WITHIN_S)  # before the only other copy is written over
+            SYNCER.now(SYNCED_WITHIN_S)  # sync the new copy before the old one is overwritten
 
     def _free(self) -> None:
-        """Keep some of the files that are needed no more, to write over, and remove the others."""
+        # some files are kept as spares to overwrite, which takes a fraction of the time of a new file
         files, self._done_with = self._done_with, []
         for path in files:
             try:
                 self._spare.append(path.replace(path.with_suffix(_SPARE_SUFFIX)))
-            except OSError:  # Windows renames no file that is still open, to be read or synced: next time
+            except OSError:  # Windows renames no file that is open for a read or sync: the next call tries again
                 self._done_with.append(path)
         with contextlib.suppress(OSError):
             while len(self._spare) > SPARE_BYTES // SEGMENT_BYTES:
@@ -152,11 +154,11 @@ class PacketLog:
 
 
 class LogReader:
-    """Follows a log while it is written.
+    """A reader that follows a log while it is written.
 
     Attributes:
-        position: behind the last packet that was read.
-        newest: the number of the segment that was written when the log was read last.
+        position: position after the last packet read.
+        newest: number of the newest segment at the last read.
     """
 
     def __init__(self, folder: Path, position: Position = START) -> None:
@@ -165,7 +167,7 @@ class LogReader:
         self._folder = folder
 
     def read(self, most_bytes: int) -> list[tuple[LoggedPacket, Position]]:
-        """Return the packets that came since, up to about so many bytes, each with the position behind it.
+        """Return the next packets, about `most_bytes` of them, each with the position after it.
 
         Raises:
             OSError: the log can't be read.
@@ -180,7 +182,7 @@ class LogReader:
                 most_bytes -= len(entry.packet.payload)
                 if most_bytes <= 0:
                     break
-            # a segment that had a successor before it was read to its end does not grow any more
+            # a segment does not grow once it has a successor
             if most_bytes <= 0 or not later:
                 self.position = found[-1][1] if found else Position(segment, start)
                 return found
@@ -188,18 +190,18 @@ class LogReader:
 
 
 def log_folder(state_dir: Path) -> Path:
-    """Return where the packet log of a run is."""
+    """Return the folder of a run's packet log."""
     return state_dir / LOG_FOLDER
 
 
 def logged_packets(folder: Path) -> Iterator[LoggedPacket]:
-    """Yield all packets of a log in the order in which they were appended; those carried forward come again."""
+    """Yield all packets of a log in the order of appending; packets that were carried forward come again."""
     for path in segments(folder):
         yield from (entry for entry, _ in read_segment(path))
 
 
 def cached_packets(folder: Path) -> list[LoggedPacket]:
-    """Return what the scheduler's cache held when the log was written last, oldest first."""
+    """Return the content of the scheduler's cache at the last write, oldest first."""
     kept: dict[str, dict[int, LoggedPacket]] = {}
     for entry in logged_packets(folder):
         if entry.history:
@@ -212,36 +214,45 @@ def cached_packets(folder: Path) -> list[LoggedPacket]:
 
 
 def expect_recorder(folder: Path) -> None:
-    """Have the log keep packets until a recorder has committed them. Raises OSError."""
+    """Have the log keep packets until a recorder has committed them.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     if committed(folder) is None:
         folder.mkdir(parents=True, exist_ok=True)
         commit(folder, START)
 
 
 def commit(folder: Path, position: Position) -> None:
-    """Say that everything before a position is recorded, and on the disk. Raises OSError."""
+    """Commit a position: everything before it is recorded and on the disk.
+
+    Raises:
+        OSError: the disk refuses.
+    """
     text = f"{position.segment} {position.offset}\n"
     replace_file(folder / COMMITTED_FILE, [text.encode("ascii")], synced=False)
 
 
 def committed(folder: Path) -> Position | None:
-    """Return the position up to which everything is recorded; None: there is no recorder."""
+    """Return the committed position; None without a recorder."""
     try:
         segment, offset = (folder / COMMITTED_FILE).read_text(encoding="ascii").split()
         return Position(int(segment), int(offset))
     except FileNotFoundError:
         return None
+    # a damaged file: nothing counts as recorded, so nothing is freed
     except (OSError, ValueError):
         return START
 
 
 def discard_if_recorded(folder: Path) -> None:
-    """Remove the log of an experiment that has ended, unless the recorder has not had all of it."""
+    """Remove the log of an ended experiment if all of it is recorded."""
     position = committed(folder)
     if position is not None and LogReader(folder, position).read(1):
         return
     with contextlib.suppress(OSError):
-        SYNCER.now(SYNCED_WITHIN_S)  # Windows removes no file that is open
+        SYNCER.now(SYNCED_WITHIN_S)  # Windows removes no open file: let the syncer close its descriptors
     for pattern in (f"*{SUFFIX}", f"*{_SPARE_SUFFIX}", COMMITTED_FILE):
         for file in folder.glob(pattern):
             with contextlib.suppress(OSError):

@@ -1,12 +1,12 @@
 """One file of the packet log: packets one after the other, each with its length and a checksum.
 
 A packet is: "AFp3", the number of the file, the lengths of envelope and payload, its time and the translator's time of
-it (-1: none), how many of its envelope are cached, the checksum of all that; envelope; payload. Keyed results
+it (-1: none), the number of cached packets of its envelope, the checksum of all that; envelope; payload. Keyed results
 of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum of its
 64-bit words, which takes a hundredth of the time that sending them takes.
 
-To write over an old file takes a fraction of the time that new room on a disk does. The number of the file, which is
-new each time, tells what is left of before from what is new; the checksum tells what a kill or power cut left half.
+Overwriting an old file takes a fraction of the time of a new file. The number of the file, which is new each time,
+distinguishes new packets from remains of old ones; the checksum detects a packet that a kill or power cut left half.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ _CHECKSUM_MODULUS = 1 << 64
 
 
 class SegmentWriter:
-    """A segment that is being written.
+    """A writer of one segment.
 
     Args:
-        spare: a file whose contents are needed no more, to write over; None: a new one is made.
+        spare: a file that is no longer needed, to overwrite; None: a new file.
 
     Attributes:
         size: bytes of the packets in it.
 
     Raises:
-        OSError: the disk is full …
+        OSError: the disk refuses (full …).
     """
 
     def __init__(self, path: Path, spare: Path | None = None) -> None:
@@ -51,9 +51,14 @@ class SegmentWriter:
         SYNCER.folder_soon(path.parent)
 
     def append(self, entry: LoggedPacket) -> None:
-        """Write a packet behind the others. Raises OSError: the disk is full …; `take_back` it then."""
+        """Append a packet.
+
+        Raises:
+            OSError: the disk refuses (full …); then call `take_back`.
+        """
         payload = entry.packet.payload
         head = head_of(entry, self._number)
+        # one system call for a small packet, no copy of a large one
         if len(payload) <= _SMALL:
             self._write(head + payload)
         else:
@@ -63,7 +68,7 @@ class SegmentWriter:
         SYNCER.soon(self._file.fileno())
 
     def take_back(self) -> bool:
-        """Remove what was written of a packet that failed; returns whether more can be appended."""
+        """Remove the part of a packet that failed; return whether more packets can be appended."""
         try:
             self._file.seek(self.size)
             self._file.truncate()
@@ -76,18 +81,19 @@ class SegmentWriter:
         self._file.close()
 
     def _write(self, data: bytes | memoryview) -> None:
+        # an unbuffered write may take only a part, e.g. on a disk that is nearly full
         view = memoryview(data)
         while view:
             view = view[self._file.write(view) :]
 
 
 def number_of(path: Path) -> int:
-    """Return what tells a segment from what was in the file before it had this name."""
+    """Return the number of a segment."""
     return int(path.stem)
 
 
 def path_of(folder: Path, number: int) -> Path:
-    """Return where the segment with a number is."""
+    """Return the path of the segment with a number."""
     return folder / f"{number:08d}{SUFFIX}"
 
 
@@ -97,7 +103,7 @@ def segments(folder: Path) -> list[Path]:
 
 
 def read_segment(path: Path, offset: int = 0) -> Iterator[tuple[LoggedPacket, int]]:
-    """Yield each whole packet from an offset on, with the offset behind it; nothing if the file is gone."""
+    """Yield each complete packet from an offset on, with the offset after it; nothing if the file is gone."""
     try:
         file = path.open("rb")
     except FileNotFoundError:
@@ -110,12 +116,13 @@ def read_segment(path: Path, offset: int = 0) -> Iterator[tuple[LoggedPacket, in
 
 
 def read_packet(file: IO[bytes], number: int = 0) -> LoggedPacket | None:
-    """Return the packet that begins here; None if there is none, or not all of it."""
+    """Return the packet that begins here; None if there is none, or it is incomplete."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None
-    magic, said, envelope_len, payload_len, time_ns, source_ns, history, _ = _HEAD.unpack(head)
-    if (magic, said) != (_MAGIC, number):
+    # a number of another life marks remains of an overwritten file
+    magic, written_number, envelope_len, payload_len, time_ns, source_ns, history, _ = _HEAD.unpack(head)
+    if (magic, written_number) != (_MAGIC, number):
         return None
     envelope, payload = file.read(envelope_len), file.read(payload_len)
     packet = Packet(envelope.decode("utf-8", "replace"), payload, None if time_ns < 0 else time_ns)
@@ -125,7 +132,7 @@ def read_packet(file: IO[bytes], number: int = 0) -> LoggedPacket | None:
 
 
 def head_of(entry: LoggedPacket, number: int = 0) -> bytes:
-    """Return what comes before the payload."""
+    """Return the bytes of a packet before its payload."""
     packet, source_ns, history = entry
     envelope, times = packet.envelope.encode(), [-1 if one is None else one for one in (packet.time_ns, source_ns)]
     about = _MAGIC, number, len(envelope), len(packet.payload), *times, history
@@ -136,7 +143,7 @@ def head_of(entry: LoggedPacket, number: int = 0) -> bytes:
 def _checksum(payload: bytes | memoryview) -> int:
     if len(payload) <= _SMALL:
         return zlib.crc32(payload)
-    import numpy as np  # not before there are scans: without it a scheduler starts in half the time
+    import numpy as np  # imported late: without numpy a scheduler starts in half the time
 
     words, rest = divmod(len(payload), _WORD)
     end = int.from_bytes(payload[len(payload) - rest :], "little")

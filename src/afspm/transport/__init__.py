@@ -4,12 +4,12 @@
 
     comes in      packets of one publisher (`subscriber`), requests (`router`, `zmq_server`), answers (`control_client`,
                   `translator_link`)
-    state         who is connected under which name; up to which time a subscriber has everything
+    state         the connected peers and their names; the time up to which a subscriber has every packet
     goes out      events of a port (`port`): PacketReceived, RequestReceived, ParentGone …, in one poller per process
-    always holds  each packet arrives once and in order, or the subscriber learns that some are missing; nobody is
-                  waited for; a socket accepts only this experiment's processes
+    always holds  each packet arrives once and in order, or the subscriber learns that some are missing; no send waits
+                  for a peer; a socket accepts only this experiment's processes
 
-A subscriber that joins late, or was restarted, sends a marker with the time of its newest packet, and the publisher
-replays what it still has from there on (`late_joiners`). `process/` is the child's side of supervision: the context
-that a component runs in, the bond to its parent, log, signals.
+A late or restarted subscriber sends a marker with the time of its newest packet. The publisher then replays the kept
+packets after this time (`late_joiners`). `process/` is the child's side of supervision: the context in which a
+component runs, the bond to its parent, log, signals.
 """

@@ -18,10 +18,10 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 
 
 class ControlClient:
-    """Asks the scheduler: the same bytes as a REQ socket, without its lock step.
+    """A client that sends requests to the scheduler: the bytes of a REQ socket, without its lock step.
 
     Args:
-        name: of the component. Restarted, it is the same client to the scheduler.
+        name: name of the component; after a restart the scheduler sees the same client.
     """
 
     def __init__(self, network: Network, name: str, address: str, log: RateLimitedLog) -> None:
@@ -36,15 +36,15 @@ class ControlClient:
         network.connect(self.socket, address)
 
     def send(self, frames: Sequence[bytes]) -> None:
-        """Ask; dropped while there is no scheduler.
+        """Send a request; it is dropped while there is no scheduler.
 
-        A request repeated without an answer in between makes the connection anew: a connection that stands but leads
-        nowhere (cut off, or its identity was taken by another process) would never lead anywhere again.
+        A second request without an answer in between opens a new connection. The old one may look intact and lead
+        nowhere: cut off, or its identity taken by another process.
         """
         if not self._connected:
             return
         asked = frames[2] if len(frames) > 2 else b""
-        if asked and not self._token:  # the same in all of a process's ids that have one
+        if asked and not self._token:  # equal in all ids of a process with a token
             self._token = token_of(self._name, asked.decode()) or ""
         if asked and asked == self._unanswered:
             self._reconnect()
@@ -53,7 +53,9 @@ class ControlClient:
         self._send(frames)
 
     def _send(self, frames: Sequence[bytes]) -> None:
-        send_frames(self.socket, [b"", *frames])  # or not, if it is full: the scheduler has stood still for thousands
+        send_frames(
+            self.socket, [b"", *frames]
+        )  # a full queue drops it: the scheduler has ignored thousands of requests
 
     def _reconnect(self) -> None:
         self._connected, self._unanswered = False, b""
@@ -63,7 +65,7 @@ class ControlClient:
     def receive(self) -> list[Incoming]:
         """Return the next answer."""
         frames = [frame.bytes for frame in receive_frames(self.socket)]
-        if not frames or frames == [b""]:  # an empty one: the scheduler has looked whether we are there
+        if not frames or frames == [b""]:  # an empty message is the scheduler's probe
             return []
         try:
             return self._interpret(frames)
@@ -72,7 +74,7 @@ class ControlClient:
             return []
 
     def follow(self) -> list[Incoming]:
-        """Return the scheduler's coming and going."""
+        """Return connections and disconnections of the scheduler."""
         found: list[Incoming] = []
         for event in self.monitor.drain():
             self._connected, self._unanswered = event.kind == CONNECTED, b""
@@ -83,16 +85,14 @@ class ControlClient:
 
     def _interpret(self, frames: list[bytes]) -> list[Incoming]:
         if len(frames) < 2 or frames[0]:
-            raise WireError("the empty frame before it is missing")
+            raise WireError("the empty frame before the answer is missing")
         response = wire.decode_response(frames[1:])
         self._unanswered = b""
         return [ReplyReceived(response)]
 
     def _greet(self) -> None:
-        """Say who we are to a scheduler that was restarted, or that has not yet seen our last connection close.
-
-        It may be waiting for us, who are in control; and what we ask next may have an id that does not say who we are.
-        """
+        # a restarted scheduler may wait for this client, which is in control. The next request need not have the token
+        # in its id, without which the scheduler can't match the new connection with the old session.
         if self._has_asked and self._token:
             self._send(wire.encode_request(Request(CLOCK_REQUEST, id=f"{self._name}/{self._token}/0")))
         elif self._has_asked:

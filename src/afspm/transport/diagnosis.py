@@ -1,4 +1,4 @@
-"""Judges what `afspm doctor` has measured: what is wrong, in a physicist's words, and what to do about it."""
+"""Diagnoses of the measurements of `afspm doctor`: each problem in a physicist's words, with its remedy."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ class Reach(Enum):
 
     OPEN = "open"
     OTHER_PROGRAM = "other-program"
-    """A program answers that does not speak ZeroMQ."""
+    """A program answers, but not with ZeroMQ's protocol."""
     NO_GREETING = "no-greeting"
-    """A program accepts the connection, and says nothing."""
+    """A program accepts the connection, but sends nothing."""
     REFUSED = "refused"
     SILENT = "silent"
-    """Neither accepted nor refused."""
+    """The connection is neither accepted nor refused."""
     NO_ROUTE = "no-route"
     UNKNOWN_NAME = "unknown-name"
 
 
 class Handshake(Enum):
-    """The outcome of the exchange of keys on an open connection."""
+    """The outcome of the key exchange on an open connection."""
 
     DONE = "done"
     KEY_REFUSED = "key-refused"
@@ -44,12 +44,12 @@ class Handshake(Enum):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """One thing that was looked at.
+    """The verdict on one measurement.
 
     Attributes:
-        code: names it for programs.
+        code: identifier for programs.
         where: the address, file or computer.
-        remedy: what to do; empty where nothing is wrong.
+        remedy: what to do; empty if nothing is wrong.
     """
 
     code: str
@@ -61,7 +61,7 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Versions:
-    """The programs of one computer."""
+    """Versions of the programs of one computer."""
 
     afspm: str
     python: str
@@ -69,9 +69,9 @@ class Versions:
 
 
 def of_packages(declared: Iterable[DeclaredName]) -> Iterator[Diagnosis]:
-    """Yield what each package adds to afspm, a line for each group, and what of it can't be used.
+    """Yield the names that each package adds to afspm, one line for each group, and the names that can't be used.
 
-    A name that can't be used is a warning: only an experiment that needs the name fails.
+    An unusable name is a warning: only an experiment with this name fails.
     """
     usable: dict[tuple[str, str], list[str]] = {}
     for one in declared:
@@ -85,7 +85,6 @@ def of_packages(declared: Iterable[DeclaredName]) -> Iterator[Diagnosis]:
 
 
 def fine(code: str, where: str, what: str) -> Diagnosis:
-    """Return a diagnosis without a remedy."""
     return Diagnosis(code, Severity.FINE, where, what)
 
 
@@ -95,12 +94,12 @@ _UNREACHED: Mapping[Reach, tuple[str, str]] = {
         "end that program, or give the experiment another port",
     ),
     Reach.NO_GREETING: (
-        "the connection is accepted, and nothing comes: that process hangs, or it is another program",
+        "the connection is accepted, but nothing is sent: that process hangs, or is another program",
         "look which program has this port; a process of the experiment that hangs is restarted by itself",
     ),
     Reach.SILENT: (
-        "no answer at all: a firewall drops what is sent there, the cable is out, or that computer is off",
-        "see that it is on and has this address; then let its firewall accept this port",
+        "no answer at all: a firewall drops the messages, the cable is out, or that computer is off",
+        "check that it is on and has this address; then let its firewall accept this port",
     ),
     Reach.NO_ROUTE: (
         "this computer has no way to that network",
@@ -114,11 +113,11 @@ _UNREACHED: Mapping[Reach, tuple[str, str]] = {
 
 
 def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expected: bool) -> Diagnosis:
-    """Judge an address that `owner` listens at.
+    """Judge an address at which `owner` listens.
 
     Args:
-        is_here: it is one of this computer's own.
-        expected: the experiment runs, so that `owner` should listen.
+        is_here: the address belongs to this computer.
+        expected: the experiment is running, so `owner` should listen.
     """
     where = f"{owner} at {address}"
     if reach is Reach.OPEN:
@@ -134,16 +133,16 @@ def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expecte
 
 
 def of_handshake(address: str, handshake: Handshake, key: str, server: str) -> Diagnosis:
-    """Judge the exchange of keys, with the key of `key`, at an address of `server`."""
+    """Judge the key exchange with the key `key` at an address of `server`."""
     code = f"key-{handshake.value}"
     if handshake is Handshake.DONE:
-        return fine(code, address, f"the key of {key or 'nobody'} is let in")
+        return fine(code, address, f"the key of {key} is accepted" if key else "no key is needed")
     if handshake is Handshake.KEY_REFUSED:
         what = f"{server} does not know the key of {key}"
         return Diagnosis(
             "key-unknown", Severity.ERROR, address, what, f"copy keys/public/{key}.key to the computer of {server}"
         )
-    what = f"the connection stands, but keys do not fit: perhaps keys/public/{server}.key here is not that of {server}"
+    what = f"the connection stands, but keys do not fit: perhaps keys/public/{server}.key here is of another process"
     remedy = f"copy keys/public of the computer of {server} to this one"
     return Diagnosis("key-mismatch", Severity.ERROR, address, what, remedy)
 
@@ -152,23 +151,23 @@ MOST_AHEAD_S = 1.0
 
 
 def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
-    """Judge by how much this computer's clock is ahead of the scheduler's."""
+    """Judge the lead of this computer's clock over the scheduler's."""
     where = "the clock of this computer"
     if abs(ahead_s) <= MOST_AHEAD_S + uncertain_s:
-        return fine("clock", where, f"agrees with that of the scheduler to {abs(ahead_s) + uncertain_s:.2f} s")
+        return fine("clock", where, f"agrees with the scheduler's clock to {abs(ahead_s) + uncertain_s:.2f} s")
     way = "ahead of" if ahead_s > 0.0 else "behind"
-    what = f"is {duration_text(abs(ahead_s))} {way} that of the scheduler"
+    what = f"is {duration_text(abs(ahead_s))} {way} the scheduler's clock"
     remedy = "let both computers take their time from the network (NTP): files and logs have times that do not fit"
     return Diagnosis("clock", Severity.WARNING, where, what, remedy)
 
 
 def of_versions(ours: Versions, theirs: Versions | None) -> Diagnosis:
-    """Compare what runs here with what the scheduler runs."""
+    """Compare the versions here with those of the scheduler."""
     here = f"afspm {ours.afspm}, Python {ours.python}, libzmq {ours.libzmq}"
     if theirs is None or theirs == ours:
         return fine("versions", "this computer", here)
     there = f"afspm {theirs.afspm}, Python {theirs.python}, libzmq {theirs.libzmq}"
-    what = f"{here}; that of the scheduler: {there}"
+    what = f"{here}; the scheduler's computer: {there}"
     if theirs.afspm == ours.afspm:
         return fine("versions", "this computer", what)
     remedy = f"install the same on both: pip install afspm=={theirs.afspm}"
@@ -199,10 +198,10 @@ LEAST_MEMORY_BYTES = 1 << 30
 
 
 def of_memory(available: int, used: Mapping[str, int]) -> Diagnosis:
-    """Judge the memory of this computer; `used`: by processes of the experiment that run here."""
+    """Judge the memory of this computer; `used`: bytes of each process of the experiment on it."""
     largest = sorted(used.items(), key=lambda one: -one[1])[:5]
-    told = "".join(f", {name} {size / 1e6:.0f} MB" for name, size in largest)
-    what = f"{available / 1e9:.1f} GB available{told}"
+    users = "".join(f", {name} {size / 1e6:.0f} MB" for name, size in largest)
+    what = f"{available / 1e9:.1f} GB available{users}"
     if available >= LEAST_MEMORY_BYTES:
         return fine("memory", "this computer", what)
     return Diagnosis("memory", Severity.WARNING, "this computer", what, "close other programs")
@@ -219,25 +218,25 @@ class Heard:
 
     @property
     def rate_hz(self) -> float:
-        """Packets a second."""
+        """Return packets per second."""
         return self.count / self.listened_s
 
     @property
     def bytes_per_s(self) -> float:
-        """Bytes a second."""
+        """Return bytes per second."""
         return self.size / self.listened_s
 
 
 def of_publisher(address: str, heard: Iterable[Heard], *, caught_up: bool) -> Diagnosis:
-    """Judge what came from the scheduler's publisher."""
+    """Judge the packets received from the scheduler's publisher."""
     count = sum(one.count for one in heard)
     if caught_up:
         return fine("heard", address, f"{count} packets while listening, after all that was cached")
-    what = "it is connected, and publishes nothing"
+    what = "the publisher is connected, but sends nothing"
     remedy = "wait a moment; if it stays so, the link is too slow for the scans that are cached, or the scheduler hangs"
     return Diagnosis("silent-publisher", Severity.ERROR, address, what, remedy)
 
 
 def is_well(found: Iterable[Diagnosis]) -> bool:
-    """Return whether nothing keeps the experiment from working."""
+    """Return whether no diagnosis is an error."""
     return all(one.severity is not Severity.ERROR for one in found)

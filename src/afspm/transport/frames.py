@@ -1,4 +1,4 @@
-"""Messages to and from sockets, each whole, without copying what is large."""
+"""Whole messages to and from sockets, without copies of large frames."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from afspm.wire import Buffer
 
 Socket = zmq.Socket[bytes]
 
-# as numbers: to combine the library's flags, or to ask for an option, takes longer than to send or to receive
+# as plain integers: combining the library's enums takes longer than a send
 _NOW, _MORE = int(zmq.NOBLOCK), int(zmq.SNDMORE)
 _LARGE_BYTES = 32 * 1024
-"""Below this a copy is cheaper than keeping the received buffer."""
+"""Below this size a copy is cheaper than a reference to the received buffer."""
 
 
 def receive_frames(socket: Socket) -> list[zmq.Frame]:
@@ -29,15 +29,15 @@ def receive_frames(socket: Socket) -> list[zmq.Frame]:
 
 
 def contents(frames: Sequence[zmq.Frame]) -> list[Buffer]:
-    """Return what frames hold: what is large as a view of the received buffer, which the view keeps alive."""
+    """Return the contents of frames: large ones as views of the received buffer, which a view keeps alive."""
     return [frame.bytes if len(frame) < _LARGE_BYTES else memoryview(frame.buffer).toreadonly() for frame in frames]
 
 
 def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
-    """Send a whole message; False if nobody is there to take it. Never blocks.
+    """Send a whole message; return False if no peer can take it. Never blocks.
 
     Raises:
-        zmq.ZMQError: it is addressed to a peer that is gone, where the socket tells.
+        zmq.ZMQError: the addressed peer is gone, on sockets that report it.
     """
     try:
         for frame in frames[:-1]:
@@ -49,29 +49,29 @@ def send_frames(socket: Socket, frames: Sequence[bytes]) -> bool:
 
 
 def send_packet(socket: Socket, packet: Packet, stamp: bytes | None, *, topic: bytes | None = None) -> None:
-    """Publish a packet; a payload that was received goes out from the buffer that it came in.
+    """Publish a packet; a received payload is sent from its own buffer.
 
     Args:
         stamp: the third frame; None: the packet has two.
-        topic: put before the envelope.
+        topic: frame before the envelope.
     """
     payload: Buffer | zmq.Frame = packet.payload
     if isinstance(payload, memoryview):
         origin = payload.obj
-        # any other buffer may change after we return
+        # copy any other buffer: it may change while ZeroMQ is still sending it
         payload = origin if isinstance(origin, zmq.Frame) and len(origin) == payload.nbytes else payload.tobytes()
     if topic is not None:
         socket.send(topic, _MORE)
     socket.send(packet.envelope.encode(), _MORE)
-    socket.send(payload, 0 if stamp is None else _MORE, copy=False)  # what is small is copied all the same
+    socket.send(payload, 0 if stamp is None else _MORE, copy=False)  # libzmq copies small frames all the same
     if stamp is not None:
         socket.send(stamp)
 
 
 def descriptor_of(frame: zmq.Frame) -> int:
-    """Return the number of the connection that a message came by; -1 for peers older than ZMTP 3.
+    """Return the descriptor of a message's connection; -1 for peers older than ZMTP 3.
 
-    For REQ sockets and plain subscribers alone, see `router` and `publisher`: the library calls it obsolete.
+    Only for REQ sockets and plain subscribers, see `router` and `publisher`: the library calls this option obsolete.
     """
     try:
         return int(frame.get(zmq.SRCFD))
@@ -80,7 +80,7 @@ def descriptor_of(frame: zmq.Frame) -> int:
 
 
 def property_of(frame: zmq.Frame, name: str) -> str | None:
-    """Return what is known of the peer, e.g. "Socket-Type"; None if it is not."""
+    """Return a property of the peer, e.g. "Socket-Type"; None if unknown."""
     try:
         value = frame.get(name)
     except zmq.ZMQError:
@@ -89,5 +89,5 @@ def property_of(frame: zmq.Frame, name: str) -> str | None:
 
 
 def user_of(frame: zmq.Frame) -> str | None:
-    """Return whose key the connection was made with; None without keys."""
+    """Return the owner of the connection's key; None without keys."""
     return property_of(frame, "User-Id")

@@ -1,4 +1,4 @@
-"""Heartbeats: a thread in every process says that it is alive and for how long it has been busy."""
+"""Heartbeats: a thread in every process that reports its life and the age of its current step."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from afspm.wire import BEAT, CLOSING
 
 
 class Heartbeat(NamedTuple):
-    """One beat.
+    """One heartbeat.
 
     Attributes:
-        name: of the process.
-        closing: it ends on purpose; no more beats will come.
-        step_age_s: for how long the current step has been running; 0 when idle. None if the process did not say.
-        longest_step_s: how long a step may take; None if the process did not say.
+        name: name of the process.
+        closing: the process ends on purpose; no more heartbeats follow.
+        step_age_s: age of the current step; 0 when idle. None if the process does not send it.
+        longest_step_s: longest allowed step; None if the process does not send it.
     """
 
     name: str
@@ -35,20 +35,20 @@ class Heartbeat(NamedTuple):
 
 
 class HeartbeatSender:
-    """Beats from a thread of its own, so that a process that is busy is not taken for dead.
+    """A thread that sends heartbeats, so that a busy process is not presumed dead.
 
-    The first beat goes out as soon as there is a listener.
+    The first heartbeat is sent once there is a listener.
 
     Args:
-        address: the listener's.
-        period_s: real seconds between beats.
-        step_age_s: for how long the current step has been running; called in the thread.
-        longest_step_s: how long a step may take; called in the thread.
-        token: of the launch line, by which the listener knows that the beat is ours.
-        network: for this socket alone, and closed with it.
+        address: address of the listener.
+        period_s: real seconds between heartbeats.
+        step_age_s: returns the age of the current step; called in the thread.
+        longest_step_s: returns the longest allowed step; called in the thread.
+        token: token of the launch line, which proves the sender.
+        network: network of this socket only, closed with it.
 
     Attributes:
-        heard: set as soon as there is a listener: beats from then on arrive.
+        heard: set once there is a listener; later heartbeats arrive.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class HeartbeatSender:
         self._token = token.encode()
         self._stop: WakeUp[None] = WakeUp()
         self.heard = threading.Event()
-        # XPUB, since it sees the listener subscribe: a beat sent before that would be lost
+        # XPUB, not PUB: it receives the listener's subscription, and a beat before that would be lost
         self._socket = self._network.socket(zmq.XPUB)
         self._network.connect(self._socket, address)
         self._thread = threading.Thread(target=self._run, name="heartbeat", daemon=True)
@@ -92,7 +92,7 @@ class HeartbeatSender:
         self._socket.send_multipart([beat, *(f"{age_s:.3f}".encode() for age_s in ages), self._token])
 
     def close(self) -> None:
-        """Say that we are closing on purpose, and stop. Safe to repeat."""
+        """Announce the end on purpose, and stop. Safe to repeat."""
         if self._thread.is_alive():
             self._stop.post()
             self._thread.join()
@@ -102,7 +102,7 @@ class HeartbeatSender:
 
 @dataclass
 class _Expected:
-    """The process that beats at one address, and the token that proves it."""
+    """The process that sends heartbeats to one address, and its token."""
 
     name: str
     token: bytes
@@ -110,15 +110,15 @@ class _Expected:
 
 
 class HeartbeatListener:
-    """Listens to the heartbeats of several processes, each at an address of its own, by a token of its own.
+    """A receiver of the heartbeats of several processes, each with its own address and token.
 
-    Other users of this computer get to no such address: it is a unix socket, or encrypted, by a key that the process
-    alone gets. Other processes of this user may: a beat of a process that knows its token counts with it alone. A
-    program that sends none is believed as it is.
+    Other users of this computer can't reach an address: it is a unix socket, or encrypted with a key that only the
+    process gets. Other processes of this user can. So once a process has sent its token, heartbeats without it are
+    ignored. A program that never sends a token is believed.
 
     Args:
         take_address: returns a new address.
-        encrypts: whether sockets are encrypted that other users can reach.
+        encrypts: whether to encrypt sockets that other users can reach.
     """
 
     def __init__(
@@ -130,21 +130,21 @@ class HeartbeatListener:
         self._poller = zmq.Poller()
 
     def end_polls_by(self, descriptor: int) -> None:
-        """Have a readable descriptor end a `poll` under way; to read from it is left to its owner."""
+        """Have a readable descriptor end the present `poll`; its owner reads it."""
         self._poller.register(descriptor, zmq.POLLIN)
 
     def listen(self, name: str, *, token: str = "", needs_token: bool = False) -> tuple[str, bytes | None]:
-        """Begin to listen to the process `name`; return the address and the key to give to it, None if it is plain.
+        """Start to listen to the process `name`; return the address and the key for it, None for a plain socket.
 
         Args:
-            token: to be given to it, too.
-            needs_token: it is known to send its token; else it is from its first beat that has it.
+            token: token that the process gets, too.
+            needs_token: the process certainly sends its token; otherwise the token is required after its first use.
         """
         socket = self._network.socket(zmq.SUB)
         socket.setsockopt(zmq.SUBSCRIBE, b"")
         address, key = self._take_address(), None
         if self._encrypts and not curve.is_private(address):
-            # its clients need no keys that are known: nobody else has the server's
+            # any client key is accepted: only the process gets the server's public key
             key, secret = curve.pair()
             socket.setsockopt(zmq.CURVE_SERVER, 1)
             socket.setsockopt(zmq.CURVE_SECRETKEY, secret)
@@ -154,7 +154,7 @@ class HeartbeatListener:
         return bound, key
 
     def poll(self, timeout_s: float | None) -> list[Heartbeat]:
-        """Return the beats that have come; waits up to `timeout_s` real seconds (None: as long as it takes)."""
+        """Return the received heartbeats, after a wait of up to `timeout_s` real seconds (None: without limit)."""
         found = []
         for ready, _ in self._poller.poll(milliseconds(timeout_s)):
             expected = None if isinstance(ready, int) else self._expected.get(ready)
@@ -169,7 +169,7 @@ class HeartbeatListener:
 
 
 def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
-    """True for a beat of the process that is expected."""
+    # the first heartbeat with the token makes the token necessary
     token = frames[3] if len(frames) > 3 else b""
     if expected.token and hmac.compare_digest(token, expected.token):
         expected.needs_token = True
@@ -178,7 +178,7 @@ def _is_by(expected: _Expected, frames: list[bytes]) -> bool:
 
 
 def read_beat(name: str, frames: list[bytes]) -> Heartbeat | None:
-    """Return a beat, of one frame or of four; None if it is neither."""
+    """Return a heartbeat of one or four frames; None for other frames."""
     if not frames or frames[0] not in (BEAT, CLOSING):
         return None
     ages = [_seconds(frame) for frame in frames[1:3]]

@@ -1,9 +1,9 @@
-"""CURVE keys: one pair a component, in a folder of certificates.
+"""CURVE keys, one pair for each component in a folder of certificates, and the check of connecting keys.
 
-    keys/public/<name>.key            to be copied to every computer that takes part
+    keys/public/<name>.key            copied to every computer that takes part
     keys/private/<name>.key_secret    only where the component runs
 
-The files are those of ZeroMQ's own tools (ZPL), so that peers of other makes can use them.
+The files have the format of ZeroMQ's own tools (ZPL), so that peers of other makes can use them.
 """
 
 from __future__ import annotations
@@ -13,37 +13,42 @@ import re
 import secrets
 import stat
 import sys
-from collections.abc import Iterable, Mapping
+import threading
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import zmq
+from zmq.utils import z85
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.model import component_of
+from afspm.transport.polling import WakeUp
 
 GUEST = "guest"
-"""The owner of the key that notebooks and terminal commands use where keys are made for a run; good for other names."""
+"""Owner of the key for notebooks and terminal commands, if keys are made for a run; good for other names too."""
 MARK = b"\0"
-"""Between a name and the random rest of a socket's identity."""
+"""Separates the name from the random part of a socket's identity."""
+DOMAIN = b"afspm"
+_ZAP_ADDRESS = "inproc://zeromq.zap.01"
 _NAME = re.compile(r"[A-Za-z0-9_. +-]{1,100}")
 _ENTRY = re.compile(r'^\s*(public-key|secret-key)\s*=\s*"([^"]{40})"\s*$', re.MULTILINE)
 
 
 @dataclass(frozen=True)
 class Keys:
-    """A process's proof of who it is, and the keys of the others.
+    """The key pair of a process, and the public keys of its peers.
 
     Attributes:
-        name: whose keys these are.
-        public, secret: the own pair, as Z85 text.
-        peers: the public keys that are let in, and the names of their owners.
-        servers: the names of those who bind the addresses that we connect to, by address.
-        folder: where public keys are that are made later; None: these are all.
-        everywhere: whether every socket is encrypted. Else, on one computer, connections to `servers` are, and of our
-            own sockets those of `guards`.
-        guards: whether our sockets for requests are encrypted, and all that are not unix sockets.
+        name: owner of the pair.
+        public, secret: the pair, as Z85 text.
+        peers: accepted public keys, with the names of their owners.
+        servers: names of the peers that bind the addresses to connect to, by address.
+        folder: folder of public keys that may be added later; None: there are no others.
+        everywhere: every socket is encrypted. Otherwise, on one computer, only connections to `servers` are, and of the
+            process's own sockets those of `guards`.
+        guards: sockets for requests are encrypted, and all that are not unix sockets.
     """
 
     name: str
@@ -56,7 +61,11 @@ class Keys:
     guards: bool = True
 
     def server_key(self, address: str) -> bytes | None:
-        """Return the public key that the owner of `address` must have; None: the connection is plain."""
+        """Return the public key of the process that binds `address`; None for a plain connection.
+
+        Raises:
+            ConfigError: the owner of the address, or its key, is unknown.
+        """
         name = self.servers.get(address)
         if name is None and not self.everywhere:
             return None
@@ -75,17 +84,19 @@ class Keys:
     def binds_encrypted(self, address: str, *, requests: bool) -> bool:
         """Return whether a socket bound at `address` is encrypted; `requests`: the socket receives requests.
 
-        Only the owner of their folder gets to unix sockets. Names of senders need proof all the same.
+        Only the owner of the folder reaches a unix socket. Requests need keys even there: a sender must prove its name.
         """
         return self.everywhere or (self.guards and (requests or not is_private(address)))
 
     def user_as(self, user: str | None, name: str) -> str | None:
-        """Return for whom a key is good: the guests' for every name that is not that of a process with its own key."""
+        """Return the user of a key under a name: the guests' key is good for every name of a process without its own
+        key.
+        """
         component = component_of(name)
         return component if user == GUEST and component not in self.peers.values() else user
 
     def as_launch(self) -> Plain:
-        """Return the entries of a launch line, see `from_launch`."""
+        """Return the entries for a launch line, see `from_launch`."""
         return {
             "name": self.name,
             "public": self.public.decode(),
@@ -104,19 +115,19 @@ def is_private(address: str) -> bool:
 
 
 def routing_id(name: str) -> bytes:
-    """Return a new identity for a socket that sends requests in a name: unique, and known to the scheduler alone.
+    """Return a new, random socket identity for requests under a name.
 
-    A ROUTER socket sends answers to the newest connection of an identity. By a bare name a second process would cut off
-    the first.
+    A ROUTER socket sends answers to the newest connection of an identity: with the bare name as identity, a second
+    process would cut off the first.
     """
     return name.encode() + MARK + secrets.token_hex(8).encode()
 
 
 def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None) -> Keys:
-    """Return the keys of the component `name` out of the folder that `generate` made.
+    """Return the keys of the component `name` from a folder that `generate` made.
 
     Raises:
-        ConfigError: no such folder or key, a file that is no certificate, or a secret that others may read.
+        ConfigError: a folder or key is missing, a file is not a certificate, or other users may read the secret key.
     """
     folder = Path(folder)
     secret_file = folder / "private" / f"{_checked(name)}.key_secret"
@@ -137,7 +148,11 @@ def load(folder: str | Path, name: str, servers: Mapping[str, str] | None = None
 
 
 def require_private(file: Path) -> None:
-    """Refuse a secret that others than its owner may read. Raises ConfigError."""
+    """Refuse a secret that other users may read.
+
+    Raises:
+        ConfigError: the mode of the file lets other users read it.
+    """
     mode = file.stat().st_mode if sys.platform != "win32" else 0
     if mode & 0o077:
         raise ConfigError(
@@ -147,18 +162,22 @@ def require_private(file: Path) -> None:
 
 
 def public_keys(folder: Path, name: str) -> dict[bytes, str]:
-    """Return the public keys in a folder, with the names of their owners; read for `name`. Raises ConfigError."""
+    """Return the public keys in a folder, with the names of their owners, for the process `name`.
+
+    Raises:
+        ConfigError: a file is not a certificate.
+    """
     files = sorted(folder.glob("*.key"))
     return {_read(file, name)["public-key"]: file.name.removesuffix(".key") for file in files}
 
 
 def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
-    """Return the keys that a launch line hands over (`Keys.as_launch`), or names, for programs that join.
+    """Return the keys in a launch line, either whole (`Keys.as_launch`) or as names, for programs that join.
 
-    A component that acts for a person ("dashboard:Ada") does so with its own key.
+    A component that acts for a person ("dashboard:Ada") uses its own key.
 
     Args:
-        entries: what `as_launch` returns; or `{"folder": …, "<address>": "<name of who binds it>", …}`.
+        entries: the result of `as_launch`; or `{"folder": …, "<address>": "<name of the binding process>", …}`.
     """
     if not entries:
         return None
@@ -181,10 +200,10 @@ def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
 
 
 def with_server(name: str, entries: PlainMapping | None, address: str, key: bytes) -> Plain:
-    """Return the keys of a launch line with that of one more server, the supervisor's heartbeat socket.
+    """Return the keys of a launch line with one more server, the supervisor's heartbeat socket.
 
     Args:
-        name: of the process; it gets a pair of its own if it has no keys yet.
+        name: name of the process; it gets a new pair if it has no keys yet.
     """
     own = from_launch(name, entries) or Keys(name, *pair(), {}, everywhere=False, guards=False)
     owner = f"heartbeat of {name}"
@@ -195,18 +214,17 @@ def with_server(name: str, entries: PlainMapping | None, address: str, key: byte
 
 
 def pair() -> tuple[bytes, bytes]:
-    """Return a new pair, public and secret."""
     return zmq.curve_keypair()
 
 
 def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
-    """Make a key pair for each of `names` that has none yet; returns the files written.
+    """Make a key pair for each of `names` without one; return the files written.
 
-    Existing keys are left alone: a new component joins without the others being told anew. A public key alone is that
-    of a process on another computer; where it got lost, it is in the file of the secret one.
+    Existing keys stay: a new component joins without changes on the other computers. A public key without a secret one
+    belongs to a process on another computer. A lost public key is restored from the file of the secret one.
 
     Raises:
-        ConfigError: a name that no file can have, or a file that is no certificate.
+        ConfigError: a name is not valid for a file, or a file is not a certificate.
     """
     folder = Path(folder)
     written = []
@@ -238,7 +256,7 @@ def _write(file: Path, entries: Mapping[str, bytes], *, mode: int) -> None:
     lines = [f'    {key} = "{value.decode()}"' for key, value in entries.items()]
     text = "\n".join(["#   ZeroMQ CURVE certificate of afspm. Do not share a secret key.", "metadata", "curve",
                       *lines, ""])  # fmt: skip
-    # created with its mode: a secret is never readable by others, not even for a moment
+    # the mode is set at creation: a later chmod would leave the secret readable for a moment
     descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode)
     with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
         stream.write(text)
@@ -255,3 +273,66 @@ def _read(file: Path, name: str) -> dict[str, bytes]:
     if "public-key" not in entries:
         raise ConfigError("the file is not a certificate: it has no public key", where=str(file))
     return entries
+
+
+class Authenticator:
+    """The handler of ZeroMQ's authentication protocol (ZAP, RFC 27) for CURVE keys, in its own thread.
+
+    It answers whether a key may connect, and the name of its owner, which then is the "User-Id" of every message of the
+    connection. A key may be made while the experiment runs: for an unknown key, a changed folder of keys is read again.
+    """
+
+    def __init__(self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> None:
+        self._keys = keys
+        self._names = {z85.decode(key): name.encode() for key, name in keys.peers.items()}
+        self._read_ns: int | None = None
+        self._stop: WakeUp[None] = WakeUp()
+        # bound before all other sockets: a connection without a handler is refused for ever
+        self._socket: zmq.Socket[bytes] = context.socket(zmq.REP)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.bind(_ZAP_ADDRESS)
+        self._thread = threading.Thread(target=self._serve, name="authenticator", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        poller = zmq.Poller()
+        poller.register(self._socket, zmq.POLLIN)
+        poller.register(self._stop.fileno(), zmq.POLLIN)
+        while self._stop.fileno() not in (ready := dict(poller.poll())):
+            if self._socket in ready:
+                self._socket.send_multipart(self.answer(self._socket.recv_multipart()))
+        self._socket.close()
+
+    def answer(self, request: Sequence[bytes]) -> list[bytes]:
+        """Return the reply to a request of the protocol: 200 and the owner's name, or 400 and no name."""
+        version, request_id, domain, _address, _identity, mechanism, *credentials = [*request, *[b""] * 7][:7]
+        known = version == b"1.0" and domain == DOMAIN and mechanism == b"CURVE" and len(request) == 7
+        name = self._name_of(credentials[0]) if known else None
+        if name is None:
+            return [b"1.0", request_id, b"400", b"this key is not among the public keys", b"", b""]
+        return [b"1.0", request_id, b"200", b"OK", name, b""]
+
+    def _name_of(self, key: bytes) -> bytes | None:
+        if key not in self._names:
+            self._read_again()
+        return self._names.get(key)
+
+    def _read_again(self) -> None:
+        # no new file gives a known key another name
+        folder = self._keys.folder
+        if folder is None:
+            return
+        try:
+            changed_ns = folder.stat().st_mtime_ns
+            if changed_ns == self._read_ns:
+                return
+            found = {z85.decode(key): name.encode() for key, name in public_keys(folder, self._keys.name).items()}
+        except (OSError, ConfigError, ValueError):
+            return  # a file may be half written: the next unknown key reads the folder again
+        self._names, self._read_ns = {**found, **self._names}, changed_ns
+
+    def close(self) -> None:
+        """Stop the thread; the context must be closed after it."""
+        self._stop.post()
+        self._thread.join()
+        self._stop.close()

@@ -1,11 +1,11 @@
-"""The packets that a publisher keeps for late joiners, and the marker by which a subscriber asks for them.
+r"""Packets that a publisher keeps for late joiners, and the marker with which a subscriber requests them.
 
-A subscriber of ours subscribes to a marker, a topic of its own that also says what it wants:
+A subscriber of afspm subscribes to a marker, a topic of its own that also holds its request:
 
-    \\0replay/<name>/<nonce> \\0 <since_ns> \\0 <prefix> \\0 <prefix> …
+    \0replay/<name>/<nonce> \0 <since_ns> \0 <prefix> \0 <prefix> …
 
-The publisher sends what it has kept as `[topic, envelope, message, timestamp]` and at last `[topic]` alone, where topic
-is the first part of the marker: nobody else is subscribed to that.
+The publisher sends the kept packets as `[topic, envelope, message, timestamp]` and finally `[topic]` alone; the topic
+is the first part of the marker, to which only this subscriber is subscribed.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ from afspm.model import Packet
 from afspm.wire import Buffer
 
 History = Callable[[Hashable, tuple[str, ...], int], Iterable[Packet]]
-"""(who, prefixes, since_ns) -> what was published under these prefixes and is newer, oldest first."""
+"""(subscriber, prefixes, since_ns) -> later packets under these prefixes, oldest first."""
 
 LONGEST = 8 << 10
-"""Bytes of a marker."""
+"""Longest marker, in bytes."""
 _BEGIN = b"\0replay/"
 _MOST_PREFIXES = 1000
 _MOST_PACKETS = 1000
 _MOST_BYTES = 256 << 20
 
-# An envelope is text: it begins with one of these. The empty prefix, "everything", is written as all of them, since as
-# it stands it would also match the replays that are meant for others.
+# An envelope is text, so it begins with one of these bytes. They replace the empty prefix ("everything"), which would
+# also match the replays for other subscribers.
 FIRST_BYTES = tuple(bytes([n]) for n in (*range(0x20, 0x7F), *range(0xC2, 0xF5)))
 
 
@@ -37,9 +37,9 @@ class Marker(NamedTuple):
     """A subscriber's request for a replay.
 
     Attributes:
-        topic: what its replay is published under.
-        since_ns: it has everything up to this time.
-        prefixes: of the envelopes that it wants.
+        topic: topic of the replayed packets.
+        since_ns: time up to which the subscriber has every packet.
+        prefixes: prefixes of the wanted envelopes.
     """
 
     topic: bytes
@@ -51,7 +51,7 @@ class Marker(NamedTuple):
 
     @classmethod
     def decode(cls, subscription: bytes) -> Marker | None:
-        """Return the marker in a subscription; None if it is an ordinary prefix, or no proper marker."""
+        """Return the marker in a subscription; None for an ordinary prefix or a malformed marker."""
         if not subscription.startswith(_BEGIN) or len(subscription) > LONGEST:
             return None
         parts = subscription[1:].split(b"\0")
@@ -66,17 +66,17 @@ class Marker(NamedTuple):
 
 
 def topic(name: str, nonce: int) -> bytes:
-    """Return a topic of the subscriber `name`; another one every time it asks."""
+    """Return a topic of the subscriber `name`, different for each request."""
     return _BEGIN + name.replace("\0", "").encode() + b"/%d" % nonce
 
 
 def is_reserved(subscription: bytes) -> bool:
-    """Return whether this begins like a marker, well-formed or not."""
+    """Return whether a subscription begins like a marker, well-formed or not."""
     return subscription.startswith(b"\0")
 
 
 def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
-    """Return the prefixes to really subscribe to: the empty one as all that an envelope may begin with."""
+    """Return the prefixes for the socket: the empty prefix becomes all first bytes of envelopes."""
     found: list[bytes] = []
     for prefix in prefixes:
         found.extend([prefix] if prefix else FIRST_BYTES)
@@ -84,9 +84,9 @@ def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
 
 
 class PublishedHistory:
-    """Gives packets their time, and keeps the last of them for those who join later.
+    """The kept packets of a publisher, which also gives packets their times.
 
-    Kept is the last packet of every envelope, and of all others as many of the newest as fit the bounds.
+    It keeps the last packet of every envelope, and the newest other packets within bounds.
     """
 
     def __init__(self, clock: Clock, *, most_packets: int = _MOST_PACKETS, most_bytes: int = _MOST_BYTES) -> None:
@@ -99,10 +99,10 @@ class PublishedHistory:
         self._newest_ns = 0
 
     def stamp(self, envelope: str, payload: Buffer, time_ns: int | None = None, *, keep: bool = True) -> Packet:
-        """Return a packet that is newer than all before it; it is remembered, unless `keep` is False.
+        """Return a packet with a later time than all before, and keep it unless `keep` is False.
 
         Args:
-            time_ns: a time that was given out already.
+            time_ns: a time that was already given to this packet.
         """
         self._newest_ns = max(self._clock.now_ns() if time_ns is None else time_ns, self._newest_ns + 1)
         packet = Packet(envelope, payload, self._newest_ns)
@@ -121,7 +121,7 @@ class PublishedHistory:
             del self._last[next(iter(self._last))]
 
     def __call__(self, _who: Hashable, prefixes: tuple[str, ...], since_ns: int) -> list[Packet]:
-        """Return what is kept under `prefixes` and newer than `since_ns`, oldest first."""
+        """Return the kept packets under `prefixes` after `since_ns`, oldest first."""
         kept = {packet.time_ns or 0: packet for packet in (*self._last.values(), *self._packets)}
         return [
             kept[time_ns]

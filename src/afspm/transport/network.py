@@ -1,4 +1,4 @@
-"""One process's access to ZeroMQ: the context, the options that all sockets share, and who is let in."""
+"""A process's access to ZeroMQ: the context, the options of all sockets, and the check of peers."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ if TYPE_CHECKING:
     from afspm.transport.keys import Keys
 
 MAX_PACKET_BYTES = 256 * 1024 * 1024
-"""Longest frame of a published packet: a scan of 4096² in one channel is half of that."""
+"""Longest frame of a published packet: twice a scan of 4096² pixels in one channel."""
 MAX_REQUEST_BYTES = 1024 * 1024
 """Longest frame of a request, response or subscription."""
 HAS_PRIVATE_SOCKETS = sys.platform != "win32" and zmq.has("ipc")
-"""Whether there are unix sockets, in folders with modes."""
+"""Whether the system has unix sockets, and modes of folders to protect them."""
 QUEUE_LENGTH = 4000
-"""Messages that may wait for one peer; a publisher drops what is more."""
+"""Most messages that wait for one peer; a publisher drops further ones."""
 
 _LINGER_MS = 200
-# A peer that is frozen or cut off is found within seconds and not when the system gives up on it after hours.
+# ZMTP heartbeats: a peer that is frozen or cut off is noticed within seconds, not after hours as by TCP.
 _ALIVE_CHECK_MS = 2_000
 _ALIVE_TIMEOUT_MS = round(CUT_OFF_SHOWS_WITHIN_S * 1e3) - _ALIVE_CHECK_MS
 # libzmq 4.3.5 aborts the process (`Assertion failed: !_io_error`) if it sends or answers a heartbeat of ZMTP on a
 # connection that was lost while its receive queue was full. So the receive queues of sockets with heartbeats, and of
-# their peers, have no length.
-# A subscriber's heartbeats have its publisher drop what waits for it once it stands still (`HEARTBEAT_TTL`), on unix
-# sockets too, where no option of TCP helps. A publisher sends none: behind unsent packets they would never go out.
+# their peers, are unlimited.
+# When a subscriber stands still, its heartbeats stop, and its publisher drops the packets that wait for it
+# (`HEARTBEAT_TTL`); this works on unix sockets too, where no option of TCP helps. A publisher sends no heartbeats:
+# behind unsent packets they would never leave.
 _WITH_HEARTBEATS = frozenset({zmq.ROUTER, zmq.DEALER, zmq.XSUB})
 _UNLIMITED = frozenset({*_WITH_HEARTBEATS, zmq.XPUB, zmq.SUB})
 _KEEPALIVE_S, _KEEPALIVE_TRIES = 2, 3
-# A peer of TCP that takes nothing is disconnected after this time, and the packets that waited for it are dropped.
-# Connected again it asks for them. (Linux and Windows.)
+# A TCP peer that reads nothing is disconnected after this time, and its waiting packets are dropped. After a
+# reconnection it requests them. (Linux and Windows.)
 _STALLED_MS = 5_000
-_WINDOWS_MAXRT = 5  # of ws2ipdef.h; Python's socket module has no name for it
+_WINDOWS_MAXRT = 5  # from ws2ipdef.h; Python's socket module lacks it
 _RECONNECT_MS, _RECONNECT_MAX_MS = 20, 200
 _HANDSHAKE_MS = 5_000
-# Systems repeat an attempt to connect after 1, 3, 7, 15, 31 s …: one that was begun while the link was down would not
-# notice its return for half a minute. Instead it is given up, and begun again.
+# Systems repeat an attempt to connect after 1, 3, 7, 15, 31 s …: an attempt begun while the link was down would notice
+# its return only after half a minute. So attempts are ended after this time, and begun again.
 _CONNECT_MS = 2_000
 _OPTIONS = (
     (zmq.LINGER, _LINGER_MS),
@@ -72,7 +73,7 @@ _HEARTBEATS = (
 
 @cache
 def _can_end_stalled() -> bool:
-    """Return whether the system knows `TCP_MAXRT`: where it does not (Wine), libzmq with it never connects."""
+    # where the system does not know TCP_MAXRT (Wine), libzmq with this option never connects
     if sys.platform != "win32":
         return True
     with socket.socket() as probe:
@@ -84,11 +85,11 @@ def _can_end_stalled() -> bool:
 
 
 class Network:
-    """Makes sockets, binds and connects them: to this computer only, unless there are keys or `insecure` is set.
+    """A maker of sockets, limited to this computer unless there are keys or `insecure` is set.
 
     Args:
-        keys: of this process. With keys connections are encrypted and their owners known: all of them, or those by
-            which requests come, and all that are not unix sockets (`Keys.binds_encrypted`).
+        keys: keys of this process. With keys, connections are encrypted and their owners known: all connections, or
+            only connections for requests and all but unix sockets (`Keys.binds_encrypted`).
         insecure: bind and connect to other computers without keys. Anyone there can then move the tip.
     """
 
@@ -99,13 +100,13 @@ class Network:
         self._sockets: list[zmq.Socket[bytes]] = []
         self._authenticator = None
         if keys is not None and (keys.everywhere or keys.guards):
-            from afspm.transport.authenticator import Authenticator
+            from afspm.transport.keys import Authenticator
 
             self._authenticator = Authenticator(self._context, keys)
 
     @classmethod
     def from_launch(cls, name: str, entries: Mapping[str, object] | None) -> Network:
-        """As the launch line of the process `name` says.
+        """Return the network for the launch line of the process `name`.
 
         Args:
             entries: see `keys.from_launch`, or `{"insecure": "true"}`; None: this computer only, without keys.
@@ -118,16 +119,18 @@ class Network:
 
     @classmethod
     def connecting(cls, name: str, entries: Mapping[str, object] | None) -> Network:
-        """As `from_launch`, for sockets that only connect to this computer: plain where no key of a server is known."""
+        """Return a network as `from_launch` for connections on this computer only, plain to servers without a known
+        key.
+        """
         from afspm.transport.keys import from_launch
 
         own = from_launch(name, entries)
         return cls(None if own is None else replace(own, everywhere=False, guards=False))
 
     def socket(self, kind: int, *, max_bytes: int = MAX_REQUEST_BYTES) -> zmq.Socket[bytes]:
-        """Return a socket with our limits; a frame over `max_bytes` ends the connection that it comes by."""
+        """Return a socket with afspm's limits; a frame over `max_bytes` ends its connection."""
         socket = self._context.socket(kind)
-        self._sockets.append(socket)  # else a forgotten one would be closed by the garbage collector, at any time
+        self._sockets.append(socket)  # a reference, else the garbage collector may close the socket at any time
         options = _OPTIONS + (_HEARTBEATS if kind in _WITH_HEARTBEATS else ())
         if _can_end_stalled():
             options += ((zmq.TCP_MAXRT, _STALLED_MS),)
@@ -140,14 +143,14 @@ class Network:
         return socket
 
     def bind(self, socket: zmq.Socket[bytes], address: str, *, requests: bool = False) -> str:
-        """Bind, and return the address with the port that was found, where `address` asks for any (port 0).
+        """Bind a socket, and return the address with the port that was found if `address` has port 0.
 
         Args:
-            requests: peers send requests by this socket, so that it has to be known whose they are.
+            requests: peers send requests to this socket, so that they must prove their names.
 
         Raises:
             TransportError: the address is taken or malformed.
-            ConfigError: it would be open to others, and there are no keys.
+            ConfigError: other computers could connect, and there are no keys.
         """
         self._guard(address)
         if self.keys is not None and self.keys.binds_encrypted(address, requests=requests):
@@ -163,11 +166,11 @@ class Network:
         return socket.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
 
     def connect(self, socket: zmq.Socket[bytes], address: str) -> None:
-        """Connect, and again whenever the connection is lost.
+        """Connect a socket, and connect again after each loss of the connection.
 
         Raises:
             TransportError: the address is malformed.
-            ConfigError: it is another computer's, and there are no keys.
+            ConfigError: the address belongs to another computer, and there are no keys.
         """
         self._guard(address)
         if self.keys is not None and (server_key := self.keys.server_key(address)) is not None:
@@ -180,7 +183,7 @@ class Network:
             raise TransportError(f"can't connect: {error}", where=address) from error
 
     def close(self) -> None:
-        """Close all sockets, once what was sent has gone out or a fraction of a second has passed."""
+        """Close all sockets, after all sent messages have left or a fraction of a second has passed."""
         if self._context.closed:
             return
         if self._authenticator is not None:
@@ -199,13 +202,13 @@ class Network:
 
 
 def is_local(address: str) -> bool:
-    """Return whether only processes of this computer can be at `address`."""
+    """Return whether only processes of this computer can use `address`."""
     scheme, _, rest = address.partition("://")
     if scheme in ("ipc", "inproc"):
         return True
     if scheme != "tcp":
         return False
-    # "source;destination" connects from a given address; both have to be local
+    # "source;destination" connects from a given address; both must be local
     for end in rest.split(";"):
         host = end.rpartition(":")[0].strip("[]")
         if host == "localhost":
@@ -219,20 +222,15 @@ def is_local(address: str) -> bool:
 
 
 def _bindable(address: str) -> str:
-    """Return where to listen for those who connect to an address: by a host name, at all addresses of this computer.
-
-    The name may lead to another address tomorrow, and on the computer itself often leads to a loopback one.
-
-    Raises:
-        TransportError: the name is not known, or that of another computer.
-    """
+    # a host name is bound at all addresses of this computer: it may lead to another address tomorrow, and on the
+    # computer itself often leads to a loopback one
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     if not address.startswith("tcp://") or not _is_name(host):
         return address
     try:
         found = {str(entry[4][0]) for entry in socket.getaddrinfo(host, None, socket.AF_INET)}
     except OSError as error:
-        raise TransportError(f"can't bind: {host!r} is no name that is known here", where=address) from error
+        raise TransportError(f"can't bind: this computer does not know the name {host!r}", where=address) from error
     if not any(map(_is_ours, found)):
         what = f"can't bind: {host!r} is another computer: {', '.join(sorted(found))}"
         raise TransportError(what, where=address, hint="is this process meant to run there (--only)?")
@@ -240,7 +238,7 @@ def _bindable(address: str) -> str:
 
 
 def _is_name(host: str) -> bool:
-    """Return whether this is a host's name, and not an address, a wildcard, or a network interface."""
+    # not an address, a wildcard, or a network interface
     interfaces = {name for _, name in socket.if_nameindex()} | {"*", "localhost"}
     with contextlib.suppress(ValueError):
         ipaddress.ip_address(host.strip("[]"))
@@ -271,23 +269,25 @@ ACCEPTED = int(zmq.EVENT_ACCEPTED)
 REFUSED = int(
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 )
-"""The peer has no key, or one that is not known. A peer without keys may hang up first, which has no detail."""
+"""The peer has no key or an unknown one. A peer without keys may also hang up first, an event without a detail."""
 _EVENT = struct.Struct("=hi")
 _numbers = itertools.count()
 
 
 class ConnectionEvent(NamedTuple):
-    """`kind` is one of the constants above; `value` the connection's descriptor if it was DISCONNECTED."""
+    """A connection event: `kind` is one of the constants above; `value` the descriptor of a connection that is
+    DISCONNECTED.
+    """
 
     kind: int
     value: int
 
 
 class Monitor:
-    """The connection events of one socket, in the order in which they happened.
+    """The connection events of one socket, in order.
 
-    Events come from the thread that also delivers the messages: after a message was received, `drain` returns every
-    event that came before that message.
+    The thread that delivers messages also sends these events: after a message was received, `drain` returns every event
+    before it.
     """
 
     def __init__(self, network: Network, socket: zmq.Socket[bytes], events: int) -> None:
@@ -298,7 +298,7 @@ class Monitor:
         self.socket.connect(address)
 
     def drain(self) -> list[ConnectionEvent]:
-        """Return all events that have come."""
+        """Return all events so far."""
         events: list[ConnectionEvent] = []
         while zmq.zmq_poll([(self.socket, zmq.POLLIN)], 0):
             kind, value = _EVENT.unpack(self.socket.recv_multipart(zmq.NOBLOCK)[0])

@@ -1,4 +1,4 @@
-"""Waits for sockets and for other threads at once."""
+"""Waiting for sockets and for other threads at once."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _LONGEST_MS = 2**31 - 1  # 24 days
 
 
 def milliseconds(timeout_s: float | None) -> int | None:
-    """Round a timeout up, so that a wait does not end just before a deadline; None waits for ever."""
+    """Return a timeout rounded up, so that a wait does not end just before a deadline; None for no limit."""
     return None if timeout_s is None else max(0, math.ceil(min(timeout_s * 1000.0, _LONGEST_MS)))
 
 
 class WakeUp(Generic[T]):
-    """A queue with a descriptor to poll: `post` from any thread, `take` from the thread that polls.
+    """A queue with a descriptor to poll: `post` from any thread, `take` from the polling thread.
 
-    A pair of sockets and not a pipe, since Windows can only wait on sockets.
+    It uses a pair of sockets, not a pipe: Windows can wait only on sockets.
     """
 
     def __init__(self) -> None:
@@ -33,18 +33,18 @@ class WakeUp(Generic[T]):
         self._writer.settimeout(0)
 
     def fileno(self) -> int:
-        """The descriptor that becomes readable when `post` was called."""
+        """Return the descriptor that is readable after `post`."""
         return self._reader.fileno()
 
     def writer_fileno(self) -> int:
-        """The descriptor that `signal.set_wakeup_fd` may write to."""
+        """Return the descriptor for `signal.set_wakeup_fd`."""
         return self._writer.fileno()
 
     def post(self, item: T | None = None) -> None:
-        """Wake the poller up, with something to take or for nothing."""
+        """Wake the poller up, with or without an item."""
         if item is not None:
             self._items.append(item)
-        # full: it will wake up anyway; closed: nobody is left to wake up
+        # a full pipe wakes the poller anyway; a closed one has no poller any more
         with contextlib.suppress(BlockingIOError, OSError):
             self._writer.send(b"\0")
 
@@ -61,7 +61,7 @@ class WakeUp(Generic[T]):
 
 
 class Poller(Generic[S]):
-    """Waits until one of its sockets can be read, or another thread wakes it up."""
+    """A wait until a socket is readable, or another thread ends the wait."""
 
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._poller = zmq.Poller()
@@ -69,21 +69,21 @@ class Poller(Generic[S]):
         self._sources: dict[object, S] = {}
 
     def register(self, socket: zmq.Socket[bytes], source: S) -> None:
-        """Wait for `socket` too; `wait` names it by `source`."""
+        """Add `socket`; `wait` returns `source` for it."""
         self._poller.register(socket, zmq.POLLIN)
         self._sources[socket] = source
 
     def pause(self, socket: zmq.Socket[bytes]) -> None:
-        """Leave `socket` alone until it is registered again."""
+        """Ignore `socket` until it is registered again."""
         self._poller.unregister(socket)
 
     def forget(self, socket: zmq.Socket[bytes]) -> None:
-        """Leave `socket` alone for good, before it is closed."""
+        """Remove `socket` before it is closed."""
         self._poller.unregister(socket)
         del self._sources[socket]
 
     def wait(self, timeout_ms: int | None) -> tuple[list[S], bool]:
-        """Return the sources of the sockets that can be read, and whether we were woken up."""
+        """Return the sources of readable sockets, and whether `WakeUp.post` was called."""
         ready = [which for which, _ in self._poller.poll(timeout_ms)]
         sources = [self._sources[which] for which in ready if which in self._sources]
         return sources, len(sources) < len(ready)

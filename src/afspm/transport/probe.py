@@ -1,4 +1,4 @@
-"""Attempts to reach an address, step by step: its name, the connection, the greeting of ZeroMQ, the keys."""
+"""Attempts to reach an address, step by step: its name, the connection, ZeroMQ's greeting, the keys."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _NO_ROUTE = (errno.ENETUNREACH, errno.EHOSTUNREACH, errno.ENETDOWN)
 
 
 def versions_here() -> Versions:
-    """Return what this computer runs."""
+    """Return the versions on this computer."""
     return Versions(version("afspm"), platform.python_version(), zmq.zmq_version())
 
 
 def reach(address: str, within_s: float = WITHIN_S) -> Reach:
-    """Return what becomes of a connection to a `tcp://` address."""
+    """Return the outcome of a connection to a `tcp://` address."""
     host, _, port = address.removeprefix("tcp://").rpartition(":")
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=within_s) as peer:
@@ -49,13 +49,13 @@ def _greeting(peer: socket.socket) -> Reach:
 
 
 def handshake(network: Network, address: str, within_s: float = WITHIN_S) -> Handshake:
-    """Return what becomes of the exchange of keys at an address that can be reached."""
+    """Return the outcome of the key exchange at a reachable address."""
     client = network.socket(zmq.DEALER)
     monitor = Monitor(network, client, CONNECTED | REFUSED)
     network.connect(client, address)
     clock = ExperimentClock.real()
     until_s, found = clock.monotonic_s() + within_s, Handshake.SILENT
-    # a peer that refuses may hang up before its reason has come: it is asked again, until time is up
+    # a refusing peer may hang up before its reason arrives: try again until the time is up
     while found in (Handshake.SILENT, Handshake.FAILED) and (left_s := until_s - clock.monotonic_s()) > 0.0:
         monitor.socket.poll(round(left_s * 1000))
         for kind, _ in monitor.drain():
@@ -66,7 +66,7 @@ def handshake(network: Network, address: str, within_s: float = WITHIN_S) -> Han
 
 
 def is_of_this_computer(address: str) -> bool:
-    """Return whether an address is one of this computer's own."""
+    """Return whether an address belongs to this computer."""
     host = address.removeprefix("tcp://").rpartition(":")[0].strip("[]")
     try:
         found = {entry[4][0] for entry in socket.getaddrinfo("0.0.0.0" if host == "*" else host, None, socket.AF_INET)}

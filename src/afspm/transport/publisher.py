@@ -1,4 +1,4 @@
-"""Publishes, and gives those who join late what they missed."""
+"""Publishing, with the replay of missed packets to late subscribers."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from afspm.transport.late_joiners import LONGEST, History, Marker, is_reserved, 
 from afspm.transport.network import Network
 
 _BATCH, _MOST_REPLAYS = 100, 5
-"""Messages taken in, and replays made, before everything else is looked at again."""
+"""Messages received, and replays sent, in one turn, so that the other sockets get theirs."""
 
 
 class Publisher:
-    """A publishing socket that sees who subscribes.
+    """A publishing socket that handles subscriptions.
 
-    A subscriber of ours is sent what it missed under a topic of its own (see `replay`), so that nobody else is sent it
-    again, and from then on everything, without a gap. To a plain SUB socket what was kept is sent as ordinary packets,
-    which all others with such a subscription are sent again.
+    A subscriber of afspm is sent its missed packets under its own topic (see `late_joiners`), so that no other
+    subscriber gets them twice, and from then on every packet, without a gap. A plain SUB socket is sent the kept
+    packets as ordinary packets, which all others with the same subscription get again.
 
-    The publisher waits for no subscriber. One that stands still is disconnected: once it takes something again, it
-    connects anew and gets what it missed.
+    The publisher waits for no subscriber. One that stands still is disconnected; when it reads again, it reconnects and
+    gets the missed packets.
 
     Args:
-        history: what was published before; asked when somebody subscribes.
+        history: returns earlier packets for a new subscriber.
     """
 
     def __init__(self, network: Network, address: str, history: History) -> None:
@@ -36,15 +36,15 @@ class Publisher:
         self.address = network.bind(self.socket, address)
 
     def publish(self, packet: Packet) -> None:
-        """Send to all who subscribed to the packet's envelope. Never blocks."""
+        """Send a packet to all subscribers of its envelope. Never blocks."""
         send_packet(self.socket, packet, None if packet.time_ns is None else wire.encode_time(packet.time_ns))
 
     def kill(self) -> None:
-        """Tell everyone that the experiment has ended."""
+        """Send the signal KILL: the experiment has ended."""
         self.socket.send(wire.KILL)
 
     def serve(self) -> int:
-        """Serve new subscriptions; return how many subscribers joined."""
+        """Serve new subscriptions; return the number of subscribers that joined."""
         joined = 0
         for _ in range(_BATCH):
             frames = receive_frames(self.socket) if joined < _MOST_REPLAYS else []
@@ -63,8 +63,8 @@ class Publisher:
         if marker is not None:
             self._replay(marker)
             return 1
-        # our own subscribers repeat their prefixes by themselves when a connection is made again, before they can say
-        # what they have: they are subscribed by the marker, and only by it, so that they miss nothing
+        # the XSUB of afspm's subscribers repeats its prefixes at a reconnection by itself, before their marker: only
+        # the marker counts, else live packets would overtake the missed ones
         if is_reserved(subscription) or property_of(frame, "Socket-Type") == "XSUB":
             return 0
         for prefix in spelled_out([subscription]):
@@ -75,7 +75,7 @@ class Publisher:
 
     def _replay(self, marker: Marker) -> None:
         socket, topic = self.socket, marker.topic
-        # in this mode a subscription is for the one peer whose message was received last
+        # in XPUB_MANUAL mode setsockopt subscribes the peer of the last received message
         socket.setsockopt(zmq.SUBSCRIBE, topic)
         for prefix in spelled_out(prefix.encode() for prefix in marker.prefixes):
             socket.setsockopt(zmq.SUBSCRIBE, prefix)

@@ -1,4 +1,4 @@
-"""A log that lets a handful of warnings through and counts the rest: a flood must not fill the log."""
+"""A log that passes a few warnings and counts the rest: a flood must not fill the log."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PERIOD_S = 10.0
 
 
 class RateLimitedLog:
-    """Passes on a few warnings every ten seconds, and says later how many it dropped."""
+    """A log of at most five warnings every ten seconds, and later of the number of dropped ones."""
 
     def __init__(self, log: logging.Logger, clock: Clock) -> None:
         self._log = log
@@ -21,7 +21,7 @@ class RateLimitedLog:
         self._dropped = 0
 
     def warning(self, text: str) -> None:
-        """Log `text`, or count it as one of many."""
+        """Log `text`, or count it."""
         now_s = self._clock.monotonic_s()
         if now_s - self._since_s > _PERIOD_S:
             if self._dropped:

@@ -1,13 +1,12 @@
-"""The scheduler's control socket: requests, each with its sender, and the end of senders.
+"""The scheduler's control socket: requests with their senders, and the end of senders.
 
-A sender is known by the identity that it gives its socket: its name, a zero byte, and a random text
-(`keys.routing_id`). So two processes that use one name are two senders, and the answers to one never go to the other. A
-sender whose identity is its bare name, such as a REQ socket of a program without a client, is one sender with all that
-use the same.
+The identity of its socket identifies a sender: its name, a zero byte, and a random text (`keys.routing_id`). So two
+processes with one name are two senders, and answers to one never reach the other. Sockets with a bare name as identity,
+such as a REQ socket of a program without a client, share one sender.
 
-ZeroMQ says that some connection has ended, and not whose. Each sender that is known is then looked for by an empty
-message, which every client ignores: ROUTER refuses to send it to a peer that is gone (ROUTER_MANDATORY). A REQ socket
-would take it for the answer to a request that is on its way: its end is known by its connection's descriptor.
+ZeroMQ reports the end of a connection, but not whose. So each known sender is then probed with an empty message, which
+every client ignores: ROUTER refuses to send it to a peer that is gone (ROUTER_MANDATORY). A REQ socket would take the
+probe for the answer to its request: its end is recognised by the descriptor of its connection.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from afspm.transport.network import DISCONNECTED, REFUSED, Monitor, Network
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 _LAST_WORDS = 200
-"""Messages received before the end of a sender is passed on."""
+"""Most messages received before the end of a sender is reported."""
 _LOOKS_S = (0.0, 0.02, 0.5)
-"""Real times, after a connection has ended, at which its sender is looked for: the library tells of the end a moment
-before it lets go of the peer."""
+"""Real times, after the end of a connection, at which its sender is probed: ZeroMQ reports the end a moment before it
+forgets the peer."""
 
 
 class PeerConnected(NamedTuple):
@@ -41,11 +40,11 @@ class PeerDisconnected(NamedTuple):
 
 
 class PeerAsked(NamedTuple):
-    """A request, as frames for `wire.decode_request`; no frames at all: the peer only says its name.
+    """A request, as frames for `wire.decode_request`; without frames the peer only gives its name.
 
     Attributes:
-        name: what the peer calls itself; "" if it has no name that is text.
-        user: whose key it is; None without keys.
+        name: name of the peer; "" without a readable one.
+        user: owner of its key; None without keys.
     """
 
     connection: int
@@ -65,12 +64,12 @@ class _Sender:
     name: str
     user: str | None
     is_req: bool
-    descriptor: int = -1  # of a REQ socket
+    descriptor: int = -1  # of its connection, for a REQ socket
     is_gone: bool = False
 
 
 class Router:
-    """REQ and DEALER peers, each known by its identity."""
+    """A socket for REQ and DEALER peers, each known by its identity."""
 
     def __init__(self, network: Network, address: str, log: RateLimitedLog, clock: Clock) -> None:
         self._log, self._clock = log, clock
@@ -79,11 +78,11 @@ class Router:
         self._has_refused = False
         self._numbers = 0
         self._senders: dict[bytes, _Sender] = {}
-        self._identities: dict[int, bytes] = {}  # by number
+        self._identities: dict[int, bytes] = {}  # by the sender's number
         self._looks_s: list[float] = []
         self.socket = network.socket(zmq.ROUTER)
-        # an identity belongs to its newest connection: its owner may connect anew before the old connection is found
-        # dead
+        # the newest connection of an identity gets its answers: a client may reconnect before its old connection times
+        # out
         self.socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
         self.socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
         self.monitor = Monitor(network, self.socket, DISCONNECTED | REFUSED)
@@ -91,13 +90,13 @@ class Router:
 
     @property
     def due_s(self) -> float:
-        """When to call `receive` if nothing comes, in real monotonic time."""
+        """Return when `receive` must be called without a new message, in real monotonic time."""
         return self._looks_s[0] if self._looks_s else math.inf
 
     def receive(self) -> list[RouterEvent]:
-        """Return the next request, and the ends of senders, each after the sender's last request.
+        """Return the next request, and ended senders, each after its last request.
 
-        The socket gives one message of each client in turn.
+        The socket takes messages from its clients in turn.
         """
         self._follow()
         events: list[RouterEvent] = [*self._messages(1)]
@@ -113,14 +112,13 @@ class Router:
         return [*ended, *(event for event in events if event.connection not in gone)]
 
     def reply(self, connection: int, frames: Sequence[bytes]) -> None:
-        """Answer a sender, if it is still there. Never blocks."""
+        """Answer a sender, if it is still connected. Never blocks."""
         sender = self._senders.get(self._identities.get(connection, b""))
         if sender is not None and not self._send([sender.identity, b"", *frames]):
             sender.is_gone = True
             self._look_soon()
 
     def _send(self, frames: Sequence[bytes]) -> bool:
-        """False if the peer is gone."""
         try:
             send_frames(self.socket, frames)
         except zmq.ZMQError as error:
@@ -130,7 +128,6 @@ class Router:
         return True
 
     def _messages(self, most: int) -> list[PeerConnected | PeerAsked]:
-        """Return what the next messages say, at most so many."""
         events: list[PeerConnected | PeerAsked] = []
         for _ in range(most):
             if not (frames := receive_frames(self.socket)):
@@ -141,7 +138,7 @@ class Router:
     def _interpret(self, frames: list[zmq.Frame]) -> list[PeerConnected | PeerAsked]:
         kind = property_of(frames[0], "Socket-Type")
         if kind is None:
-            return []  # a peer older than ZMTP 3, or another protocol that looks like it
+            return []  # a peer older than ZMTP 3, or of a similar protocol
         sender, is_new = self._sender(frames[0], kind)
         events: list[PeerConnected | PeerAsked] = [PeerConnected(sender.number)] if is_new else []
         content = [frame.bytes for frame in frames]
@@ -152,7 +149,6 @@ class Router:
         return events
 
     def _sender(self, first: zmq.Frame, kind: str) -> tuple[_Sender, bool]:
-        """Return who sent a message, and whether it is new."""
         identity, owner = first.bytes, None if self._keys is None else user_of(first)
         sender = self._senders.get(identity)
         descriptor = descriptor_of(first) if kind == "REQ" else -1
@@ -169,12 +165,11 @@ class Router:
         return sender, True
 
     def _former_lives(self, events: Sequence[RouterEvent]) -> list[int]:
-        """Return the senders that are gone, if one has come that may be such a process started again."""
+        # a new sender under a known name may be a restarted process: look whether its former life is gone
         names = {event.name for event in events if isinstance(event, PeerAsked) and len(events) > 1}
         return self._gone() if sum(sender.name in names for sender in self._senders.values()) > 1 else []
 
     def _gone(self) -> list[int]:
-        """Return the numbers of senders that are not there any more."""
         there = set()
         for sender in self._senders.values():
             if not sender.is_gone and (sender.is_req or self._send([sender.identity, b""])):
@@ -200,7 +195,7 @@ class Router:
         self._looks_s = [now_s + after_s for after_s in _LOOKS_S]
 
     def _warn_refused(self) -> None:
-        """Once: a peer that is refused tries again without end."""
+        # only once: a refused peer tries again without end
         if self._keys is not None and not self._has_refused:
             self._has_refused = True
             self._log.warning(
@@ -210,7 +205,7 @@ class Router:
 
 
 def _name(identity: bytes) -> str:
-    """The peer's own name; the socket gives peers without one an identity that begins with a zero byte."""
+    # the socket gives peers without an identity one that begins with a zero byte
     if identity.startswith(b"\0"):
         return ""
     try:

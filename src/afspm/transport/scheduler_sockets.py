@@ -20,15 +20,15 @@ Source = Router | TranslatorLink | Subscriber | Publisher | Monitor
 
 
 class SchedulerSockets:
-    """Publisher and router for the components, subscriber and link to the translator.
+    """Publisher and router for the components, subscriber and link for the translator.
 
     Args:
-        since_ns: up to which the translator's packets are known.
-        epoch: put before each request to the translator; empty: none.
+        since_ns: time up to which the translator's packets are known.
+        epoch: epoch before each request to the translator; empty: none.
 
     Raises:
         TransportError: an address can't be used.
-        ConfigError: one is missing.
+        ConfigError: an address is missing.
     """
 
     def __init__(self, launch: Launch, log: RateLimitedLog, clock: Clock, *, since_ns: int, epoch: bytes = b"") -> None:
@@ -53,18 +53,18 @@ class SchedulerSockets:
             self._poller.register(monitor.socket, monitor)
 
     def wait(self, timeout_ms: int | None) -> list[Source]:
-        """Return the sources that have something to receive; returns early, perhaps with none, after `wake_up`."""
+        """Return the sources with something to receive; returns early, perhaps without sources, after `wake_up`."""
         sources, woken = self._poller.wait(timeout_ms)
         if woken:
             self._wake_up.take()
         return sources
 
     def wake_up(self) -> None:
-        """End a `wait` under way, or the next. From any thread."""
+        """End the present or next `wait`. From any thread."""
         self._wake_up.post()
 
     def close(self) -> None:
-        """Close all once what was sent has gone out, within a fraction of a second."""
+        """Close all sockets after all sent messages have left, within a fraction of a second."""
         self._network.close()
         self._wake_up.close()
 

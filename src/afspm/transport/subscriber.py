@@ -1,4 +1,4 @@
-"""Receives what one publisher publishes: each packet once, and what was missed before anything newer."""
+"""Receiving from one publisher: each packet once, and missed packets before newer ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.wire import Buffer, decode_packet
 
 _MOST_ENVELOPES = 10_000
-# few: what waits in the library's queue costs nothing, what we hold keeps large buffers from being used again
+# small: a packet that waits in libzmq's queue costs nothing, but a received one keeps its large buffer from reuse
 _BATCH = 16
 
 
@@ -25,14 +25,14 @@ class Subscriber:
     """A connection to one publisher.
 
     Args:
-        name: of this component.
-        prefixes: of the envelopes wanted; None for all. The signal KILL always comes.
-        since_ns: what is not newer is known already.
-        filtered: drop what is not newer than the newest of its envelope, as is right where times always increase. A
-            translator's may not, if its clock is set back: then the listener has to tell doubles.
+        name: name of this component.
+        prefixes: prefixes of the wanted envelopes; None for all. The signal KILL always comes.
+        since_ns: time up to which packets are known already.
+        filtered: drop packets that are not newer than the newest of their envelope. Set it to False for a translator,
+            whose clock may be set back: then the receiver must drop repeated packets.
 
     Raises:
-        ConfigError: these are too many prefixes.
+        ConfigError: the prefixes are too long for one marker.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class Subscriber:
         self._newest_of: dict[str, int] = {}
         self._nonces = itertools.count()
         self._marker: Marker | None = None
-        # unlike SUB, XSUB takes what is sent to it under any topic, and lets the marker through as it is
+        # XSUB, not SUB: it accepts messages under any topic, and sends the marker unchanged
         self.socket = network.socket(zmq.XSUB, max_bytes=MAX_PACKET_BYTES)
         self.monitor = Monitor(network, self.socket, CONNECTED)
         for prefix in self._prefixes:
@@ -64,7 +64,7 @@ class Subscriber:
         network.connect(self.socket, address)
 
     def receive(self) -> list[Incoming]:
-        """Return what has come, a batch at a time: the rest is still there for the next call."""
+        """Return the next batch of packets; further ones stay for the next call."""
         found: list[Incoming] = []
         for _ in range(_BATCH):
             frames = receive_frames(self.socket)
@@ -80,7 +80,7 @@ class Subscriber:
         return found
 
     def follow(self) -> list[Incoming]:
-        """Ask for what was missed if a connection was made, the first or another."""
+        """Request the missed packets after each connection."""
         if self.monitor.drain():
             self._forget_marker()
             self._marker = Marker(topic(self._name, next(self._nonces)), self._newest_ns, self._prefixes)
@@ -88,7 +88,7 @@ class Subscriber:
         return []
 
     def _forget_marker(self) -> None:
-        """Else the socket would ask for the same again when the connection is next made."""
+        # otherwise the socket repeats the old request at the next connection
         if self._marker is not None:
             self.socket.send(b"\0" + self._marker.encode())
             self._marker = None
@@ -96,7 +96,7 @@ class Subscriber:
     def _interpret(self, frames: list[Buffer]) -> Incoming | None:
         if frames[0][:1] == b"\0":
             if self._marker is None or frames[0] != self._marker.topic:
-                return None  # of an earlier connection
+                return None  # a replay for an earlier connection
             del frames[0]
             if not frames:
                 self._forget_marker()

@@ -15,28 +15,28 @@ _LONGEST_NUMBER = 18
 
 
 class LinkUp(NamedTuple):
-    """The translator can be asked."""
+    """The translator is connected."""
 
 
 class LinkDown(NamedTuple):
-    """The translator's connection is gone."""
+    """The translator is disconnected."""
 
 
 class LinkReply(NamedTuple):
-    """The translator's answer to the request that was sent as `number`, as frames for `wire.decode_response`."""
+    """The translator's answer to the request `number`, as frames for `wire.decode_response`."""
 
     number: int
     frames: Sequence[bytes]
 
 
 class TranslatorLink:
-    """Asks the translator.
+    """A client that sends requests to the translator.
 
-    A REP socket gives back what stands before the empty frame: a number, so that a late answer is never taken for
-    another's, and our epoch, by which it obeys us alone.
+    A REP socket returns the frames before the empty frame: a number, so that a late answer is never taken for another
+    one, and the scheduler's epoch, which the translator checks.
 
     Args:
-        epoch: of the scheduler; empty: it has none.
+        epoch: epoch of the scheduler; empty: none.
     """
 
     def __init__(self, network: Network, address: str, log: RateLimitedLog, epoch: bytes = b"") -> None:
@@ -44,20 +44,20 @@ class TranslatorLink:
         self._before = [epoch, b""] if epoch else [b""]
         self._address = address
         self.socket = network.socket(zmq.DEALER)
-        # nothing waits for a translator that is gone, to be carried out when it is back. (With this an answer may be
-        # lost together with the connection: it is asked for again by its id.)
+        # without it, requests would queue for a translator that is gone, and move the tip when it returns. The price:
+        # an answer may be lost with the connection; the request is then repeated with its id.
         self.socket.setsockopt(zmq.IMMEDIATE, 1)
         self.monitor = Monitor(network, self.socket, CONNECTED | DISCONNECTED)
         network.connect(self.socket, address)
 
     def send(self, number: int, frames: Sequence[bytes]) -> bool:
-        """Ask; False if there is no translator to ask."""
+        """Send a request; return False without a connected translator."""
         return send_frames(self.socket, [b"%d" % number, *self._before, *frames])
 
     def receive(self) -> LinkReply | None:
-        """Return the next answer; None: there is none, or it is malformed."""
+        """Return the next answer; None if there is none, or it is malformed."""
         frames = [frame.bytes for frame in receive_frames(self.socket)]
-        if not frames or frames == [b""]:  # an empty one: the translator has looked whether we are there
+        if not frames or frames == [b""]:  # an empty message is the translator's probe
             return None
         before, content = _parted(frames)
         number = before[0] if before else b""
@@ -68,12 +68,12 @@ class TranslatorLink:
         return LinkReply(int(number), content)
 
     def follow(self) -> list[LinkUp | LinkDown]:
-        """Return the translator's coming and going."""
+        """Return connections and disconnections of the translator."""
         return [LinkUp() if event.kind == CONNECTED else LinkDown() for event in self.monitor.drain()]
 
 
 def _parted(frames: list[bytes]) -> tuple[list[bytes], list[bytes]]:
-    """The frames before the first empty one, and those behind it; both are empty where there is none."""
+    # the frames before the first empty one, and those after it
     if b"" not in frames[1:]:
         return [], []
     at = frames.index(b"", 1)

@@ -1,4 +1,4 @@
-"""The port of a component over ZeroMQ, and what it shares with a translator's: one poller for all sockets."""
+"""A component's port over ZeroMQ, and the poller that it shares with a translator's port."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ T = TypeVar("T")
 
 
 class BasePort(Generic[T]):
-    """Waits for its sockets, and publishes.
+    """A port that waits for its sockets and publishes.
 
     Args:
-        publish: the address to publish on; None: it has none.
+        publish: address to publish on; None: none.
     """
 
     def __init__(self, network: Network, clock: Clock, publish: str | None) -> None:
@@ -46,7 +46,7 @@ class BasePort(Generic[T]):
 
     @property
     def publish_address(self) -> str | None:
-        """Where others can subscribe to what we publish, with the port that was found."""
+        """Return the address of the publisher, with the port that was found."""
         return self._publisher.address if self._publisher else None
 
     def poll(self, timeout_s: float | None) -> list[T]:
@@ -63,7 +63,7 @@ class BasePort(Generic[T]):
         return self._wake_up.writer_fileno()
 
     def close(self) -> None:
-        """The network is the port's own: it is closed too."""
+        """Close the port and its own network."""
         if not self._closed:
             self._closed = True
             self._network.close()
@@ -76,15 +76,15 @@ class BasePort(Generic[T]):
 
 
 class ZmqPort(BasePort[Incoming]):
-    """See `transport.port.Port`.
+    """A component's port, see `transport.port.Port`.
 
     Args:
-        name: of the component.
-        clock: of the experiment.
-        subscribe: addresses of the publishers to listen to.
-        envelopes: prefixes of what to listen to; None: all.
+        name: name of the component.
+        clock: clock of the experiment.
+        subscribe: addresses of the publishers.
+        envelopes: prefixes of the envelopes to subscribe to; None: all.
         control: the scheduler's address for requests.
-        publish: the address to publish on.
+        publish: address to publish on.
 
     Raises:
         TransportError: an address can't be used.
@@ -128,7 +128,11 @@ class ZmqPort(BasePort[Incoming]):
 
 
 def open_port(launch: Launch, clock: Clock) -> ZmqPort:
-    """Open the port of a component as its launch line says. Raises TransportError."""
+    """Open a component's port for its launch line.
+
+    Raises:
+        TransportError: an address can't be used.
+    """
     sockets = launch.sockets
     return ZmqPort(
         Network.from_launch(launch.name, launch.keys),

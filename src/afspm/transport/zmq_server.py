@@ -1,4 +1,4 @@
-"""A translator's side of the network: answers requests, one at a time, and publishes."""
+"""A translator's port over ZeroMQ: it answers requests, one at a time, and publishes."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from afspm.transport.network import Network
 from afspm.transport.port import RequestReceived, Served, SubscriberJoined
 from afspm.transport.zmq_port import BasePort
 
-_WITHOUT_EPOCH = 3  # frames up to the empty one: connection, number; the epoch comes behind them
+_WITHOUT_EPOCH = 3  # frames without an epoch: connection, number, empty frame; an epoch stands behind the number
 
 
 class ZmqServerPort(BasePort[Served]):
-    """See `transport.port.ServerPort`.
+    """A translator's port, see `transport.port.ServerPort`.
 
-    To a requester it is a REP socket: it gives back whatever came before the empty frame, so that a scheduler of ours
-    can number its requests. It is a ROUTER since an answer may also be withheld.
+    To a client it behaves as a REP socket: it returns all frames before the empty one, so that a scheduler can number
+    its requests. It is a ROUTER, since an answer may also be withheld.
 
     Args:
-        serve: the address to answer requests on.
-        publish: the address to publish on.
-        allowed: with keys, the only name whose requests are answered (the scheduler's); None: all that are let in.
+        serve: address for requests.
+        publish: address to publish on.
+        allowed: with keys, the only name whose requests are answered (the scheduler's); None: all accepted keys.
 
     Raises:
         TransportError: an address can't be used.
@@ -40,10 +40,10 @@ class ZmqServerPort(BasePort[Served]):
         self._has_keys = network.keys is not None and network.keys.binds_encrypted(serve, requests=True)
         self._asker: list[bytes] | None = None
         self._socket = network.socket(zmq.ROUTER)
-        # A name belongs to its newest connection, else a scheduler that connects anew before the old connection is
-        # found dead is never heard. And what it says is never freed: the library keeps the queues that nobody reads.
+        # The newest connection gets an identity. Without it, a scheduler that reconnects before its old connection
+        # times out is ignored, and libzmq never frees the queue of its requests.
         self._socket.setsockopt(zmq.ROUTER_HANDOVER, 1)
-        self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # so that it can be seen who is there
+        self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)  # a send to a peer that is gone fails
         self.serve_address = network.bind(self._socket, serve, requests=True)
         self._poller.register(self._socket, self._request)
 
@@ -60,7 +60,6 @@ class ZmqServerPort(BasePort[Served]):
         return [SubscriberJoined()] if self._publisher is not None and self._publisher.serve() else []
 
     def _request(self) -> list[Served]:
-        """The next request, if the last one was answered."""
         while self._asker is None and (frames := receive_frames(self._socket)):
             request = self._accepted(frames)
             if request is not None:
@@ -68,11 +67,11 @@ class ZmqServerPort(BasePort[Served]):
         return []
 
     def _accepted(self, frames: Sequence[zmq.Frame]) -> RequestReceived | None:
-        """A message as a request that is to be answered; None: it is none, or was answered here."""
+        # None if the message is no request, or was refused here
         parts = [frame.bytes for frame in frames]
         start = parts.index(b"", 1) + 1 if b"" in parts[1:] else len(parts)
         if start == len(parts):
-            return None  # no telling where an answer would go; or a peer says its name, as to a scheduler
+            return None  # without a return path, or a peer that gives its name, as to a scheduler
         self._asker = parts[:start]
         epoch = parts[start - 2] if start > _WITHOUT_EPOCH else b""
         user = user_of(frames[0]) if self._has_keys else None
@@ -90,7 +89,6 @@ class ZmqServerPort(BasePort[Served]):
         return self._send([connection, b""])
 
     def _send(self, frames: list[bytes]) -> bool:
-        """False if the peer is gone, or takes nothing."""
         try:
             return send_frames(self._socket, frames)
         except zmq.ZMQError as error:
@@ -104,15 +102,20 @@ class ZmqServerPort(BasePort[Served]):
         self._publisher.publish(self._published.stamp(envelope, payload, time_ns, keep=keep))
 
     def kill(self) -> None:
-        """Tell all subscribers that the experiment has ended."""
+        """Send the signal KILL to all subscribers: the experiment has ended."""
         if self._publisher is not None:
             self._publisher.kill()
 
 
 def open_server_port(launch: Launch, clock: Clock) -> ZmqServerPort:
-    """Open the port of a translator. Raises TransportError, or ConfigError if it has no address to answer on."""
+    """Open a translator's port.
+
+    Raises:
+        TransportError: an address can't be used.
+        ConfigError: there is no address for requests.
+    """
     if launch.sockets.serve is None:
-        raise ConfigError("it has no address to answer requests on", where=launch.name, hint="serve = address")
+        raise ConfigError("the translator has no address for requests", where=launch.name, hint="serve = address")
     return ZmqServerPort(
         Network.from_launch(launch.name, launch.keys),
         clock,

@@ -1,20 +1,26 @@
 """The wire format: messages as bytes, and bytes as values of the model. The only room that knows protobuf.
 
-**Theory of operation.** The messages are those of the paper, in `proto/`; a build step generates Python classes from
-them. One registry declares each message once: its name, its envelope, whether it is a measurement or a state, the
-handler that a component has for it. Every other list of messages is derived from the registry.
+**Theory of operation.** `proto/` defines the messages of the paper; a build step generates Python classes from
+it. One registry declares each message once: its name, its envelope, whether it is a measurement or a state, the
+handler of a component for it. Every other list of messages is derived from the registry.
 
     comes in      frames from sockets and the packet log; values of the model
-    state         none; message types of the user are registered once, at the start of a process
+    state         the registry; the user's message types are added to it once, at the start of a process
     goes out      values of the model; bytes
-    always holds  equal values give equal bytes (reference bytes in `proto/golden.json`); what can't be read is a
-                  WireError and disturbs nobody; the values of a scan are a view of the received buffer, never a copy
+    always holds  equal values give equal bytes (reference bytes in `proto/golden.json`); unreadable bytes raise
+                  WireError and disturb no other message; a scan's values are a view of the received buffer, never a
+                  copy
 """
 
 from __future__ import annotations
 
 from afspm.wire.codec import decode, encode, header
 from afspm.wire.frames import (
+    BEAT,
+    CLOSE,
+    CLOSING,
+    KILL,
+    PROTOCOL_VERSION,
     decode_packet,
     decode_parameter,
     decode_request,
@@ -40,13 +46,6 @@ from afspm.wire.messages import (
     messages_of_the_experiment,
     messages_without_values,
     register,
-)
-from afspm.wire.protocol import (
-    BEAT,
-    CLOSE,
-    CLOSING,
-    KILL,
-    PROTOCOL_VERSION,
 )
 from afspm.wire.split import Buffer
 from afspm.wire.values import encode_place, place_in, relocated

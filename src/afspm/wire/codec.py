@@ -1,4 +1,4 @@
-"""Model objects and messages to and from bytes, by the name of the message."""
+"""Conversion of model objects and messages to and from bytes, by the name of the message."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def encode(thing: object) -> tuple[str, bytes]:
     """Return a model object, or any message, as (name of the message, bytes).
 
     Raises:
-        InvalidValue: it is neither.
+        InvalidValue: `thing` is neither.
     """
     if isinstance(thing, Message):
         return _serialised(thing)
@@ -37,12 +37,12 @@ def encode(thing: object) -> tuple[str, bytes]:
 
 
 def decode(name: str, payload: Buffer) -> Any:
-    """Return the message `name` as a model object, where there is one for it, else as the generated message itself.
+    """Return the message `name` as a model object if it has one, else as the generated message.
 
     A scan's values are a view of `payload`.
 
     Raises:
-        WireError: the bytes are no such message, or say what can't be.
+        WireError: the bytes are no such message, or hold invalid values.
     """
     decoder = _DECODERS.get(name)
     try:
@@ -52,7 +52,7 @@ def decode(name: str, payload: Buffer) -> Any:
 
 
 def header(name: str, payload: Buffer) -> model.PacketHeader:
-    """Return the facts that the envelope of a message may depend on; its values are not touched.
+    """Return the facts on which the envelope of a message may depend, without reading its values.
 
     Raises:
         WireError: the bytes are no such message.
@@ -90,7 +90,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
         raise WireError(f"a scan of {shape.x} x {shape.y} pixels with {values.size} values")
     region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
     if region is None:
-        raise WireError("a scan that does not say where it was taken")
+        raise WireError("a scan without a place")
     return model.Scan(
         region,
         message.channel,
@@ -103,6 +103,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
 
 
 def _scan_header(payload: Buffer) -> model.PacketHeader:
+    # the values are cut out before parsing: a header costs the same for a scan of any size
     message = parse(scan_pb2.Scan2d, split(payload, _VALUES_OF_SCAN)[0])
     spatial = message.params.spatial
     size_m = None
@@ -130,7 +131,7 @@ def _decode_lines(payload: Buffer) -> model.ScanLines:
     values, shape = doubles(chunks), message.params.data.shape
     region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
     if region is None or not shape.x or values.size % shape.x:
-        raise WireError(f"{values.size} values are no lines of {shape.x} pixels of a scan of which the place is known")
+        raise WireError(f"{values.size} values are no lines of {shape.x} pixels of a scan with a known place")
     return model.ScanLines(
         region,
         (shape.y, shape.x),
@@ -161,6 +162,7 @@ def _encode_spectrum(spectrum: model.Spectrum) -> tuple[str, bytes]:
         names=spectrum.names,
         units=spectrum.units,
     )
+    # nested by hand: protobuf would copy the values into a list of Python floats
     inner = b"".join((data.SerializeToString(), *packed(spectrum.values, _VALUES_OF_DATA)))
     return "Spec1d", message.SerializeToString() + nested(inner, _DATA_OF_SPECTRUM)
 
@@ -213,9 +215,10 @@ def _encode_mapped(mapping: MessageMapping[object], thing: object) -> tuple[str,
 
 def _published_parameters(payload: Buffer) -> model.ScanParameters:
     parameters = convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, payload))
-    if isinstance(parameters.region, model.RegionChange):  # published is what is in force: no angle means none
+    if isinstance(parameters.region, model.RegionChange):  # published parameters are in force: no angle means unrotated
         whole = convert.whole_region(parameters.region)
         parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
+    # a request may change one axis alone, but parameters in force have both
     if isinstance(parameters.shape, model.ShapeChange):
         raise WireError("scan parameters in force with pixels along one axis only")
     return parameters

@@ -1,6 +1,6 @@
-"""Places, positions and scan parameters to and from messages. Only here do units and corners of the wire matter.
+"""Conversion of places, positions and scan parameters to and from messages, with units and corners of the wire.
 
-We send metres, degrees and full presence; any unit and any absence is read.
+Sent messages are in metres and degrees and have every field; received ones may have any unit and lack fields.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import math
 
 from afspm import model
 from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import lengths_text
 from afspm.basics.units import convert
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 
@@ -36,14 +37,15 @@ def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.Spati
 
 
 def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | None:
-    """Return the region of a message, as far as it is given, in SI; None if nothing is.
+    """Return the given fields of a message's region, in SI; None if there are none.
 
     Raises:
-        UnitError: a unit that is none of length or angle.
+        UnitError: a unit is neither a length nor an angle.
     """
     if not spatial.HasField("roi"):
         return None
     roi = spatial.roi
+    # the wire format's units for a message without any
     unit = spatial.length_units or "m"
     angle_unit = spatial.angular_units or "deg"
 
@@ -59,10 +61,10 @@ def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | 
 
 
 def whole_region(change: model.RegionChange | None) -> model.Region | None:
-    """Return the region, if the message gives all of it; an angle that is not given is zero.
+    """Return the region if every field but the angle is given; a missing angle is zero.
 
     Raises:
-        InvalidValue: it is none.
+        InvalidValue: the fields are no valid region.
     """
     if change is None:
         return None
@@ -89,13 +91,14 @@ def scan_parameters_to_wire(parameters: model.ScanParameters) -> scan_pb2.ScanPa
 
 
 def scan_parameters_from_wire(message: scan_pb2.ScanParameters2d) -> model.ScanParameters:
-    """With a RegionChange where the region, its angle included, is not given whole.
+    """Return scan parameters, with a RegionChange if the region or its angle is incomplete.
 
     Raises:
-        InvalidValue, UnitError: values that make no sense.
+        InvalidValue, UnitError: a value is invalid.
     """
     change = spatial_from_wire(message.spatial)
     _finite(change)
+    # a request without an angle keeps the present angle, so it is only a change of the region
     region = whole_region(change) if change is not None and change.angle_rad is not None else None
     shape: tuple[int, int] | model.ShapeChange | None = None
     if message.data.HasField("shape"):
@@ -111,8 +114,9 @@ def _finite(change: model.RegionChange | None) -> None:
     for name, value in vars(change).items():
         if value is not None and not math.isfinite(value):
             raise InvalidValue(f"{name.rsplit('_', 1)[0]} of the region is {value}")
-    if any(size is not None and size <= 0 for size in (change.width_m, change.height_m)):
-        raise InvalidValue(f"the region's size ({change.width_m} m, {change.height_m} m) must be above zero")
+    for side, size_m in (("width", change.width_m), ("height", change.height_m)):
+        if size_m is not None and size_m <= 0.0:
+            raise InvalidValue(f"the {side} of the region is {lengths_text([size_m])}", hint="above zero")
 
 
 def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePosition:
@@ -122,7 +126,12 @@ def position_to_wire(position: model.ProbePosition) -> spectroscopy_pb2.ProbePos
 
 
 def position_from_wire(message: spectroscopy_pb2.ProbePosition) -> model.ProbePosition:
-    """Raises InvalidValue where a coordinate is missing or not finite, UnitError for units that are no lengths."""
+    """Return a complete probe position.
+
+    Raises:
+        InvalidValue: a coordinate is missing or not finite.
+        UnitError: a unit is not a length.
+    """
     change = position_change_from_wire(message)
     if isinstance(change, model.PositionChange):
         raise InvalidValue("a probe position needs x and y")
@@ -132,11 +141,11 @@ def position_from_wire(message: spectroscopy_pb2.ProbePosition) -> model.ProbePo
 def position_change_from_wire(
     message: spectroscopy_pb2.ProbePosition,
 ) -> model.ProbePosition | model.PositionChange:
-    """Return the position of a request: a PositionChange where it gives only x or only y.
+    """Return the position in a request; a PositionChange if it gives only x or only y.
 
     Raises:
-        InvalidValue: it says neither, or a coordinate is not finite.
-        UnitError: the unit is no length.
+        InvalidValue: both coordinates are missing, or one is not finite.
+        UnitError: the unit is not a length.
     """
     unit, point = message.units or "m", message.point
     x_m = convert(point.x, unit, "m") if point.HasField("x") else None

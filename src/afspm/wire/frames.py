@@ -1,9 +1,10 @@
-"""Packets, requests and responses as the frames that travel."""
+"""Packets, requests and responses as frames of a ZeroMQ message, and the signals of one frame."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from typing import Final
 
 from google.protobuf.duration_pb2 import Duration
 from google.protobuf.message import DecodeError
@@ -30,12 +31,23 @@ from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import FEEDBACK, PARAMETER, RELAYED, known, time_ns, timestamp
 from afspm.wire.messages import parse
-from afspm.wire.protocol import LONGEST_ENVELOPE, LONGEST_ID
 from afspm.wire.split import Buffer
+
+PROTOCOL_VERSION: Final = 2
+
+KILL: Final = b"KILL"
+"""The packet of one frame to all subscribers that announces the end of the experiment."""
+CLOSE: Final = bytes([100])
+"""The request of one frame that ends the translator, which subscribes to no publisher, with the experiment."""
+BEAT: Final = b"\x00"
+CLOSING: Final = b"\x01"
+LONGEST_ID: Final = 200
+LONGEST_ENVELOPE: Final = 1000
+"""In bytes."""
 
 
 def encode_time(time_ns: int) -> bytes:
-    """The third frame of a packet: a serialised google.protobuf.Timestamp."""
+    """Return the third frame of a packet: a serialised google.protobuf.Timestamp."""
     return timestamp(time_ns).SerializeToString()
 
 
@@ -43,7 +55,7 @@ def decode_time(frame: Buffer) -> int:
     """Return the time in the third frame of a packet, ns since the Unix epoch.
 
     Raises:
-        WireError: it is none.
+        WireError: the bytes are no Timestamp, or a time out of range.
     """
     try:
         return time_ns(Timestamp.FromString(bytes(frame)))
@@ -52,7 +64,7 @@ def decode_time(frame: Buffer) -> int:
 
 
 def encode_packet(packet: Packet) -> list[Buffer]:
-    """[envelope, message] and, where it is known, [timestamp]."""
+    """Return the frames [envelope, message] and, for a packet with a time, [timestamp]."""
     frames: list[Buffer] = [packet.envelope.encode(), packet.payload]
     if packet.time_ns is not None:
         frames.append(encode_time(packet.time_ns))
@@ -60,10 +72,10 @@ def encode_packet(packet: Packet) -> list[Buffer]:
 
 
 def decode_packet(frames: Sequence[Buffer]) -> Packet:
-    """Return a packet of two or three frames; its message is not decoded.
+    """Return a packet of two or three frames, with its message still in bytes.
 
     Raises:
-        WireError: it is none.
+        WireError: the frames are no packet.
     """
     if not 2 <= len(frames) <= 3:
         raise WireError(f"a packet of {len(frames)} frames instead of two or three")
@@ -78,7 +90,7 @@ def decode_packet(frames: Sequence[Buffer]) -> Packet:
 
 
 def encode_request(request: Request) -> list[bytes]:
-    """[number, object, id]; frames at the end that are empty are left out."""
+    """Return the frames [number, object, id], without empty frames at the end."""
     frames = [bytes([request.kind]), request.payload or encode_subject(request.subject), request.id.encode()]
     while len(frames) > 1 and not frames[-1]:
         frames.pop()
@@ -86,9 +98,9 @@ def encode_request(request: Request) -> list[bytes]:
 
 
 def encode_subject(subject: object) -> bytes:
-    """Return a request's subject in bytes.
+    """Return the subject of a request in bytes.
 
-    One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the model object's.
+    One byte for a whole number, a Duration for seconds, an ActionMsg for text, else the bytes of the model object.
     """
     if subject is None:
         return b""
@@ -98,6 +110,7 @@ def encode_subject(subject: object) -> bytes:
         seconds, nanos = divmod(round(subject * 1e9), 10**9)
         return Duration(seconds=seconds, nanos=nanos).SerializeToString()
     if isinstance(subject, str):
+        # long names are not cached, since 256 of them could take much memory
         return _action_message(subject) if len(subject) <= LONGEST_ID else _new_action_message(subject)
     return encode(subject)[1]
 
@@ -113,8 +126,8 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
     """Return a request of one to three frames.
 
     Raises:
-        WireError: it is none, with the `response` to answer: REP_CMD_NOT_SUPPORTED for a number that is unknown,
-            REP_PARAM_ERROR for a value that makes no sense, else REP_FAILURE.
+        WireError: the frames are no request; with the `response` to send: REP_CMD_NOT_SUPPORTED for an unknown number,
+            REP_PARAM_ERROR for an invalid value, else REP_FAILURE.
     """
     if not 1 <= len(frames) <= 3:
         raise WireError(f"a request of {len(frames)} frames instead of one to three")
@@ -134,7 +147,7 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
 
 
 def id_of(frames: Sequence[Buffer]) -> str:
-    """Return the id of a request that may be malformed, so that its sender knows what is refused; "" if it has none."""
+    """Return the id of a request, perhaps a malformed one, for a refusal; empty if there is none."""
     return str(frames[2], "utf-8", "replace") if len(frames) == 3 and len(frames[2]) <= LONGEST_ID else ""
 
 
@@ -148,7 +161,7 @@ def _request_id(frame: Buffer) -> str:
 
 
 def encode_response(response: Response) -> list[bytes]:
-    """[number] and, where there is any of it, [object, reason, id, detail]."""
+    """Return the frames [number, object, reason, id, detail], without empty frames at the end."""
     detail = bytes([response.detail]) if response.detail else b""
     frames = [bytes([response.code]), response.payload, response.reason.encode(), response.id.encode(), detail]
     while len(frames) > 1 and not frames[-1]:
@@ -160,12 +173,13 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
     """Return a response of one to five frames; frames that a newer peer appends are ignored.
 
     Raises:
-        WireError: it is none.
+        WireError: the frames are no response.
     """
     count = len(frames)
     if not count or len(frames[0]) != 1:
         raise WireError(f"a response of {count} frames, the first of {len(frames[0]) if frames else 0} bytes")
     payload = bytes(frames[1]) if count > 1 else b""
+    # text for people: a wrong byte in it must not hide the answer
     reason = str(frames[2], "utf-8", "replace") if count > 2 and frames[2] else ""
     request_id = str(frames[3], "utf-8", "replace") if count > 3 else ""
     detail = known(ResponseDetail, frames[4][0]) if count > 4 and frames[4] else ResponseDetail.NONE
@@ -173,10 +187,10 @@ def decode_response(frames: Sequence[Buffer]) -> Response:
 
 
 def decode_parameter(payload: Buffer) -> Parameter:
-    """Return the object of a successful REQ_PARAM: the value in force.
+    """Return the parameter in the answer to REQ_PARAM, with the value in force.
 
     Raises:
-        WireError: it is none.
+        WireError: the bytes are no parameter.
     """
     try:
         return PARAMETER.decode(payload)
@@ -185,7 +199,7 @@ def decode_parameter(payload: Buffer) -> Parameter:
 
 
 def _action(payload: bytes) -> str:
-    # there are few actions, and they are asked for again and again
+    # cached: an experiment repeats the same few actions
     return _known_action(payload) if len(payload) <= LONGEST_ID else _new_action(payload)
 
 
@@ -209,10 +223,10 @@ def _number(payload: bytes) -> int:
 
 def _seconds(payload: bytes) -> float:
     try:
-        told = Duration.FromString(payload)
+        duration = Duration.FromString(payload)
     except DecodeError as error:
         raise WireError(f"the bytes are no Duration: {error}") from None
-    seconds = told.seconds + told.nanos * 1e-9
+    seconds = duration.seconds + duration.nanos * 1e-9
     if not 0.0 < seconds <= LONGEST_LEASE_S:
         raise InvalidValue(f"a lease of {seconds:g} s", hint=f"above 0 and at most {LONGEST_LEASE_S:g} s")
     return seconds

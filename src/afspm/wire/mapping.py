@@ -1,4 +1,4 @@
-"""Model objects to and from messages, field by field: a table for each, of those that need no more than that."""
+"""Conversion of model objects to and from messages field by field, by one table for each class."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from afspm.wire.split import Buffer
 T = TypeVar("T")
 E = TypeVar("E", bound=IntEnum)
 
+# the record and numpy keep times as ns in a signed 64-bit integer
 _TIMES = 2**63
 _FLOAT32 = struct.Struct("<f")
 
@@ -32,32 +33,36 @@ def timestamp(time_ns: int) -> Timestamp:
 
 
 def time_ns(stamp: Timestamp) -> int:
-    """Raises InvalidValue: 64 bits, the years 1678 to 2261, don't hold it; no record could keep it."""
+    """Return a timestamp in ns since the Unix epoch.
+
+    Raises:
+        InvalidValue: the time does not fit 64 bits (the years 1678 to 2261), so that no record could keep it.
+    """
     found = int(stamp.seconds) * NS_PER_S + stamp.nanos
     if not -_TIMES <= found < _TIMES:
-        raise InvalidValue(f"a time {stamp.seconds} s from 1970")
+        raise InvalidValue(f"a time of {stamp.seconds} s since 1970, outside of the years 1678 to 2261")
     return found
 
 
 def known(kind: type[E], number: int) -> E:
-    """Return the member with this number; UNDEFINED (0) for one that only a newer peer knows."""
+    """Return the member with this number; UNDEFINED (0) for a number that only a newer peer knows."""
     return kind(number) if number in kind._value2member_map_ else kind(0)
 
 
 def shortest(number: float) -> float:
-    """Return the decimal number that a float32 means: 0.1, not 0.10000000149011612, which is above a limit of 0.1."""
+    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612, which exceeds a limit of 0.1."""
     for digits in range(6, 9):
         decimal = float(f"{number:.{digits}g}")
         if _FLOAT32.unpack(_FLOAT32.pack(decimal)) == (number,):
             return decimal
-    return float(f"{number:.9g}")  # which tells any two of them apart
+    return float(f"{number:.9g}")  # nine digits distinguish any two float32
 
 
 class FieldMapping(NamedTuple):
-    """One field of a message, and how its value is converted each way.
+    """One field of a message, and the conversion of its value in both directions.
 
     Attributes:
-        sparse: it is not sent where it is empty or zero.
+        sparse: an empty or zero value is not sent.
     """
 
     name: str
@@ -67,10 +72,12 @@ class FieldMapping(NamedTuple):
 
 
 class MessageMapping(Generic[T]):
-    """A model class and its message. An attribute that is None is absent; one whose default is None may be absent.
+    """A model class and its message.
+
+    None is sent as an absent field. An absent field is read as None if that is the attribute's default.
 
     Args:
-        same: attributes that are fields of the same name and type.
+        same: attributes with a field of the same name and type.
         other: all other attributes.
     """
 
@@ -94,10 +101,15 @@ class MessageMapping(Generic[T]):
         return self._message(**values)
 
     def from_wire(self, message: Message) -> T:
-        """Raises InvalidValue: a value makes no sense."""
+        """Return the model object of a message.
+
+        Raises:
+            InvalidValue: a value is invalid.
+        """
         return self.kind(
             **{
                 attribute: None
+                # an absent field reads as 0, which a request would then set
                 if attribute in self._optional and not message.HasField(field.name)
                 else _converted(field, getattr(message, field.name))
                 for attribute, field in self._fields.items()
@@ -105,7 +117,12 @@ class MessageMapping(Generic[T]):
         )
 
     def decode(self, payload: Buffer) -> T:
-        """Raises WireError: the bytes are no such message; InvalidValue: a value makes no sense."""
+        """Return the model object of a serialised message.
+
+        Raises:
+            WireError: the bytes are no such message.
+            InvalidValue: a value is invalid.
+        """
         return self.from_wire(parse(self._message, payload))
 
 
@@ -130,6 +147,7 @@ def _each(name: str, mapping: MessageMapping[Any]) -> FieldMapping:
 
 
 def _gain(name: str) -> FieldMapping:
+    # a float32 in the message: its nearest float64 would differ from the value that was set
     def finite(value: float) -> float:
         if not math.isfinite(value):
             raise InvalidValue(f"{name} is {value}")
@@ -162,6 +180,7 @@ CONTROL_STATE = MessageMapping(
     model.ControlState,
     control_pb2.ControlState,
     mode=_enum("control_mode", model.ControlMode),
+    # the wire has an empty name for no holder
     holder=FieldMapping("client_in_control_id", from_wire=lambda holder: holder or None),
     problems=FieldMapping("problems_set", from_wire=lambda problems: tuple(sorted({int(one) for one in problems}))),
 )
@@ -202,6 +221,7 @@ _NOTE = MessageMapping(
     scan_ns=_time("scan"),
     written_ns=_time("written"),
 )
+# Told is the name on the wire, which must stay compatible
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )
@@ -226,10 +246,14 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:
-    """Return the object of the answer to RELAY_REQUEST."""
+    """Return the object in the answer to RELAY_REQUEST."""
     return journal_pb2.Orders(restart=restart).SerializeToString()
 
 
 def decode_orders(payload: Buffer) -> tuple[str, ...]:
-    """Return the processes that are to be started anew. Raises WireError: the bytes are no orders."""
+    """Return the names of the processes to restart.
+
+    Raises:
+        WireError: the bytes are no orders.
+    """
     return tuple(parse(journal_pb2.Orders, payload).restart)

@@ -1,4 +1,4 @@
-"""Messages of the user: Python modules that protoc made or that declare them, or .proto files compiled here."""
+"""The user's message types, from Python modules (made by protoc, or with declarations) or from .proto files."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from afspm.basics.errors import ConfigError
 
 
 def register_all(sources: Iterable[str]) -> None:
-    """Make the messages of modules ("my_lab.messages_pb2") and files ("peaks.proto") known by their names.
+    """Register the messages in modules ("my_lab.messages_pb2") and files ("peaks.proto") by their names.
 
-    A module may hold `MessageDeclaration`s instead, by which more than the type of its messages is known.
+    A module may hold `MessageDeclaration`s, which give more than the types of its messages.
 
     Raises:
-        ConfigError: there is no such module or file, it has errors, or it holds no messages.
+        ConfigError: a module or file does not exist, has errors, or holds no messages.
     """
     for source in sources:
         module = _compiled(Path(source)) if source.endswith(".proto") else _imported(source)
@@ -41,35 +41,36 @@ def register_all(sources: Iterable[str]) -> None:
 def _imported(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
-    except Exception as error:  # a module may raise anything while it is imported
+    except Exception as error:  # importing runs the user's code, which may raise anything
         raise ConfigError(
             f"can't be imported: {error}", where=name, hint="is it on the Python path, or beside the experiment file?"
         ) from error
 
 
 def _compiled(path: Path) -> ModuleType:
-    """The module that protoc makes of a file. It is used once and not kept: the file is what counts."""
+    # the compiled module is not kept: the .proto file may change before the next start
     if not path.is_file():
         raise ConfigError("there is no such file", where=str(path))
-    import tempfile  # imported late: few have messages of their own, and all would start later for it
+    import tempfile  # imported late: few experiments have their own messages, and every process would start later
 
     try:
         from grpc_tools import protoc
     except ImportError:
         raise ConfigError(
-            "needs a compiler for messages",
+            "this file needs a compiler for messages",
             where=str(path),
             hint='pip install "afspm[messages]", or name a _pb2 module',
         ) from None
+    # for files that import google/protobuf/*.proto
     well_known = Path(protoc.__file__).parent / "_proto"
     with tempfile.TemporaryDirectory(prefix="afspm-") as folder:
         arguments = ["protoc", f"-I{path.parent}", f"-I{well_known}", f"--python_out={folder}", str(path)]
         if protoc.main(arguments) != 0:
-            raise ConfigError("has errors, told above", where=str(path))
+            raise ConfigError("has errors; the compiler's messages are above", where=str(path))
         name = f"{path.stem.replace('-', '_')}_pb2"
         spec = importlib.util.spec_from_file_location(name, Path(folder) / f"{name}.py")
         if spec is None or spec.loader is None:
-            raise ConfigError("protoc made no module of it", where=str(path))
+            raise ConfigError("protoc has not made a module from this file", where=str(path))
         module = importlib.util.module_from_spec(spec)
         sys.modules[name] = module
         spec.loader.exec_module(module)

@@ -1,17 +1,18 @@
-"""Every message, declared once: all that the other rooms do by the name of a message follows from its declaration.
+"""The registry of messages: one declaration for each message, which all other rooms follow.
 
-Nothing outside of this package imports the generated modules; a message class that is needed elsewhere comes from here.
+Nothing outside of this package imports the generated modules; it provides message classes to other rooms.
 
-| a declaration says | which decides |
+| a declaration states | and thereby |
 | --- | --- |
-| type | how its bytes are read; its name, and with it its envelopes |
-| kind, source, always | what clients follow, what a terminal subscribes to, what `afspm check` knows as published |
+| type | how bytes are read; the name, with which its envelopes begin |
+| kind, source, always | what clients follow, what a terminal subscribes to, what `afspm check` expects to be published
+|
 | history | how many packets of an envelope the scheduler keeps for late joiners |
-| handler | the method of a component, and of an overview of the record, that gets it |
+| handler | the method of a component, and of an overview of the record, for this message |
 | attribute | where a client keeps the newest |
 | event | the kind of event under which the gateway streams it |
 
-What must hold: a name is declared once; no set, table or tuple of message names stands in another package.
+Always holds: a name is declared once; no set, table or tuple of message names stands in another package.
 """
 
 from __future__ import annotations
@@ -48,33 +49,33 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageKind(Enum):
-    """The kinds of messages, by which receivers treat them."""
+    """The kinds of messages, which receivers treat differently."""
 
     MEASUREMENT = "a finished measurement, with its values"
-    LINES = "rows of a running scan: of the moment, not kept"
-    STATE = "what is in force: the newest replaces those before"
-    EVENT = "what happened to processes, requests and people's notes"
-    RESULT = "what a component or a drift scheduler found out"
+    LINES = "rows of a running scan, for the moment: not kept"
+    STATE = "states and settings in force: the newest replaces earlier ones"
+    EVENT = "events of processes and requests, and people's notes"
+    RESULT = "findings of a component or a drift scheduler"
     PART = "a part of other messages or of requests, or a message of a user"
 
 
 @dataclass(frozen=True, kw_only=True)
 class MessageDeclaration:
-    """All that is known of a message by its name.
+    """All properties of a message by its name.
 
     Attributes:
         type: the generated class.
         kind: see `MessageKind`.
-        source: the role that publishes it; None: no process by itself.
-        always: every process of that role publishes it; False: only where something asks for it.
-        named: its envelopes go on after its name: with size and channel, kind or owner.
-        history: packets of an envelope that the scheduler keeps for late joiners; 0: none.
-        handler: the method that gets it, of a `Component` and of an `Overview`.
-        attribute: of a client's view, where the newest is kept; empty: it is not kept.
-        set_by: the request that sets what it says.
-        event: its kind among the events of the gateway; empty: it is not streamed.
-        in_past: an overview of an earlier part of a run needs all of its packets, not the newest alone.
-        name: of the message, with which its envelopes begin.
+        source: role of the process that publishes it; None: a process publishes it only for another.
+        always: every process of that role publishes it; False: only on some request or event.
+        named: its envelopes continue after the message's name with size and channel, kind or owner.
+        history: number of packets for each envelope that the scheduler keeps for late joiners.
+        handler: method of a `Component` and of an `Overview` for this message.
+        attribute: attribute of a client's view for the newest; empty: not kept.
+        set_by: the request that sets its content.
+        event: kind of the event in the gateway; empty: not streamed.
+        in_past: an overview of an earlier part of a run needs all packets, not only the newest.
+        name: name of the message, with which its envelopes begin.
     """
 
     type: type[Message]
@@ -91,14 +92,14 @@ class MessageDeclaration:
     name: str = field(init=False)
 
     def __post_init__(self) -> None:
-        # kept, since each packet is compared with some: reading the descriptor takes longer
+        # cached: each packet is compared with some names, and reading the descriptor takes longer
         object.__setattr__(self, "name", self.type.DESCRIPTOR.name)
         if not self.handler:
             object.__setattr__(self, "handler", f"on_{snake_case(self.name)}")
 
     @property
     def has_values(self) -> bool:
-        """Whether it carries an array of measured values."""
+        """Return whether it carries an array of measured values."""
         return self.kind in (MessageKind.MEASUREMENT, MessageKind.LINES)
 
 
@@ -239,22 +240,25 @@ _MODULES = (
     analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2,
     journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
+# collected by their class, so that no declaration above can be forgotten
 _declared: dict[str, MessageDeclaration] = {
     one.name: one for one in list(globals().values()) if isinstance(one, MessageDeclaration)
 }
+# all other messages are parts of these
 for _module in _MODULES:
     for _name in _module.DESCRIPTOR.message_types_by_name:
         _declared.setdefault(_name, MessageDeclaration(type=getattr(_module, _name)))
 
 
 def declare(declaration: MessageDeclaration) -> MessageDeclaration:
-    """Add a message of a package of one's own, with all that follows from its declaration.
+    """Register a message of another package with its declaration.
 
     Raises:
-        InvalidValue: another type has that name.
+        InvalidValue: another type has this name.
     """
     name = declaration.name
     known = _declared.setdefault(name, declaration)
+    # by full name: a .proto file that is compiled again gives another class of the same message
     if known.type is not declaration.type and known.type.DESCRIPTOR.full_name != declaration.type.DESCRIPTOR.full_name:
         raise InvalidValue(f"there is a message {name!r} already", hint="choose another name")
     if replace(known, type=declaration.type) != declaration:
@@ -263,10 +267,10 @@ def declare(declaration: MessageDeclaration) -> MessageDeclaration:
 
 
 def register(message: type[Message]) -> type[Message]:
-    """Make a message type of a user known, so that it is published, cached and received by its name.
+    """Register a user's message type, so that it can be published, cached and received.
 
     Raises:
-        InvalidValue: another type has that name.
+        InvalidValue: another type has this name.
     """
     known = _declared.get(message.DESCRIPTOR.name)
     if known is None or known.type.DESCRIPTOR.full_name != message.DESCRIPTOR.full_name:
@@ -275,7 +279,7 @@ def register(message: type[Message]) -> type[Message]:
 
 
 def declared() -> tuple[MessageDeclaration, ...]:
-    """Return the declarations of all messages, those of users included."""
+    """Return the declarations of all messages, with those of users."""
     return tuple(_declared.values())
 
 
@@ -283,7 +287,7 @@ def declaration(name: str) -> MessageDeclaration:
     """Return the declaration of the message `name`.
 
     Raises:
-        WireError: there is none.
+        WireError: the message is not declared.
     """
     try:
         return _declared[name]
@@ -297,39 +301,42 @@ def message_type(name: str) -> type[Message]:
     """Return the class of the message `name`.
 
     Raises:
-        WireError: it is not declared.
+        WireError: the message is not declared.
     """
     return declaration(name).type
 
 
 def known_messages() -> tuple[str, ...]:
-    """Return the names of all message types, those of users included."""
+    """Return the names of all messages, with those of users."""
     return tuple(_declared)
 
 
 def messages_of_the_experiment() -> tuple[str, ...]:
-    """Return the names of messages about sample, microscope and control; not about processes, requests and logs."""
+    """Return the names of messages about sample, microscope and control, without those about processes, requests and
+    logs.
+    """
     beside = journal_pb2.DESCRIPTOR.name
     return tuple(name for name, one in _declared.items() if one.type.DESCRIPTOR.file.name != beside)
 
 
 def followed_messages() -> tuple[str, ...]:
-    """Return the names of messages that every client follows: the state, and measurements that may be its own."""
+    """Return the names of messages that every client follows: states, and measurements, which may be its own."""
     return tuple(name for name, one in _declared.items() if one.kind in (MessageKind.STATE, MessageKind.MEASUREMENT))
 
 
 def messages_without_values() -> tuple[str, ...]:
-    """Return the names of messages that a scheduler publishes, but for those with values of scans and spectra."""
+    """Return the names of messages from translator and scheduler without the values of scans and spectra."""
     published = (Role.TRANSLATOR, Role.SCHEDULER)
     return tuple(name for name, one in _declared.items() if one.source in published and not one.has_values)
 
 
 def message_of(envelope: str) -> str:
-    """Return the name of the message in a packet: the envelope is that name, or begins with it and an underscore.
+    """Return the name of the message in a packet: all of its envelope, or the part before an underscore.
 
     Raises:
-        WireError: it begins with no known message's name.
+        WireError: the envelope begins with no known name.
     """
+    # the longest name first: the name of a message may begin with that of another and an underscore
     end = len(envelope)
     while end > 0:
         if (name := envelope[:end]) in _declared:
@@ -345,7 +352,7 @@ def parse(message: type[M], payload: bytes | memoryview) -> M:
     """Return bytes as a message of the given class.
 
     Raises:
-        WireError: they are none.
+        WireError: the bytes are no such message.
     """
     try:
         return message.FromString(payload if isinstance(payload, bytes) else bytes(payload))

@@ -1,7 +1,7 @@
-"""Takes the numbers of a message out of its bytes, so that an array is a view of the buffer and never a list.
+"""Extraction of an array from a serialised message as a view of the buffer, without a list of numbers.
 
-A packed `repeated double` is tag, length, then little-endian float64 values: what lies between can be handed to numpy
-as it is, and the rest of the message, small, to the Protocol Buffers library.
+A packed `repeated double` is tag, length, then little-endian float64 values. The values go to numpy as they are; the
+small rest of the message goes to the Protocol Buffers library.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ _VARINT, _FIXED64, _LENGTH, _FIXED32 = 0, 1, 2, 5
 
 
 def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryview]]:
-    """A serialised message without the top-level field number `field`, and the contents of that field.
+    """Return a serialised message without the top-level field number `field`, and the contents of this field.
 
     Returns:
-        The rest of the message in bytes, and the contents as views in the order they came: usually one.
+        The rest of the message in bytes, and the contents as views in their order: usually one.
 
     Raises:
         WireError: the bytes are no message.
@@ -52,6 +52,7 @@ def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryvie
             raise WireError(f"byte {start} begins a field of the unknown kind {wire_type}")
         if at + length > end:
             raise WireError(f"the message breaks off: the field at byte {start} is longer than what is left")
+        # protobuf allows a repeated field in several packed pieces, and unpacked
         if tag >> 3 == field and wire_type in (_LENGTH, _FIXED64):
             found.append(view[at : at + length])
             rest.append(view[kept_from:start])
@@ -64,15 +65,16 @@ def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryvie
 
 
 def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
-    """The contents of a `repeated double` as an array, shape (n,): a view where it came in one piece.
+    """Return the contents of a `repeated double` as an array, shape (n,): a view if they came in one piece.
 
     Raises:
-        WireError: the length is no multiple of eight bytes.
+        WireError: the length is not a multiple of eight bytes.
     """
     import numpy as np
 
     if not chunks:
         return np.empty(0)
+    # the encoder of a peer may send pieces: only these are copied
     data = chunks[0] if len(chunks) == 1 else b"".join(chunks)
     if len(data) % 8:
         raise WireError(f"values of {len(data)} bytes are no float64 numbers")
@@ -80,7 +82,7 @@ def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
 
 
 def packed(values: NDArray[np.float64], field: int) -> tuple[bytes, memoryview]:
-    """An array as the field number `field`: its tag and length, and its values as bytes (a view where possible)."""
+    """Return an array as the field number `field`: its tag and length, and its values (if possible a view)."""
     import numpy as np
 
     data = np.ascontiguousarray(values, "<f8").reshape(-1).data.cast("B")
@@ -88,20 +90,25 @@ def packed(values: NDArray[np.float64], field: int) -> tuple[bytes, memoryview]:
 
 
 def packed_chunks(chunks: Chunks, field: int) -> Chunks:
-    """The contents of a `repeated double` as the field number `field` again, in one piece."""
+    """Return the contents of a `repeated double` as the field number `field`, in one piece."""
     length = sum(map(len, chunks))
     return [memoryview(bytes([field << 3 | _LENGTH]) + as_varint(length)), *chunks]
 
 
 def nested(payload: bytes, field: int) -> bytes:
-    """A serialised message as the field number `field` of another."""
+    """Return a serialised message as the field number `field` of another message."""
     return bytes([field << 3 | _LENGTH]) + as_varint(len(payload)) + payload
 
 
 def varint(view: memoryview | bytes, at: int) -> tuple[int, int]:
-    """The number at byte `at`, and where the next thing begins."""
+    """Return the number at byte `at`, and the position after it.
+
+    Raises:
+        WireError: the bytes are no varint.
+    """
     value = shift = 0
     end = len(view)
+    # a 64-bit number has at most ten bytes; a longer one is damage
     while at < end and shift < 64:
         byte = view[at]
         at += 1
@@ -113,7 +120,7 @@ def varint(view: memoryview | bytes, at: int) -> tuple[int, int]:
 
 
 def as_varint(value: int) -> bytes:
-    """A number that is not negative, as it stands in a message."""
+    """Return a non-negative number as a varint."""
     out = bytearray()
     while value > 0x7F:
         out.append(value & 0x7F | 0x80)

@@ -1,4 +1,4 @@
-"""Messages with other values or at another place, changed without decoding all that is in them."""
+"""Serialised messages with other values or at another place, changed without decoding the rest."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+# numbers of fields in proto/
 _VALUES = {"Scan2d": 4, "ScanLines": 4}
 _DATA_OF_SPECTRUM, _VALUES_OF_DATA = 4, 5
-_NO_VALUES = 1 << 28  # a field that no message has
+_NO_VALUES = 1 << 28  # a field number that no message has
 _PLACES: dict[str, tuple[type[Message], Callable[[Any], Message], int]] = {
     "Scan2d": (scan_pb2.Scan2d, lambda scan: scan.params.spatial, _VALUES["Scan2d"]),
     "ScanLines": (lines_pb2.ScanLines, lambda lines: lines.params.spatial, _VALUES["ScanLines"]),
     "ScanParameters2d": (scan_pb2.ScanParameters2d, lambda parameters: parameters.spatial, _NO_VALUES),
     "Spec1d": (spectroscopy_pb2.Spec1d, lambda spectrum: spectrum.position, _DATA_OF_SPECTRUM),
 }
-"""By the name of a message: its class, the part that says where it is, and the field that is left alone."""
+"""By the name of a message: its class, the field that holds its place, and the field of values, which is not parsed."""
 
 
 def without_values(message: str, payload: Buffer) -> bytes:
-    """Return a message without the values of a scan, of lines or of a spectrum; any other as it is.
+    """Return a message without the values of a scan, of lines or of a spectrum; other messages unchanged.
 
     Raises:
         WireError: the bytes are no message.
@@ -45,7 +46,7 @@ def without_values(message: str, payload: Buffer) -> bytes:
 
 
 def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes:
-    """Put values into what `without_values` made: of a scan or of lines [y, x], of a spectrum (points, variables).
+    """Return a message from `without_values` with values: of a scan or lines [y, x], of a spectrum (points, variables).
 
     Raises:
         WireError: the bytes are no message.
@@ -58,7 +59,11 @@ def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes
 
 
 def with_nan(head: bytes) -> bytes:
-    """Return a spectrum that `without_values` made, with NaN for its values. Raises WireError: it is none."""
+    """Return a spectrum from `without_values` with NaN as values.
+
+    Raises:
+        WireError: the bytes are no spectrum.
+    """
     import numpy as np
 
     data = parse(spectroscopy_pb2.Spec1d, head).data
@@ -66,14 +71,14 @@ def with_nan(head: bytes) -> bytes:
 
 
 def encode_place(place: Region | ProbePosition) -> bytes:
-    """Return a place as the part of a message that says it: a SpatialAspects, or a ProbePosition."""
+    """Return a place as the part of a message that holds it: a SpatialAspects, or a ProbePosition."""
     if isinstance(place, Region):
         return convert.spatial_to_wire(place).SerializeToString()
     return convert.position_to_wire(place).SerializeToString()
 
 
 def place_in(name: str, payload: Buffer) -> bytes:
-    """Return the place in a ScanParameters2d or a ProbePosition, to the last bit and in its own unit.
+    """Return the place in a ScanParameters2d or a ProbePosition, bit by bit and in its own unit.
 
     Raises:
         WireError: the bytes are no such message.
@@ -84,7 +89,7 @@ def place_in(name: str, payload: Buffer) -> bytes:
 
 
 def relocated(name: str, payload: Buffer, place: bytes) -> bytes:
-    """Return a Scan2d, ScanLines, ScanParameters2d, Spec1d or ProbePosition with another place, else as it was.
+    """Return a Scan2d, ScanLines, ScanParameters2d, Spec1d or ProbePosition at another place, otherwise unchanged.
 
     Raises:
         WireError: the bytes are no such message, or messages of this name have no place.
@@ -99,5 +104,6 @@ def relocated(name: str, payload: Buffer, place: bytes) -> bytes:
     part = part_of(message)
     part.Clear()
     part.ParseFromString(place)
+    # a place of default values alone has no bytes, but must be present
     part.SetInParent()
     return b"".join((message.SerializeToString(), *(packed_chunks(values, values_field) if values else [])))

@@ -138,7 +138,9 @@ def test_a_missing_library_is_told_with_the_extra_that_brings_it(monkeypatch: py
     monkeypatch.setattr(metadata, "version", version)
     with pytest.raises(ConfigError) as refused:
         estimator("sift")
-    assert str(refused.value) == 'Sift needs what is not installed: scikit-image (pip install "afspm[features]")'
+    assert (
+        str(refused.value) == 'Sift needs packages that are not installed: scikit-image (pip install "afspm[features]")'
+    )
 
 
 def test_how_sure_the_default_must_be_may_be_given_as_in_the_experiment_file() -> None:

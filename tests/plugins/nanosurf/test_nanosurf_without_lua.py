@@ -20,6 +20,6 @@ def test_what_is_missing_is_told_with_the_command_that_installs_it(monkeypatch: 
 
     NanosurfEmulator().check()
     monkeypatch.setattr(metadata, "version", found)
-    with pytest.raises(ConfigError, match="NanosurfEmulator needs what is not installed: lupa") as refused:
+    with pytest.raises(ConfigError, match="NanosurfEmulator needs packages that are not installed: lupa") as refused:
         NanosurfEmulator().check()
     assert refused.value.hint == 'pip install "afspm[nanosurf]"'

@@ -142,7 +142,7 @@ def test_what_is_not_installed_is_found_before_anything_starts(installed: Instal
     }
     for arguments, remedy in says.items():
         output = installed.run("afspm", *arguments, cwd=folder, code=1)
-        assert "needs what is not installed" in output
+        assert "needs packages that are not installed" in output
         assert remedy in output
         assert "Traceback" not in output
     assert not (folder / "runs").exists()

@@ -20,7 +20,7 @@ HOST = [sys.executable, "-m", "afspm.supervisor.host"]
 
 
 class Child:
-    """A process under test: its lines, as they come, and its end."""
+    """A process under test: its lines as they come, and its end."""
 
     def __init__(self, command: Sequence[str], first_line: str | None) -> None:
         self.popen = subprocess.Popen(
@@ -42,14 +42,14 @@ class Child:
             self.tell(first_line)
 
     def tell(self, line: str) -> None:
-        """A line on its standard input, which one that has ended already does not hear."""
+        """Send a line to its standard input; ignored if the process has ended."""
         assert self.popen.stdin is not None
         with contextlib.suppress(BrokenPipeError):
             self.popen.stdin.write(line.encode() + b"\n")
             self.popen.stdin.flush()
 
     def expect(self, text: str) -> str:
-        """The next line on its standard output, which has to begin with `text`."""
+        """Return the next line of its standard output, which must begin with `text`."""
         try:
             line = self.lines.get(timeout=PATIENCE_S)
         except Empty:
@@ -98,9 +98,9 @@ Start = Callable[..., Child]
 
 @pytest.fixture
 def start() -> Iterator[Start]:
-    """Starts a command with a first line on its standard input; ends all that is left after the test.
+    """Start a command with a first line on its standard input; end all remaining processes after the test.
 
-    None for the line: it is told later.
+    None: the line is sent later.
     """
     children: list[Child] = []
 
@@ -115,11 +115,11 @@ def start() -> Iterator[Start]:
 
 @pytest.fixture
 def host(start: Start) -> Callable[[Launch], Child]:
-    """Starts a process in our host."""
+    """Start a process in afspm's host."""
     return lambda launch: start(HOST, launch.to_json())
 
 
 @pytest.fixture
 def waiting_host(start: Start) -> Child:
-    """One that is not told yet what it hosts: on a busy computer it takes long to start a process."""
+    """Start a host without its launch line: on a busy computer the start of a process takes long."""
     return start(HOST, None)

@@ -11,13 +11,13 @@ from afspm.model import Region, Scan
 
 
 def say(*words: object) -> None:
-    """To the test, which reads our standard output."""
+    """Write to the test, which reads standard output."""
     sys.stdout.write(" ".join(map(str, words)) + "\n")
     sys.stdout.flush()
 
 
 class Diary(Component):
-    """Says on standard output what happens to it."""
+    """A component that writes its calls to standard output."""
 
     def on_start(self) -> None:
         say("start")
@@ -32,7 +32,7 @@ class NeedsThreshold(Component):
 
 
 class Stuck(Component):
-    """Computes for ever, and lets nobody interrupt it."""
+    """A component that computes for ever and ignores interrupts."""
 
     longest_step_s = 12.5
 
@@ -43,7 +43,7 @@ class Stuck(Component):
 
 
 class SlowToMake(Component):
-    """Loads the weights of a network, say."""
+    """A component whose constructor takes long, as for loading the weights of a network."""
 
     def __init__(self) -> None:
         say("made")
@@ -51,7 +51,7 @@ class SlowToMake(Component):
 
 
 class Hanging(Stuck):
-    """Computes for longer than it says that it may."""
+    """A component that computes for longer than its limit."""
 
     longest_step_s = 0.2
 
@@ -86,7 +86,7 @@ class EndsEverything(Component):
 
 
 class Peaks(Component):
-    """Publishes a message of the user's own."""
+    """A component that publishes a user's message."""
 
     def run(self) -> None:
         from afspm import wire
@@ -97,7 +97,7 @@ class Peaks(Component):
 
 
 class Survey(Component):
-    """Takes three scans, each once."""
+    """A component that takes three scans, each once."""
 
     def __init__(self, folder: str) -> None:
         self.folder = Path(folder)

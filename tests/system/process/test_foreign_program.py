@@ -24,7 +24,7 @@ def python(code: str) -> list[str]:
 
 
 @pytest.mark.parametrize("separator", [[], ["--"]])
-def test_the_line_is_passed_on_and_the_end_too(start: Any, separator: list[str]) -> None:
+def test_foreign_program_gets_launch_line_and_end_of_input(start: Any, separator: list[str]) -> None:
     child = start([*GUARD, *separator, *python(ECHO)], '{"name": "x"}')
     child.expect('{"name": "x"}')
     child.let_go()
@@ -32,11 +32,11 @@ def test_the_line_is_passed_on_and_the_end_too(start: Any, separator: list[str])
     assert child.exit_code() == 0
 
 
-def test_the_exit_code_is_passed_on(start: Any) -> None:
+def test_exit_code_of_a_foreign_program_is_passed_on(start: Any) -> None:
     assert start([*GUARD, *python("raise SystemExit(80)")], "{}").exit_code() == ExitCode.ENDED
 
 
-def test_one_that_does_not_listen_is_ended(start: Any) -> None:
+def test_foreign_program_that_ignores_the_end_is_killed(start: Any) -> None:
     child = start([*GUARD, *python(DEAF)], "{}")
     child.expect("deaf")
     child.let_go()
@@ -44,7 +44,7 @@ def test_one_that_does_not_listen_is_ended(start: Any) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
-def test_a_guard_that_is_terminated_takes_its_command_along(start: Any) -> None:
+def test_terminated_guard_ends_its_command(start: Any) -> None:
     child = start([*GUARD, *python(DEAF)], "{}")
     child.expect("deaf")
     child.popen.terminate()
@@ -66,18 +66,18 @@ sys.exit(int(foreign.main(sys.argv[1:])))
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
-def test_a_guard_that_is_terminated_as_its_command_starts_takes_it_along(start: Any) -> None:
+def test_guard_terminated_at_the_start_ends_its_command(start: Any) -> None:
     child = start([*python(TERMINATED_AT_ONCE), *python(DEAF)], "{}")
     assert child.exit_code() == ExitCode.ORPHAN
 
 
-def test_a_crash_is_a_crash(start: Any) -> None:
+def test_crash_of_a_foreign_program_is_reported_as_a_crash(start: Any) -> None:
     child = start([*GUARD, *python("import os; os.abort()")], "{}")
     assert child.exit_code() not in (ExitCode.DONE, ExitCode.ENDED, ExitCode.ORPHAN, ExitCode.CONFIG)
 
 
 @pytest.mark.parametrize("command", [[], ["/no/such/program"]])
-def test_what_can_not_be_started_is_told(start: Any, command: list[str]) -> None:
+def test_program_that_can_not_be_started_is_reported(start: Any, command: list[str]) -> None:
     child = start([*GUARD, *command], "{}")
     assert child.exit_code() == ExitCode.CONFIG
     assert child.error_text.startswith("ERROR ")

@@ -1,4 +1,4 @@
-"""The host, as a process: how it begins, what it says, how it ends."""
+"""The host, as a process: its start, its log, its end."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def part(name: str, **launch: Any) -> Launch:
     return Launch(name.lower(), f"process_parts.{name}", **launch)
 
 
-def test_a_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
+def test_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
     child = host(part("Diary"))
     child.expect("start")
     child.let_go()
@@ -34,7 +34,7 @@ def test_a_component_ends_cleanly_when_its_parent_lets_go(host: Host) -> None:
 
 
 @pytest.mark.parametrize("name", ["Stuck", "Stubborn"])
-def test_one_that_does_not_end_by_itself_is_ended(host: Host, name: str) -> None:
+def test_process_that_does_not_end_by_itself_is_ended(host: Host, name: str) -> None:
     child = host(part(name))
     child.expect("st")
     child.let_go()
@@ -42,7 +42,7 @@ def test_one_that_does_not_end_by_itself_is_ended(host: Host, name: str) -> None
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
-def test_ctrl_c_in_the_terminal_is_for_the_parent_to_decide(host: Host) -> None:
+def test_ctrl_c_in_the_terminal_is_left_to_the_parent(host: Host) -> None:
     child = host(part("Diary"))
     child.expect("start")
     child.popen.send_signal(signal.SIGINT)
@@ -52,7 +52,7 @@ def test_ctrl_c_in_the_terminal_is_for_the_parent_to_decide(host: Host) -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of Unix")
-def test_a_wish_to_terminate_is_followed_cleanly(host: Host) -> None:
+def test_sigterm_ends_a_component_cleanly(host: Host) -> None:
     child = host(part("Diary"))
     child.expect("start")
     child.popen.terminate()
@@ -89,7 +89,7 @@ def test_a_process_may_have_as_many_connections_as_the_system_allows(host: Host)
         (part("Diary", problems={"x": 3}), "can't have the number 3"),
     ],
 )
-def test_settings_that_can_not_work_are_told_and_not_tried_again(host: Host, launch: Launch, said: str) -> None:
+def test_settings_that_can_not_work_are_reported_and_not_tried_again(host: Host, launch: Launch, said: str) -> None:
     child = host(launch)
     assert child.exit_code() == ExitCode.CONFIG
     assert said in child.error_text
@@ -98,13 +98,13 @@ def test_settings_that_can_not_work_are_told_and_not_tried_again(host: Host, lau
 
 
 @pytest.mark.parametrize("line", ["", "{", "5", '{"name": "x", "setings": {}}'])
-def test_a_line_that_is_none_is_told(start: Any, line: str) -> None:
+def test_malformed_launch_line_is_reported(start: Any, line: str) -> None:
     child = start([sys.executable, "-m", "afspm.supervisor.host"], line)
     assert child.exit_code() == ExitCode.CONFIG
     assert child.error_text.startswith("ERROR ")
 
 
-def test_an_error_is_told_with_its_traceback_and_is_worth_a_restart(host: Host) -> None:
+def test_error_is_logged_with_traceback_and_restarted(host: Host) -> None:
     child = host(part("Broken"))
     assert child.exit_code() == ExitCode.CRASHED
     first, *more = child.error_text.splitlines()
@@ -113,7 +113,7 @@ def test_an_error_is_told_with_its_traceback_and_is_worth_a_restart(host: Host) 
     assert all(line.startswith("  ") for line in more)
 
 
-def test_what_keeps_us_alive_is_not_for_the_component_to_read(host: Host) -> None:
+def test_standard_input_is_hidden_from_the_component(host: Host) -> None:
     child = host(part("ReadsStdin"))
     child.expect("read ''")
     assert child.exit_code() == ExitCode.DONE
@@ -128,7 +128,7 @@ def listener() -> Iterator[HeartbeatListener]:
 
 
 def beats_until(listener: HeartbeatListener, enough: Callable[[Heartbeat], bool]) -> list[Heartbeat]:
-    """The beats up to one that is enough."""
+    """Return the heartbeats up to one that is enough."""
     beats: list[Heartbeat] = []
     end_s = CLOCK.monotonic_s() + 20.0
     while CLOCK.monotonic_s() < end_s:
@@ -139,7 +139,7 @@ def beats_until(listener: HeartbeatListener, enough: Callable[[Heartbeat], bool]
     raise AssertionError(f"not in {beats}")
 
 
-def test_beats_tell_busy_from_idle_and_the_end(host: Host, listener: HeartbeatListener) -> None:
+def test_heartbeats_distinguish_busy_idle_and_closing(host: Host, listener: HeartbeatListener) -> None:
     address = listener.listen("diary")[0]
     child = host(part("Diary", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     child.expect("start")
@@ -148,22 +148,20 @@ def test_beats_tell_busy_from_idle_and_the_end(host: Host, listener: HeartbeatLi
     beats_until(listener, lambda beat: beat.closing)
 
 
-def test_a_busy_component_beats_with_the_age_of_its_step_and_how_long_it_may_take(
-    host: Host, listener: HeartbeatListener
-) -> None:
+def test_busy_component_sends_age_and_limit_of_its_step(host: Host, listener: HeartbeatListener) -> None:
     address = listener.listen("stuck")[0]
     host(part("Stuck", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.3 and beat.longest_step_s == 12.5)
 
 
-def test_what_takes_long_to_be_made_is_not_frozen(host: Host, listener: HeartbeatListener) -> None:
-    """The class is not known yet: it can't say how long it takes to import it."""
+def test_slow_constructor_does_not_count_as_frozen(host: Host, listener: HeartbeatListener) -> None:
+    """The limit of the class is unknown before the class is imported."""
     address = listener.listen("slow")[0]
     host(part("SlowToMake", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     beats_until(listener, lambda beat: (beat.step_age_s or 0.0) > 0.1 and beat.longest_step_s == 300.0)
 
 
-def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host, listener: HeartbeatListener) -> None:
+def test_step_that_takes_too_long_is_logged_with_its_line_of_code(host: Host, listener: HeartbeatListener) -> None:
     address = listener.listen("hanging")[0]
     child = host(part("Hanging", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     # not while it is loaded, which may take longer
@@ -175,14 +173,14 @@ def test_a_step_that_takes_too_long_is_told_with_the_line_it_is_at(host: Host, l
     assert "loop.py" not in child.error_text
 
 
-def test_a_crash_is_not_announced_as_an_end_on_purpose(host: Host, listener: HeartbeatListener) -> None:
+def test_crash_sends_no_closing_heartbeat(host: Host, listener: HeartbeatListener) -> None:
     address = listener.listen("broken")[0]
     child = host(part("Broken", beat_period_s=0.05, sockets=Sockets(heartbeat=address)))
     assert child.exit_code() == ExitCode.CRASHED
     assert not any(beat.closing for beat in listener.poll(0.3))
 
 
-def test_messages_of_the_users_own_come_from_a_proto_file(host: Host, tmp_path: Path) -> None:
+def test_users_messages_come_from_a_proto_file(host: Host, tmp_path: Path) -> None:
     pytest.importorskip("grpc_tools")
     proto = tmp_path / "my-peaks.proto"
     proto.write_text('syntax = "proto3";\nmessage PeakList { repeated double heights = 1; }\n')
@@ -191,7 +189,7 @@ def test_messages_of_the_users_own_come_from_a_proto_file(host: Host, tmp_path: 
     assert child.exit_code() == ExitCode.DONE
 
 
-def test_a_proto_file_with_errors_is_told(host: Host, tmp_path: Path) -> None:
+def test_proto_file_with_errors_is_reported(host: Host, tmp_path: Path) -> None:
     pytest.importorskip("grpc_tools")
     proto = tmp_path / "peaks.proto"
     proto.write_text("message {")

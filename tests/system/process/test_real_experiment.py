@@ -24,7 +24,7 @@ pytestmark = pytest.mark.timeout(90)
 
 
 class Experiment:
-    """Scheduler and simulator, each in a process, and the launch lines of whoever joins."""
+    """Scheduler and simulator, each in a process, and the launch lines of processes that join."""
 
     def __init__(self, host: Callable[[Launch], Any], folder: Path) -> None:
         self.folder = folder
@@ -90,7 +90,7 @@ def test_a_script_takes_its_scans(experiment: Experiment) -> None:
 
 
 @pytest.mark.parametrize("victim", ["survey", "scheduler", "translator"])
-def test_killed_in_the_middle_every_scan_is_there_once(experiment: Experiment, victim: str) -> None:
+def test_killed_component_has_every_scan_once(experiment: Experiment, victim: str) -> None:
     survey = experiment.start("survey", "Survey", folder=str(experiment.folder))
     survey.expect("tile 0")
     if victim == "survey":
@@ -119,7 +119,7 @@ def test_the_end_of_the_experiment_ends_every_process(experiment: Experiment) ->
     assert experiment.scheduler.exit_code() == ExitCode.ENDED
 
 
-def test_one_that_comes_as_the_experiment_ends_hears_of_it(experiment: Experiment, waiting_host: Any) -> None:
+def test_component_that_joins_at_the_end_gets_the_signal(experiment: Experiment, waiting_host: Any) -> None:
     ends = experiment.start("ends", "EndsEverything")
     assert ends.exit_code() == ExitCode.ENDED, ends.error_text
     waiting_host.tell(experiment.component_launch("diary", "Diary").to_json())

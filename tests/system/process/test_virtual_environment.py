@@ -30,7 +30,7 @@ def python(tmp_path: Path) -> Path:
     return tmp_path / "env" / ("Scripts/python.exe" if WINDOWS else "bin/python")
 
 
-def test_a_process_that_is_started_is_the_one_that_runs_in_the_same_environment(python: Path, tmp_path: Path) -> None:
+def test_started_process_is_the_running_one_in_the_same_environment(python: Path, tmp_path: Path) -> None:
     (tmp_path / "tells.py").write_text(TELLS, encoding="utf-8")
     path = os.pathsep.join([str(tmp_path), str(Path(afspm.__file__).parents[1])])
     told = subprocess.run(

@@ -306,6 +306,6 @@ def test_our_component_asks_their_scheduler_what_version_1_has(port: ZmqPort, ro
     ]
     for kind, thing in requests:
         assert link.request(kind, thing).ok
-        link.tell(LogLines(()))
+        link.relay(LogLines(()))
     assert not link.request(RELAY_REQUEST, RelayedMessage("Progress", b"")).ok
     assert [frames[0][0] for _, frames in router.asked] == [int(kind) for kind, _ in requests]

@@ -26,7 +26,7 @@ def test_real_time_by_default() -> None:
     assert clock.real_s(5.0) == 5.0
 
 
-def test_a_simulation_begins_where_it_wants_and_passes_faster() -> None:
+def test_simulation_begins_at_any_time_and_passes_faster() -> None:
     clock = ExperimentClock.starting_now(start_s=1_000_000.0, speed=1000.0)
     first = clock.now_ns()
     assert first >= 1_000_000 * 10**9
@@ -49,14 +49,14 @@ def test_nanoseconds_never_go_back() -> None:
 
 
 def told(clock: ExperimentClock) -> dict[str, object]:
-    """As another process is told of it."""
+    """Return the fields that another process gets."""
     plain: dict[str, object] = json.loads(json.dumps(clock.as_dict()))
     return plain
 
 
 @pytest.mark.parametrize("speed", [1.0, 60.0])
 @pytest.mark.parametrize("step_s", [3600.0, -3600.0])
-def test_who_is_started_after_the_wall_clock_was_set_shows_the_same_time(
+def test_process_started_after_the_wall_clock_was_set_shows_the_same_time(
     monkeypatch: pytest.MonkeyPatch, step_s: float, speed: float
 ) -> None:
     wall = time.time
@@ -68,7 +68,7 @@ def test_who_is_started_after_the_wall_clock_was_set_shows_the_same_time(
     assert here.now_s() == pytest.approx(there.now_s(), abs=1.0 * speed)
 
 
-def test_on_another_computer_real_time_is_what_the_wall_there_says(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_computer_uses_its_own_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
     here = told(ExperimentClock.starting_now(start_s=1_000_000.0))
     far = {**here, "monotonic": "of another boot", "wall_at_zero_s": 5.0}
     assert ExperimentClock.from_dict(far).now_s() == pytest.approx(1_000_000.0, abs=60.0)
@@ -76,7 +76,7 @@ def test_on_another_computer_real_time_is_what_the_wall_there_says(monkeypatch: 
     assert ExperimentClock.from_dict(old).now_s() == pytest.approx(1_000_000.0, abs=60.0)
 
 
-def test_it_tells_by_how_much_the_wall_clock_has_gone_another_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_drift_of_the_wall_clock_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     wall = time.time
     clock = ExperimentClock.starting_now()
     assert clock.wall_ahead_s() == pytest.approx(0.0, abs=0.5)
@@ -88,7 +88,7 @@ def waiting(tmp_path: Path, speed: float = 480.0) -> ExperimentClock:
     return ExperimentClock.starting_now(1_000_000.0, speed).waiting_in(tmp_path / "clock")
 
 
-def test_time_goes_no_faster_than_real_time_while_somebody_is_late(tmp_path: Path) -> None:
+def test_time_is_no_faster_than_real_time_while_a_process_is_late(tmp_path: Path) -> None:
     clock = waiting(tmp_path)
     other = ExperimentClock.from_dict(json.loads(json.dumps(clock.as_dict())))  # of another process
     with clock.late():
@@ -103,7 +103,7 @@ def test_time_goes_no_faster_than_real_time_while_somebody_is_late(tmp_path: Pat
     assert other.now_s() - began_s >= 0.05 * 480.0
 
 
-def test_who_dies_late_slows_the_night_for_a_moment_only() -> None:
+def test_process_that_dies_late_slows_the_night_for_a_moment_only() -> None:
     told = (0, 0, 10 * NS_PER_S)
     assert _shown_ns(told, 4 * NS_PER_S, 480.0) == 4 * NS_PER_S
     assert _shown_ns(told, 12 * NS_PER_S, 480.0) == (10 + 2 * 480) * NS_PER_S
@@ -133,7 +133,7 @@ def test_time_never_goes_back_however_many_are_late(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_first", [False, True])
-def test_whoever_is_late_for_longer_is_waited_for_and_no_longer(tmp_path: Path, is_first: bool) -> None:
+def test_process_later_than_the_limit_slows_time_no_longer(tmp_path: Path, is_first: bool) -> None:
     clock = waiting(tmp_path)
     stacks = [ExitStack(), ExitStack()]
     for stack in stacks:
@@ -151,7 +151,7 @@ def test_whoever_is_late_for_longer_is_waited_for_and_no_longer(tmp_path: Path, 
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0])
-def test_real_time_waits_for_nobody_and_needs_no_file(tmp_path: Path, speed: float) -> None:
+def test_real_time_never_waits_and_needs_no_file(tmp_path: Path, speed: float) -> None:
     clock = waiting(tmp_path, speed)
     with clock.late():
         assert list(tmp_path.iterdir()) == []
@@ -168,7 +168,7 @@ def test_a_clock_that_waits_is_refused_on_another_computer_and_its_file_may_be_g
     assert ExperimentClock.from_dict(told).speed == 480.0
 
 
-def test_who_is_killed_while_writing_stops_nobody(tmp_path: Path) -> None:
+def test_process_killed_while_writing_does_not_stop_the_clock(tmp_path: Path) -> None:
     clock = waiting(tmp_path)
     before_ns = clock.now_ns()
     whole = (tmp_path / "clock").read_bytes()
@@ -180,7 +180,7 @@ def test_who_is_killed_while_writing_stops_nobody(tmp_path: Path) -> None:
     assert ExperimentClock.from_dict(clock.as_dict()).now_ns() >= before_ns
 
 
-def test_a_file_that_a_power_cut_has_emptied_stops_nobody(tmp_path: Path) -> None:
+def test_clock_file_emptied_by_a_power_cut_does_not_stop_the_clock(tmp_path: Path) -> None:
     waiting = ExperimentClock.starting_now(speed=10.0).waiting_in(tmp_path / "clock")
     told = waiting.as_dict()
     del waiting  # Windows empties no file that is mapped

@@ -1,4 +1,4 @@
-"""A laboratory's own package joins by being installed."""
+"""A laboratory's own package joins by its installation alone."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def test_a_file_is_read_by_the_reader_of_a_plug_in(site: Path, tmp_path: Path) -
     assert scan.shape == (2, 3)
 
 
-def test_a_suffix_that_nobody_reads_is_told_with_those_of_plug_ins(site: Path, tmp_path: Path) -> None:
+def test_unknown_suffix_is_refused_with_the_known_ones(site: Path, tmp_path: Path) -> None:
     file = tmp_path / "scan.other"
     file.touch()
     with pytest.raises(FileError) as refused:
@@ -117,21 +117,19 @@ def test_a_command_of_a_plug_in_is_run_and_a_broken_one_spoils_nothing(site: Pat
     assert "'example-broken' of the package example-plugin can't be loaded" in broken.stderr
 
 
-def test_a_name_that_nobody_offers_is_none() -> None:
+def test_undeclared_name_is_none() -> None:
     assert entry_points.find("example", entry_points.READERS) is None
     assert entry_points.load(entry_points.READERS, "example") is None
 
 
-def test_a_name_that_two_packages_offer_is_refused(site: Path) -> None:
+def test_name_declared_by_two_packages_is_refused(site: Path) -> None:
     declare(site, "[afspm.readers]\nexample = other_plugin:read\n")
     with pytest.raises(ConfigError, match="several packages: example-plugin, other-plugin"):
         entry_points.load(entry_points.READERS, "example")
 
 
 @pytest.mark.parametrize("group", ["afspm.drivers", "afspm.components"])
-def test_name_of_afspm_that_a_package_declares_too_is_refused_naming_both(
-    group: str, site: Path, tmp_path: Path
-) -> None:
+def test_afspms_name_declared_by_another_package_is_refused_with_both(group: str, site: Path, tmp_path: Path) -> None:
     declare(site, f"[{group}]\nSimulator = other_plugin:Simulator\n")
     file = tmp_path / "experiment.toml"
     file.write_text(EXPERIMENT.replace("ExampleScope", "Simulator"))
@@ -151,7 +149,7 @@ def test_everything_that_afspm_declares_can_be_loaded() -> None:
     assert [one for one in ours if one.problem] == []
 
 
-def test_inventory_says_what_can_not_be_used_and_why(site: Path) -> None:
+def test_inventory_lists_unusable_names_with_reasons(site: Path) -> None:
     declare(site, "[afspm.driver]\nNew = other_plugin:New\n[afspm.commands]\nrun = other_plugin:run\n")
     problems = {one.name: one for one in entry_points.inventory(["run"]) if one.problem}
     assert problems.keys() == {"example-broken", "New", "run"}

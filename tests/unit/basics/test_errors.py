@@ -9,7 +9,7 @@ import pytest
 
 from afspm import Region
 from afspm.basics.errors import AfspmError, Interrupted, InvalidValue
-from afspm.client.interrupts import Interrupts
+from afspm.client.experiment_link import Interrupts
 from afspm.model import Scan, ScanSet
 
 CELL = "def frame(height):\n    return Region((0, 0), (1e-6, height))\n\nframe(0)\n"
@@ -22,7 +22,7 @@ class InterruptedPort:
 
 
 def shown(name: str) -> list[str]:
-    """What IPython shows of the error of a cell; IPython keeps the lines of cells so that they can be quoted."""
+    """Return the lines that IPython shows for the error of a cell, whose lines it keeps to quote them."""
     linecache.cache[name] = (len(CELL), None, CELL.splitlines(keepends=True), name)
     with pytest.raises(AfspmError) as caught:
         exec(compile(CELL, name, "exec"), {"Region": Region})
@@ -41,7 +41,7 @@ def test_a_notebook_shows_the_error_and_the_lines_of_the_cell_alone(name: str) -
     assert not any("geometry.py" in line for line in rest)
 
 
-def test_what_is_not_there_is_missed_as_python_does_and_told_in_a_sentence() -> None:
+def test_missing_item_is_a_key_error_with_a_readable_message() -> None:
     scans = ScanSet([Scan(Region((0, 0), (1, 1)), "Height", "m", np.zeros((2, 2)))])
     assert scans.get("Z") is None
     assert "Z" not in scans

@@ -1,4 +1,4 @@
-"""Durations, lengths and times in words: the same wherever they are told."""
+"""Durations, lengths and times as text."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ HOUR_NS = 3600 * NS_PER_S
         (3 * 86400, "3 d 0 h"),
     ],
 )
-def test_durations_are_told_as_exactly_as_it_matters(seconds: float, told: str) -> None:
+def test_durations_have_digits_that_suit_their_size(seconds: float, told: str) -> None:
     assert formatting.duration_text(seconds) == told
 
 
@@ -67,7 +67,7 @@ def test_times_are_those_of_the_zone_that_is_given_and_utc_is_named() -> None:
     assert formatting.day_and_time(EVENING) == f"{here:%Y-%m-%d %H:%M:%S}"
 
 
-def test_the_day_of_an_end_is_told_where_it_is_another() -> None:
+def test_period_shows_the_day_of_its_end_if_it_differs() -> None:
     assert formatting.period_text(EVENING, EVENING + HOUR_NS, UTC) == "2026-11-20 22:04 to 23:04 UTC"
     assert formatting.period_text(EVENING, EVENING + 3 * HOUR_NS, UTC) == "2026-11-20 22:04 to 2026-11-21 01:04 UTC"
 

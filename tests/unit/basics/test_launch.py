@@ -1,4 +1,4 @@
-"""The line that a process is started with."""
+"""The launch line of a process."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def test_a_launch_comes_back_as_it_was() -> None:
     assert "\n" not in FULL.to_json()
 
 
-def test_what_is_not_given_has_its_default() -> None:
+def test_missing_entries_have_their_defaults() -> None:
     assert Launch.from_json('{"name": "x"}') == Launch("x")
 
 
 @given(st.text(max_size=50))
-def test_text_that_is_no_launch_line_is_told_as_such(text: str) -> None:
+def test_text_without_a_launch_line_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         Launch.from_json(text)
 
@@ -50,15 +50,15 @@ def test_text_that_is_no_launch_line_is_told_as_such(text: str) -> None:
         ("class", 5), ("problems", None), ("name", ""),
     ],
 )  # fmt: skip
-def test_what_can_not_be_is_refused_by_name(entry: str, value: object) -> None:
+def test_invalid_entry_is_refused_by_name(entry: str, value: object) -> None:
     with pytest.raises(ConfigError, match=entry.rstrip("s")):
         Launch.from_json(json.dumps({"name": "x", entry: value}))
 
 
-def test_a_typo_is_told_with_the_nearest_name() -> None:
+def test_misspelt_entry_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(ConfigError, match="did you mean 'settings'"):
         Launch.from_json('{"name": "x", "setings": {}}')
 
 
-def test_after_all_exits_on_purpose_and_no_others_a_process_is_not_started_again() -> None:
+def test_only_exits_on_purpose_prevent_a_restart() -> None:
     assert set(ChildPolicy().final_codes) == set(ExitCode) - {ExitCode.CRASHED, ExitCode.OWN_FAULT, ExitCode.ORPHAN}

@@ -44,23 +44,26 @@ def _packages(monkeypatch: pytest.MonkeyPatch) -> None:
         (("numpy", "torch", "jax"), "torch, jax", 'pip install "torch" "jax"'),
     ],
 )
-def test_what_is_missing_is_named_with_the_command_that_installs_it(
+def test_missing_packages_are_named_with_the_install_command(
     requires: object, packages: str, command: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Needy, "requires", requires)
     with pytest.raises(ConfigError) as refused:
         require(Needy)
-    assert (refused.value.what, refused.value.hint) == (f"Needy needs what is not installed: {packages}", command)
+    assert (refused.value.what, refused.value.hint) == (
+        f"Needy needs packages that are not installed: {packages}",
+        command,
+    )
 
 
 @pytest.mark.parametrize("requires", [(), ("numpy>=1.26",), ("afspm",)])
-def test_what_is_installed_is_not_refused(requires: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_installed_packages_are_accepted(requires: object, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Needy, "requires", requires)
     require(Needy)
     require(None)
 
 
-def test_what_is_no_package_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_requirement_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Needy, "requires", ("two words",))
     with pytest.raises(ConfigError, match="'two words' is not a requirement"):
         require(Needy)

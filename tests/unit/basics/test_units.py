@@ -45,13 +45,13 @@ def test_other_units_are_known_as_well() -> None:
 
 
 @pytest.mark.parametrize("text", ["5 flurb", "nm", "", "5 V", "five nm", "5 nm nm", "1e400000 x", True])
-def test_what_is_no_length_is_refused(text: str) -> None:
+def test_quantity_that_is_no_length_is_refused(text: str) -> None:
     with pytest.raises(UnitError):
         si(text, "m")
 
 
 @pytest.mark.parametrize(("text", "unit"), [("20 degC", "K"), ("0 °C", "K"), ("68 degF", "K"), ("3 dB", "")])
-def test_what_does_not_count_from_zero_is_refused_and_not_multiplied(text: str, unit: str) -> None:
+def test_unit_with_an_offset_is_refused(text: str, unit: str) -> None:
     with pytest.raises(UnitError, match="does not count from zero"):
         si(text, unit)
 
@@ -73,11 +73,11 @@ def test_arrays_are_converted_as_a_whole() -> None:
 
 
 @given(st.floats(-1e6, 1e6), st.sampled_from(["nm", "um", "pm", "mm", "Å"]))
-def test_there_and_back_is_the_same(value: float, unit: str) -> None:
+def test_conversion_there_and_back_is_exact(value: float, unit: str) -> None:
     assert convert(convert(value, unit, "m"), "m", unit) == pytest.approx(value, rel=1e-15)
 
 
-def test_kinds() -> None:
+def test_units_of_one_kind_are_recognised() -> None:
     assert same_kind("nm", "inch")
     assert not same_kind("nm", "V")
     assert not same_kind("nm", "flurb")
@@ -85,7 +85,7 @@ def test_kinds() -> None:
 
 
 @pytest.mark.parametrize("text", ["1,5 um", "10,000"])
-def test_a_decimal_comma_is_told(text: str) -> None:
+def test_decimal_comma_is_refused(text: str) -> None:
     with pytest.raises(UnitError) as refused:
         parse_quantity(text)
     assert "decimal point" in refused.value.what

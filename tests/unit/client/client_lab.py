@@ -1,4 +1,4 @@
-"""A laboratory in memory: one port, a scheduler that decides by the real table, and a microscope, on a fake clock."""
+"""A laboratory in memory: one port, a scheduler with the real decision table, and a microscope, on a fake clock."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ OTHER_REGION = Region((5e-6, 0.0), (1e-6, 1e-6))
 
 
 class FakeClock:
-    """Stands still until it is moved."""
+    """A clock that only the test moves."""
 
     def __init__(self) -> None:
         self.passed_s = 0.0
@@ -81,11 +81,11 @@ class FakeClock:
 
 
 class Nothing(AssertionError):
-    """The component waits for something that will never come."""
+    """The component waits for an event that will never come."""
 
 
 class Lab:
-    """What happens is kept in the order of time; `poll` moves the clock to the next of it."""
+    """A laboratory whose events are in the order of time; `poll` moves the clock to the next event."""
 
     def __init__(self, name: str = "experiment") -> None:
         self.name = name
@@ -166,14 +166,14 @@ class Lab:
         return packet
 
     def answer_now(self, response: Response) -> None:
-        """What `intercept` left without an answer."""
+        """Send an answer that `intercept` withheld."""
         self._inbox.append(ReplyReceived(response))
 
     def connect(self) -> None:
         self._inbox.append(ControlConnected())
 
     def ctrl_c(self) -> None:
-        """The user interrupts, which ends the `poll` under way."""
+        """Interrupt as the user does, which ends the present `poll`."""
         self._is_woken = True
         signal.raise_signal(signal.SIGINT)
 
@@ -187,7 +187,7 @@ class Lab:
         self._inbox.append(ParentGone())
 
     def does(self, event: a.ArbitrationEvent, who: str, number: int = 0) -> Response:
-        """Somebody asks the scheduler."""
+        """Send a request of another component to the scheduler."""
         ask = a.ControlInput(event, who, number)
         rules = a.Rules(problems=PROBLEMS)
         row = a.row_for(self.control, ask, rules)
@@ -217,11 +217,11 @@ class Lab:
             self._go(ScopeState.FREE)
 
     def restart_translator(self) -> None:
-        """What was running is gone without a word."""
+        """Drop the running measurement without a state."""
         self._go(ScopeState.FREE)
 
     def begin_unheard(self, region: Region, in_s: float, asked: str = "start-scan") -> None:
-        """The translator dies as soon as it has begun a scan of `region`, and is back with it `in_s` later."""
+        """Kill the translator at the start of a scan of `region`, and restart it with the scan `in_s` later."""
         back_s = self.clock.passed_s + in_s
 
         def dies(request: Request) -> Response | str:
@@ -245,19 +245,19 @@ class Lab:
             self.publish(Scan(region, channel, "m", np.zeros(shape), self.clock.now_ns()))
 
     def replay(self) -> list[Incoming]:
-        """What a component that is started now is sent."""
+        """Return the packets for a component that starts now."""
         packets = sorted(self.cached.values(), key=lambda packet: packet.time_ns or 0)
         return [ControlConnected(), *(PacketReceived(p, SOURCE) for p in packets), CaughtUp(SOURCE)]
 
     def restart_component(self) -> None:
-        """The component was killed: what it had not taken in is lost to it, the cache is sent again."""
+        """Kill the component: its unread packets are lost, and the cache is sent again."""
         self._inbox = self.replay()
 
     def count(self, kind: ControlRequest) -> int:
         return sum(request.kind == kind for request in self.requests)
 
     def told(self, message: str) -> list[RelayedMessage]:
-        """What was to be published, of one kind."""
+        """Return the relayed messages of one kind."""
         relayed = [request.subject for request in self.requests if request.kind == RELAY_REQUEST]
         return [one for one in relayed if one.message == message]
 
@@ -350,17 +350,17 @@ class Lab:
 
 
 class Kill9(BaseException):
-    """The component is gone, in the middle of whatever it did."""
+    """The component is killed in the middle of its work."""
 
 
 class LabPort:
     """The port of the laboratory for one life of a component.
 
-    Killed at a call to the network, or from outside; then nothing it does on its way reaches anybody any more.
+    After a kill, at a call to the network or from outside, nothing that it sends arrives.
 
     Args:
-        deadly_call: the number of the call that it does not survive.
-        is_late: whether that call has done its work.
+        deadly_call: number of the call that kills it.
+        is_late: whether this call still does its work.
     """
 
     def __init__(self, lab: Lab, deadly_call: int = 0, *, is_late: bool = False) -> None:
@@ -402,7 +402,7 @@ class LabPort:
 
 
 def context_of(lab: Lab, state_dir: Path | None = None, **launch: Any) -> ProcessContext:
-    """What the host would give to a component in this laboratory."""
+    """Return the host's context for a component in this laboratory."""
     return ProcessContext(
         Launch(lab.name, sockets=Sockets(subscribe=(SOURCE,)), state_dir=str(state_dir or ""), **launch),
         lab.clock,

@@ -1,4 +1,4 @@
-"""Somebody else, at the panel or by another program, moves the frame: what is measured then is not taken for ours."""
+"""Another person or program moves the frame: its scan is not taken for the requested one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.client.scope import Scope
 from afspm.model import ControlRequest
 
 
-def test_a_frame_of_somebody_else_is_not_taken_for_what_ours_was_rounded_to(lab: Lab, scope: Scope) -> None:
+def test_another_frame_is_not_taken_for_a_rounded_own_one(lab: Lab, scope: Scope) -> None:
     publish = lab._move
     lab._move = lambda thing: publish(model.ScanParameters(OTHER_REGION, (8, 8)))  # type: ignore[method-assign]
     scope.scan(REGION)
@@ -29,7 +29,7 @@ def test_a_frame_of_somebody_else_is_not_taken_for_what_ours_was_rounded_to(lab:
         (model.ScanParameters(REGION, (4, 4)), r"1 x 1 µm at \(0, 0\) nm, 4 x 4 pixels"),
     ],
 )
-def test_a_scan_of_another_frame_is_not_ours_and_is_said_and_taken_again(
+def test_scan_of_another_frame_is_reported_and_taken_again(
     lab: Lab, scope: Scope, frame: model.ScanParameters, told: str
 ) -> None:
     def at_the_panel() -> None:
@@ -48,14 +48,12 @@ def test_a_frame_that_is_never_scanned_is_given_up(lab: Lab, scope: Scope) -> No
         lab.publish_scan(OTHER_REGION)
 
     lab._finish_scan = elsewhere  # type: ignore[method-assign]
-    with pytest.raises(NoResponse, match="failed 5 times: not what was asked for"):
+    with pytest.raises(NoResponse, match="failed 5 times: another measurement was taken"):
         scope.scan(REGION, shape=(8, 8))
 
 
 @pytest.mark.parametrize(("off", "scale", "scans"), [(0.4, 1.03, 1), (0.8, 1.0, 2), (0.0, 2.0, 2)])
-def test_where_drift_is_corrected_a_scan_lies_where_it_turned_out_to_be(
-    lab: Lab, off: float, scale: float, scans: int
-) -> None:
+def test_drift_corrected_scan_has_its_measured_position(lab: Lab, off: float, scale: float, scans: int) -> None:
     scope = Scope(ExperimentLink(LabPort(lab), lab.name, source=SOURCE), frame=model.Frame.SAMPLE)
     wrong = model.Region((off * 1e-6, 0.0), (scale * 1e-6, scale * 1e-6), frame=model.Frame.SAMPLE)
 

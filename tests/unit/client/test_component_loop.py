@@ -1,4 +1,4 @@
-"""The component's loop: which handler gets what, in which order, and how it ends."""
+"""The component's loop: handlers, their order, and the end."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Sharpness(Component):
 
 
 class Diary(Component):
-    """Writes everything down."""
+    """A component that writes every call down."""
 
     def __init__(self) -> None:
         self.lines: list[Any] = []
@@ -64,7 +64,7 @@ class Diary(Component):
         self.lines.append("end")
 
 
-def test_ten_lines_take_part_in_an_experiment() -> None:
+def test_component_of_ten_lines_takes_part_in_an_experiment() -> None:
     lab = Lab("sharpness")
     lab.at(10.0, lambda: lab.publish_scan(REGION))
     lab.at(20.0, lab.kill)
@@ -74,7 +74,7 @@ def test_ten_lines_take_part_in_an_experiment() -> None:
     assert TIP in lab.control.problems
 
 
-def test_handlers_are_called_in_the_order_of_what_happened() -> None:
+def test_handlers_are_called_in_the_order_of_events() -> None:
     lab = Lab()
     lab.at(1.0, lambda: lab.publish(ScopeStatus(ScopeState.SCANNING)))
     lab.at(2.0, lambda: lab.flag(TIP))
@@ -88,7 +88,7 @@ def test_handlers_are_called_in_the_order_of_what_happened() -> None:
     ]  # fmt: skip
 
 
-def test_a_problem_flagged_before_the_start_is_told_at_the_start() -> None:
+def test_problem_flagged_before_the_start_is_handled_at_the_start() -> None:
     lab = Lab()
     lab.flag(TIP)
     lab.at(1.0, lab.kill)
@@ -106,7 +106,7 @@ def test_a_problem_of_the_experiment_file_comes_by_its_name() -> None:
     assert ("water-film", True) in diary.lines
 
 
-def test_what_arrives_while_a_handler_blocks_is_handled_afterwards_in_order() -> None:
+def test_packets_during_a_handler_are_handled_afterwards_in_order() -> None:
     class Busy(Component):
         def __init__(self) -> None:
             self.seen: list[Any] = []
@@ -169,7 +169,7 @@ def test_only_the_envelopes_subscribed_to_are_handled() -> None:
     assert component.seen == ["B"]
 
 
-def test_what_can_not_be_read_is_dropped_and_told(caplog: pytest.LogCaptureFixture) -> None:
+def test_unreadable_packet_is_dropped_and_logged(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab()
 
     def publish_rubbish() -> None:
@@ -207,7 +207,7 @@ def test_ticks_keep_the_beat_of_the_experiment() -> None:
     assert beat.times_s == [0, 900, 3600, 4500]
 
 
-def test_a_period_that_is_none_is_refused() -> None:
+def test_period_of_zero_is_refused() -> None:
     component = Diary()
     component.period_s = 0.0
     with pytest.raises(ConfigError, match="period"):
@@ -242,7 +242,7 @@ def test_a_script_that_ends_the_experiment_has_ended() -> None:
     assert run(Script(), Lab()) in (ExitCode.ENDED, ExitCode.DONE)
 
 
-def test_who_asks_for_control_before_it_has_heard_of_the_end_has_ended_too() -> None:
+def test_request_for_control_after_the_end_ends_the_component() -> None:
     """The answer may come before the signal."""
 
     class Script(Component):
@@ -300,7 +300,7 @@ def test_the_end_comes_while_a_handler_waits(who: str) -> None:
     assert lab.clock.passed_s == pytest.approx(5.0)
 
 
-def test_an_error_in_a_handler_is_the_end_of_the_process() -> None:
+def test_error_in_a_handler_ends_the_process() -> None:
     class Faulty(Diary):
         def on_state(self, status: ScopeStatus) -> None:
             raise ZeroDivisionError
@@ -313,7 +313,7 @@ def test_an_error_in_a_handler_is_the_end_of_the_process() -> None:
     assert not lab.open
 
 
-def test_an_error_at_the_end_does_not_hide_why_it_ended(caplog: pytest.LogCaptureFixture) -> None:
+def test_error_in_on_end_does_not_hide_why_the_process_ended(caplog: pytest.LogCaptureFixture) -> None:
     class Faulty(Component):
         def on_end(self) -> None:
             raise ZeroDivisionError
@@ -324,7 +324,7 @@ def test_an_error_at_the_end_does_not_hide_why_it_ended(caplog: pytest.LogCaptur
     assert "on_end failed" in caplog.text
 
 
-def test_asking_for_something_at_the_end_does_no_harm() -> None:
+def test_request_in_on_end_does_no_harm() -> None:
     class Asks(Component):
         def on_end(self) -> None:
             self.scope.flag(TIP)
@@ -334,7 +334,7 @@ def test_asking_for_something_at_the_end_does_no_harm() -> None:
     assert run(Asks(), lab) == ExitCode.ENDED
 
 
-def test_what_is_given_by_the_runtime_is_missed_in_words_in_the_constructor() -> None:
+def test_attribute_used_too_early_is_refused_with_a_reason() -> None:
     class Early(Component):
         def __init__(self) -> None:
             self.scope.flag(TIP)
@@ -346,7 +346,7 @@ def test_what_is_given_by_the_runtime_is_missed_in_words_in_the_constructor() ->
 
 
 class Counts(Component):
-    """Counts scans, and fails at those of one channel."""
+    """A component that counts scans, and fails on those of one channel."""
 
     def on_scan(self, scan: Scan) -> None:
         self.memory.setdefault("seen", []).append(scan.channel)
@@ -354,7 +354,7 @@ class Counts(Component):
             raise ValueError("I can't read that")
 
 
-def test_what_a_handler_remembers_is_kept_when_it_returns_and_not_when_it_fails(tmp_path: Path) -> None:
+def test_memory_is_saved_when_a_handler_returns_and_not_when_it_fails(tmp_path: Path) -> None:
     lab = Lab("counts")
     lab.at(10.0, lambda: lab.publish_scan(REGION))
     with pytest.raises(ValueError, match="read that"):
@@ -362,7 +362,7 @@ def test_what_a_handler_remembers_is_kept_when_it_returns_and_not_when_it_fails(
     assert json.loads((tmp_path / "counts.json").read_text()) == {"seen": ["Height"]}
 
 
-def test_a_script_says_itself_when_it_has_remembered_all(tmp_path: Path) -> None:
+def test_script_saves_its_memory_itself(tmp_path: Path) -> None:
     class Script(Counts):
         def on_scan(self, scan: Scan) -> None:
             self.memory["half"] = True
@@ -374,7 +374,7 @@ def test_a_script_says_itself_when_it_has_remembered_all(tmp_path: Path) -> None
     assert not (tmp_path / "script.json").exists()
 
 
-def test_everything_promised_is_there_at_the_start(tmp_path: Path) -> None:
+def test_all_documented_attributes_exist_at_the_start(tmp_path: Path) -> None:
     class Looks(Component):
         def on_start(self) -> None:
             self.found = {name: getattr(self, name) for name in Component.__annotations__ if name in PROMISED}
@@ -393,7 +393,7 @@ def test_everything_promised_is_there_at_the_start(tmp_path: Path) -> None:
 PROMISED = {"scope", "clock", "log", "name", "memory", "run_dir"}
 
 
-def test_publishing_goes_out_under_the_name_of_the_message_or_an_envelope_that_begins_with_it() -> None:
+def test_published_envelope_begins_with_the_message_name() -> None:
     class Publishes(Component):
         def on_start(self) -> None:
             self.publish(FeedbackAnalysis(proportionOverThreshold=0.5))
@@ -410,7 +410,7 @@ def test_publishing_goes_out_under_the_name_of_the_message_or_an_envelope_that_b
     assert wire.decode("FeedbackAnalysis", lab.published[0][1]).proportionOverThreshold == 0.5
 
 
-def test_packets_of_other_publishers_are_handled_and_are_no_state_of_the_microscope() -> None:
+def test_packets_of_other_publishers_are_handled_but_do_not_set_the_state() -> None:
     from afspm.transport.port import PacketReceived
 
     lab = Lab()
@@ -442,7 +442,7 @@ def test_control_of_an_earlier_life_is_given_back_when_it_is_not_needed() -> Non
     assert lab.control.holder is None
 
 
-def test_busy_and_waiting_are_told_apart() -> None:
+def test_busy_and_waiting_are_distinguished() -> None:
     ages: list[float] = []
 
     class Works(Component):
@@ -464,7 +464,7 @@ def test_busy_and_waiting_are_told_apart() -> None:
     assert context.activity.age_s() == 0.0
 
 
-def test_refused_in_a_script_that_does_not_expect_it_is_a_crash() -> None:
+def test_unexpected_refusal_in_a_script_is_a_crash() -> None:
     class Script(Component):
         def run(self) -> None:
             self.scope.action("x-crash")
@@ -489,7 +489,7 @@ def _zeros() -> Any:
 
 
 @pytest.mark.parametrize("who", ["kill", "parent"])
-def test_what_was_measured_before_the_end_is_handled(who: str) -> None:
+def test_measurements_before_the_end_are_handled(who: str) -> None:
     class Table(Component):
         def __init__(self) -> None:
             self.rows: list[str] = []
@@ -523,12 +523,12 @@ class Fails(Component):
 
 
 def fault_of(component: Component, folder: Path, lab: Lab | None = None) -> OwnFault | None:
-    """What its supervisor is told of its end."""
+    """Return the fault that the component reports to its supervisor."""
     assert run(component, lab or Lab(), folder) == ExitCode.OWN_FAULT
     return take_fault(folder, "experiment")
 
 
-def test_a_script_that_fails_tells_of_the_place_and_of_what_it_keeps(tmp_path: Path) -> None:
+def test_failed_script_reports_its_place_and_its_kept_data(tmp_path: Path) -> None:
     first = fault_of(Fails(ValueError("0.1 nm is too rough")), tmp_path)
     assert first is not None
     assert (first.error, first.place.partition(":")[0]) == ("ValueError", "test_component_loop.py")
@@ -537,7 +537,7 @@ def test_a_script_that_fails_tells_of_the_place_and_of_what_it_keeps(tmp_path: P
     assert fault_of(Fails(ValueError(), key="tile"), tmp_path) != first
 
 
-def test_what_is_refused_by_a_limit_is_a_fault_of_the_script(tmp_path: Path) -> None:
+def test_refusal_by_a_limit_is_a_fault_of_the_script(tmp_path: Path) -> None:
     lab = Lab()
     limit = Response(ControlResponse.PARAM_ERROR, reason="outside the limits")
     lab.intercept = lambda request: limit if request.kind == ControlRequest.SET_SCAN_PARAMS else "go on"
@@ -549,13 +549,13 @@ def test_what_is_refused_by_a_limit_is_a_fault_of_the_script(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "error", [NoResponse("it is silent"), Refused(ControlResponse.FAILURE, "busy"), OSError("no file"), MemoryError()]
 )
-def test_an_error_that_may_pass_is_no_fault(tmp_path: Path, error: Exception) -> None:
+def test_error_that_may_pass_is_not_a_fault(tmp_path: Path, error: Exception) -> None:
     with pytest.raises(type(error)):
         run(Fails(error), Lab(), tmp_path)
 
 
 class Reacts(Component):
-    """Fails over each scan of one channel, having done what it was told to before."""
+    """A component that fails on scans of one channel, after an action of its test."""
 
     def __init__(self, *does: str) -> None:
         self.does = does

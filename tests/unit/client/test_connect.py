@@ -1,4 +1,4 @@
-"""Joining a run: which one is meant, and what is left behind where it fails."""
+"""Joining a run: the choice of the run, and the clean-up after a failure."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PUBLISHER = "tcp://127.0.0.1:1"
 
 
 class Port:
-    """Brings the same each time, or is interrupted."""
+    """A port that brings the same events each time, or is interrupted."""
 
     def __init__(self, *brings: Incoming) -> None:
         self.clock: Clock = ExperimentClock.real()
@@ -66,9 +66,7 @@ def test_an_old_run_that_is_damaged_does_not_hide_the_newest(
     assert find_run(file).name == "night-2"
 
 
-def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_is_found_by_a_file_with_a_byte_order_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     run_folder(tmp_path / "runs", "night-1")
     file = tmp_path / "other.toml"
@@ -76,9 +74,7 @@ def test_a_run_is_found_by_a_file_that_begins_as_editors_of_windows_let_it(
     assert find_run(file).name == "night-1"
 
 
-def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_while_joining_leaves_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port = Port()
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
     with pytest.raises(KeyboardInterrupt):
@@ -86,9 +82,7 @@ def test_who_is_interrupted_while_joining_leaves_no_connection_behind(
     assert port.is_closed
 
 
-def test_who_can_not_read_what_it_kept_leaves_no_connection_behind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unreadable_results_leave_no_connection(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     port, folder = Port(ControlConnected(), CaughtUp(PUBLISHER)), run_folder(tmp_path, "night")
     monkeypatch.setattr(connect, "open_port", lambda launch, clock: port)
     (folder / "state" / "notebook.scope.json").write_text("nonsense", encoding="utf-8")
@@ -100,7 +94,7 @@ def test_who_can_not_read_what_it_kept_leaves_no_connection_behind(
 def test_module_that_a_run_folder_names_is_imported_only_if_the_caller_names_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The folder may come from somebody else, and the module with it."""
+    """The folder, and the module with it, may come from another person."""
     folder = run_folder(tmp_path, "night")
     (tmp_path / "beside_the_run.py").write_text("raise SystemExit('it was run')\n", encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)

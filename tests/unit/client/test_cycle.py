@@ -1,4 +1,4 @@
-"""One scan, followed through what is published."""
+"""One scan, followed through the published packets."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ def follow(cycle: Cycle, happenings: list[ScopeState | str], first_ns: int = 1) 
 
 
 @pytest.mark.parametrize(("name", "happenings", "outcome", "results"), CASES, ids=[case[0] for case in CASES])
-def test_how_it_ends(
+def test_cycle_has_the_outcome_of_its_packets(
     name: str, happenings: list[ScopeState | str], outcome: CycleOutcome | None, results: list[str]
 ) -> None:
     cycle = follow(Cycle(BUSY, lambda result: result != "other", since_ns=0), happenings)
     assert (cycle.outcome, cycle.results) == (outcome, results)
 
 
-def test_what_is_not_newer_belongs_to_something_earlier() -> None:
+def test_packets_that_are_not_newer_belong_to_an_earlier_measurement() -> None:
     cycle = follow(Cycle(BUSY, lambda _: True, since_ns=4), [BUSY, "old", FREE, "old"])
     assert not cycle.begun
     assert follow(cycle, ["new", FREE], first_ns=5).results == ["new"]
 
 
-def test_a_peer_that_tells_no_times_is_believed_only_about_what_we_wait_for() -> None:
+def test_packets_without_times_count_only_while_waiting() -> None:
     for resumed, outcome in ((False, CycleOutcome.COMPLETED), (True, None)):
         cycle = Cycle(BUSY, lambda _: True, since_ns=4, resumed=resumed)
         cycle.on_state(BUSY, None)
@@ -59,7 +59,7 @@ def test_a_peer_that_tells_no_times_is_believed_only_about_what_we_wait_for() ->
         assert cycle.outcome is outcome
 
 
-def test_what_somebody_else_has_measured_while_we_were_dead_is_not_ours() -> None:
+def test_foreign_scan_during_a_restart_does_not_count() -> None:
     cycle = Cycle(BUSY, lambda result: result != "other", since_ns=0, resumed=True)
     follow(cycle, [BUSY, "other", FREE])
     assert cycle.outcome is CycleOutcome.ANOTHER

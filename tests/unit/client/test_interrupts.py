@@ -1,4 +1,4 @@
-"""Ctrl-C while a script or notebook measures: what was begun is stopped, or it is said that it goes on."""
+"""Ctrl-C during a measurement of a script or notebook: the measurement is stopped, or reported as running."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from afspm.model import ControlMode, Request, Response, ScopeState
 
 @pytest.fixture(autouse=True)
 def as_in_a_script() -> Iterator[None]:
-    """Ctrl-C does what it does in a plain Python, also under a runner that ignores it."""
+    """Set the default handler of Ctrl-C, also under a runner that ignores it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     signal.signal(signal.SIGINT, before)
 
 
-def test_a_scan_that_is_interrupted_is_stopped_and_control_given_back(
+def test_interrupted_scan_is_stopped_and_control_released(
     lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab.at(30.0, lab.ctrl_c)
@@ -56,9 +56,7 @@ def test_a_second_ctrl_c_does_not_keep_the_scan_from_being_stopped(lab: Lab, sco
     scope.scan(REGION)
 
 
-def test_a_scan_that_cannot_be_stopped_is_said_to_go_on(
-    lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_scan_that_cannot_be_stopped_is_reported(lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture) -> None:
     lab.intercept = lambda request: "no answer" if request.subject == "stop-scan" else "go on"
     lab.at(30.0, lab.ctrl_c)
     with pytest.raises(KeyboardInterrupt):
@@ -71,7 +69,7 @@ def test_a_scan_that_cannot_be_stopped_is_said_to_go_on(
     assert "waiting until the microscope is free; it is SCANNING" in caplog.messages
 
 
-def test_a_scan_whose_start_was_never_answered_is_stopped(lab: Lab, scope: Scope) -> None:
+def test_scan_with_an_unanswered_start_is_stopped(lab: Lab, scope: Scope) -> None:
     def unanswered(request: Request) -> Response | str:
         if request.subject == "start-scan":
             lab._answer_once(request)
@@ -104,9 +102,7 @@ def test_a_keyed_scan_is_taken_at_the_next_call(lab: Lab, scope: Scope) -> None:
     assert len(lab.finished) == 1
 
 
-def test_an_action_that_is_not_answered_is_said_to_have_been_sent(
-    lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unanswered_action_is_reported_as_sent(lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture) -> None:
     lab.intercept = lambda request: "no answer" if request.subject == "x-pulse" else "go on"
     lab.at(1.0, lab.ctrl_c)
     with pytest.raises(KeyboardInterrupt):

@@ -1,4 +1,4 @@
-"""With a key, a scan is there exactly once, whenever the component is killed."""
+"""A keyed scan is taken exactly once, for a kill of the component at any time."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_script_that_starts_from_the_beginning_gets_the_scans_of_its_earlier_l
     kills_s=st.lists(st.floats(0.0, 2.5 * SCAN_S), min_size=1, max_size=3),
     is_noticed=st.booleans(),
 )
-def test_every_tile_is_scanned_exactly_once_whenever_it_is_killed(kills_s: list[float], *, is_noticed: bool) -> None:
+def test_every_tile_is_scanned_exactly_once_for_a_kill_at_any_time(kills_s: list[float], *, is_noticed: bool) -> None:
     lab = Lab()
     with TemporaryDirectory() as folder:
         scans = survive(lab, Path(folder), kills_s, is_noticed=is_noticed)
@@ -76,7 +76,7 @@ def test_every_tile_is_scanned_exactly_once_whenever_it_is_killed(kills_s: list[
 
 @pytest.mark.parametrize("is_noticed", [True, False])
 @pytest.mark.parametrize("is_late", [True, False])
-def test_every_tile_is_scanned_exactly_once_at_whichever_step_it_is_killed(*, is_late: bool, is_noticed: bool) -> None:
+def test_every_tile_is_scanned_exactly_once_for_a_kill_at_any_step(*, is_late: bool, is_noticed: bool) -> None:
     for deadly_call in range(1, 1000):
         lab = Lab()
         with TemporaryDirectory() as folder:
@@ -94,7 +94,7 @@ def test_every_tile_is_scanned_exactly_once_at_whichever_step_it_is_killed(*, is
     assert deadly_call > 20
 
 
-def test_a_scan_that_went_on_during_the_death_is_taken_up_and_not_asked_for_again(tmp_path: Path) -> None:
+def test_scan_running_over_a_restart_is_taken_up_without_a_request(tmp_path: Path) -> None:
     lab = Lab()
     survive(lab, tmp_path, [50.0], is_noticed=False)
     assert lab.begun_scans == 3
@@ -115,7 +115,7 @@ def test_a_scan_that_was_finished_during_the_death_is_found_in_the_cache(tmp_pat
     assert lab.control.holder is None, "control of the earlier life is given back"
 
 
-def test_what_is_measured_without_a_key_first_does_not_forget_the_scan_with_one(tmp_path: Path) -> None:
+def test_scan_without_a_key_does_not_forget_the_keyed_one(tmp_path: Path) -> None:
     def measure(scope: Scope) -> None:
         scope.spectrum()
         scope.scan(TILES[0], shape=(8, 8), key="tile-0")
@@ -148,7 +148,7 @@ def test_a_scan_that_is_finished_while_a_later_life_waits_for_control_is_taken_u
     assert lab.begun_scans == 1
 
 
-def test_interruptions_of_an_earlier_life_are_said_too(tmp_path: Path) -> None:
+def test_interruptions_of_an_earlier_life_are_reported(tmp_path: Path) -> None:
     lab = Lab()
     lab.at(20.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
     lab.at(60.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
@@ -170,7 +170,7 @@ def test_a_key_must_fit_into_an_id(tmp_path: Path, key: str) -> None:
         scope_of(Lab(), tmp_path, 0).scan(TILES[0], key=key)
 
 
-def test_keys_that_look_alike_on_disk_are_told_apart(tmp_path: Path) -> None:
+def test_similar_keys_have_different_files(tmp_path: Path) -> None:
     scope = scope_of(Lab(), tmp_path, 0)
     a, b = scope.scan(TILES[0], key="Tile 1"), scope.scan(TILES[1], key="tile 1")
     assert (a.region, b.region) == (TILES[0], TILES[1])
@@ -194,7 +194,7 @@ def test_a_spectrum_with_a_key_is_taken_once(tmp_path: Path) -> None:
     assert lab.count(ControlRequest.SET_PROBE_POS) == 1
 
 
-def test_a_scan_that_was_given_up_waiting_for_is_taken_up_by_the_next_call(tmp_path: Path) -> None:
+def test_scan_after_a_timeout_is_taken_up_by_the_next_call(tmp_path: Path) -> None:
     lab = Lab()
     scope = scope_of(lab, tmp_path, 0)
     with pytest.raises(NoResponse):
@@ -203,7 +203,7 @@ def test_a_scan_that_was_given_up_waiting_for_is_taken_up_by_the_next_call(tmp_p
     assert lab.begun_scans == 1
 
 
-def test_after_a_refusal_the_same_key_is_asked_for_with_another_id(tmp_path: Path) -> None:
+def test_refused_key_is_requested_again_with_another_id(tmp_path: Path) -> None:
     lab = Lab()
     scope = scope_of(lab, tmp_path, 0)
     lab.intercept = lambda request: Response(ControlResponse.ACTION_ERROR) if request.subject else "go on"
@@ -216,7 +216,7 @@ def test_after_a_refusal_the_same_key_is_asked_for_with_another_id(tmp_path: Pat
 
 
 def retracted(lab: Lab) -> Callable[[], None]:
-    """The tip is retracted: no scan begins, and ids are remembered with that answer. Returns what engages it again."""
+    """Retract the tip: scans are refused, and the refusals cached. Return the function that engages it again."""
     execute, is_retracted = lab._execute, [True]
 
     def carry_out(request: Request) -> Response:
@@ -228,7 +228,7 @@ def retracted(lab: Lab) -> Callable[[], None]:
     return is_retracted.clear
 
 
-def test_what_was_refused_in_earlier_lives_is_done_once_it_can_be(tmp_path: Path) -> None:
+def test_scan_refused_in_earlier_lives_is_taken_once_possible(tmp_path: Path) -> None:
     lab = Lab()
     engage = retracted(lab)
     for life in range(3):
@@ -241,7 +241,7 @@ def test_what_was_refused_in_earlier_lives_is_done_once_it_can_be(tmp_path: Path
 
 
 @pytest.mark.parametrize("is_late", [True, False])
-def test_what_was_refused_is_done_once_at_whichever_step_it_was_killed(*, is_late: bool) -> None:
+def test_refused_scan_is_taken_once_for_a_kill_at_any_step(*, is_late: bool) -> None:
     for deadly_call in range(1, 1000):
         lab = Lab()
         engage = retracted(lab)
@@ -258,7 +258,7 @@ def test_what_was_refused_is_done_once_at_whichever_step_it_was_killed(*, is_lat
     assert deadly_call > 5
 
 
-def test_what_is_forgotten_is_measured_again_and_takes_no_space(tmp_path: Path) -> None:
+def test_forgotten_key_is_measured_again_and_takes_no_space(tmp_path: Path) -> None:
     lab = Lab()
     scope = scope_of(lab, tmp_path, 0)
     survey(scope)

@@ -1,4 +1,4 @@
-"""What is kept on disk, and what waits in memory."""
+"""The memory on disk, and the backlog of packets."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from afspm.model import Packet
 from afspm.storage.memory import Memory
 
 
-def test_what_is_saved_is_there_after_a_restart(tmp_path: Path) -> None:
+def test_saved_values_survive_a_restart(tmp_path: Path) -> None:
     memory = Memory(tmp_path / "state" / "x.json")
     memory["step"] = 17
     memory["places"] = [[1.5e-9, 2.0]]
@@ -28,7 +28,7 @@ def test_what_is_saved_is_there_after_a_restart(tmp_path: Path) -> None:
     assert dict(Memory(tmp_path / "state" / "x.json")) == {"step": 17, "places": [[1.5e-9, 2.0]]}
 
 
-def test_nothing_is_left_of_a_value_that_can_not_be_kept(tmp_path: Path) -> None:
+def test_invalid_value_leaves_nothing_in_memory(tmp_path: Path) -> None:
     memory = Memory(tmp_path / "x.json")
     memory["a"] = 1
     memory.save()
@@ -64,20 +64,20 @@ def test_changes_are_written_however_deep_they_are_and_nothing_else(tmp_path: Pa
     assert dict(Memory(tmp_path / "x.json")) == {"places": [1, 2]}
 
 
-def test_a_key_that_would_come_back_as_another_is_refused(tmp_path: Path) -> None:
+def test_key_that_is_not_a_string_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidValue, match="text"):
         Memory(None)[5] = "x"  # type: ignore[index]
 
 
 @pytest.mark.parametrize("content", ["{", "[1]", "\0"])
-def test_a_file_that_is_something_else_is_told(tmp_path: Path, content: str) -> None:
+def test_memory_file_of_another_kind_is_refused(tmp_path: Path, content: str) -> None:
     (tmp_path / "x.json").write_text(content)
     with pytest.raises(FileError, match="delete it"):
         Memory(tmp_path / "x.json")
 
 
-def test_a_folder_that_can_not_be_written_to_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A drive that is away for a while must not end a component, which would be given up by the time it is back."""
+def test_unwritable_folder_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """An unmounted drive must not end a component, which would be given up before the drive is back."""
     (tmp_path / "file").write_text("")
     memory = Memory(None)
     memory._path = tmp_path / "file" / "x.json"
@@ -85,12 +85,12 @@ def test_a_folder_that_can_not_be_written_to_is_told(tmp_path: Path, caplog: pyt
     assert [record.levelname for record in caplog.records] == ["CRITICAL"]
 
 
-def test_what_is_on_a_drive_that_is_away_is_not_begun_anew(tmp_path: Path) -> None:
+def test_memory_on_an_unmounted_drive_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="the folder of the run does not exist"):
         Memory(tmp_path / "away" / "state" / "x.json")
 
 
-def test_a_full_disk_is_told_once_and_all_is_kept_when_there_is_room(
+def test_full_disk_is_logged_once_and_all_is_saved_when_there_is_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(descriptor: int) -> None:
@@ -137,7 +137,7 @@ def test_a_packet_larger_than_the_limit_is_kept_all_the_same() -> None:
     assert [bytes(p.payload[:1]) for p in iter(backlog.take, None)] == [b"x", b"y"]
 
 
-def test_what_comes_later_does_not_overtake_what_waits_on_disk() -> None:
+def test_later_packets_do_not_overtake_those_on_disk() -> None:
     backlog = PacketBacklog(limit_bytes=10)
     for time_ns in range(3):  # the first in memory, the others on disk
         backlog.put(Packet("Scan2d", b"x" * 8, time_ns))

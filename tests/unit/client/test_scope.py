@@ -1,4 +1,4 @@
-"""Scope, over a scheduler that decides by the real table and a microscope in memory."""
+"""Scope, with a scheduler that decides by the real table and a microscope in memory."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from afspm.transport.process.parent import StopRequested
 TIP = Problem.TIP_SHAPE_CHANGED
 
 
-def test_a_scan_comes_with_all_channels_at_the_place_that_was_asked_for(lab: Lab, scope: Scope) -> None:
+def test_scan_has_all_channels_at_the_requested_place(lab: Lab, scope: Scope) -> None:
     scans = scope.scan(REGION, shape=(4, 6))
     assert list(scans) == ["Height", "Phase"]
     assert scans.region == REGION
@@ -47,7 +47,7 @@ def test_a_scan_comes_with_all_channels_at_the_place_that_was_asked_for(lab: Lab
     assert scans.interruptions == ()
 
 
-def test_control_is_asked_for_by_itself_and_given_back(lab: Lab, scope: Scope) -> None:
+def test_control_is_requested_and_released_by_each_call(lab: Lab, scope: Scope) -> None:
     scope.scan(REGION)
     assert lab.control.holder is None
     assert lab.count(ControlRequest.REQUEST_CTRL) == lab.count(ControlRequest.RELEASE_CTRL) == 1
@@ -97,16 +97,14 @@ def test_a_problem_interrupts_and_the_scan_is_taken_when_it_is_cleared(lab: Lab,
     assert lab.begun_scans == 2
 
 
-def test_manual_mode_interrupts_and_says_so(lab: Lab, scope: Scope) -> None:
+def test_manual_mode_interrupts_with_a_reason(lab: Lab, scope: Scope) -> None:
     lab.at(30.0, lambda: lab.set_mode(ControlMode.MANUAL))
     lab.at(60.0, lambda: lab.set_mode(ControlMode.AUTOMATED))
     scans = scope.scan(REGION)
     assert "MANUAL" in scans.interruptions[0]
 
 
-def test_a_scan_asked_for_while_a_problem_is_flagged_waits_without_asking_again_and_again(
-    lab: Lab, scope: Scope
-) -> None:
+def test_scan_during_a_problem_waits_without_repeated_requests(lab: Lab, scope: Scope) -> None:
     lab.flag(TIP)
     lab.at(3600.0, lambda: lab.clear(TIP))
     scans = scope.scan(REGION)
@@ -115,7 +113,7 @@ def test_a_scan_asked_for_while_a_problem_is_flagged_waits_without_asking_again_
     assert lab.count(ControlRequest.REQUEST_CTRL) <= 2 + 3600.0 / 10.0
 
 
-def test_another_solver_in_control_is_waited_for(lab: Lab, scope: Scope) -> None:
+def test_scan_waits_for_another_solver(lab: Lab, scope: Scope) -> None:
     from afspm.scheduler.control.arbitration import ArbitrationEvent
 
     lab.does(ArbitrationEvent.REQUEST_CONTROL, "other")
@@ -124,7 +122,7 @@ def test_another_solver_in_control_is_waited_for(lab: Lab, scope: Scope) -> None
     assert lab.count(ControlRequest.REQUEST_CTRL) == 2
 
 
-def test_the_region_is_set_again_after_somebody_else_has_moved_the_tip(lab: Lab, scope: Scope) -> None:
+def test_region_is_set_again_after_another_component_moved_the_tip(lab: Lab, scope: Scope) -> None:
     def repair() -> None:
         lab.parameters = model.ScanParameters(OTHER_REGION, (8, 8))
         lab.publish(lab.parameters)
@@ -135,14 +133,14 @@ def test_the_region_is_set_again_after_somebody_else_has_moved_the_tip(lab: Lab,
     assert scope.scan(REGION).region == REGION
 
 
-def test_a_translator_that_starts_anew_in_the_middle_costs_one_attempt(lab: Lab, scope: Scope) -> None:
+def test_restart_of_the_translator_costs_one_attempt(lab: Lab, scope: Scope) -> None:
     lab.at(50.0, lab.restart_translator)
     scans = scope.scan(REGION)
     assert lab.begun_scans == 2
     assert "restarted" in scans.interruptions[0]
 
 
-def test_a_scan_that_was_accepted_and_never_begins_is_asked_for_anew(lab: Lab, scope: Scope) -> None:
+def test_accepted_scan_that_never_begins_is_requested_again(lab: Lab, scope: Scope) -> None:
     swallowed = []
 
     def swallow(request: model.Request) -> Response | str:
@@ -157,8 +155,8 @@ def test_a_scan_that_was_accepted_and_never_begins_is_asked_for_anew(lab: Lab, s
     assert len(set(ids)) == 2
 
 
-def test_a_scan_of_the_shape_that_was_asked_for_is_the_one_even_without_values(lab: Lab, scope: Scope) -> None:
-    """Of a translator that tells what was taken and leaves the values in its files."""
+def test_scan_of_the_requested_shape_counts_without_values(lab: Lab, scope: Scope) -> None:
+    """Some translators publish a scan's parameters and leave the values in the controller's files."""
 
     def publish(region: Region, shape: tuple[int, int] = (8, 8)) -> None:
         lab.publish(Scan(region, "Height", "m", np.empty((0, 0)), lab.clock.now_ns(), "a.dat", shape))
@@ -216,7 +214,7 @@ def test_channel_of_nothing_but_nan_is_logged(lab: Lab, scope: Scope, caplog: py
         ("restart_translator", False, "was it restarted"),
     ],
 )
-def test_scan_without_a_result_on_a_full_disk_says_so(
+def test_scan_without_a_result_on_a_full_disk_names_the_disk(
     lab: Lab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str, is_full: bool, said: str
 ) -> None:
     monkeypatch.setattr("afspm.client.keyed_results.is_full", lambda folder: is_full)
@@ -235,14 +233,14 @@ def test_a_channel_that_is_switched_off_costs_one_scan_and_no_more(lab: Lab, sco
     assert lab.begun_scans == 4
 
 
-def test_a_scan_that_somebody_stops_again_and_again_is_given_up(lab: Lab, scope: Scope) -> None:
+def test_repeatedly_stopped_scan_is_given_up(lab: Lab, scope: Scope) -> None:
     for i in range(20):
         lab.at(50.0 * (i + 1), lab.stop)
     with pytest.raises(NoResponse, match="failed 5 times"):
         scope.scan(REGION)
 
 
-def test_what_was_published_before_is_not_taken_for_the_scan(lab: Lab, scope: Scope) -> None:
+def test_earlier_packets_are_not_taken_for_the_scan(lab: Lab, scope: Scope) -> None:
     lab.publish_scan(OTHER_REGION)
     lab.publish(ScopeStatus(ScopeState.FREE))
     assert scope.scan(REGION).region == REGION
@@ -264,9 +262,7 @@ def test_a_scan_whose_beginning_was_lost_with_the_connection_is_recognised(lab: 
     assert lab.begun_scans == 1
 
 
-def test_a_scan_is_not_taken_twice_where_the_connection_is_cut_before_its_beginning_is_heard(
-    lab: Lab, scope: Scope
-) -> None:
+def test_scan_is_not_taken_twice_if_the_connection_is_cut_at_its_start(lab: Lab, scope: Scope) -> None:
     publish = lab.publish
 
     def withhold(thing: object, envelope: str | None = None) -> Packet:
@@ -291,13 +287,13 @@ def test_a_scan_is_not_taken_twice_where_the_connection_is_cut_before_its_beginn
     assert lab.begun_scans == 1
 
 
-def test_a_notebook_shows_how_it_is(lab: Lab, scope: Scope) -> None:
+def test_repr_of_a_scope_shows_the_present_state(lab: Lab, scope: Scope) -> None:
     with scope.control():
         name = scope.control_state.holder
         assert repr(scope) == f"<Scope {name!r}: FREE, AUTOMATED, {name} is in control>"
     lab.flag(Problem.TIP_SHAPE_CHANGED)
     assert scope.control_state.problems
-    assert "nobody is in control, tip-shape-changed is flagged" in repr(scope)
+    assert "no component is in control, tip-shape-changed is flagged" in repr(scope)
     assert "'tip-shape-changed': 1" in repr(scope.problems)
 
 
@@ -313,7 +309,7 @@ def test_a_refusal_is_raised_with_its_reason(lab: Lab, scope: Scope) -> None:
     assert lab.control.holder is None
 
 
-def test_a_microscope_that_is_busy_is_waited_for(lab: Lab, scope: Scope) -> None:
+def test_request_waits_for_a_busy_microscope(lab: Lab, scope: Scope) -> None:
     lab.state = ScopeState.BUSY_PARAM
     lab.at(12.0, lambda: lab._go(ScopeState.FREE))
     scope.scan(REGION)
@@ -340,7 +336,7 @@ def test_a_lost_answer_repeats_the_request_with_its_id_and_executes_it_once(lab:
     assert lab.begun_scans == 1
 
 
-def test_a_scan_that_went_on_unheard_while_control_was_lost_is_not_taken_again(lab: Lab, scope: Scope) -> None:
+def test_unseen_scan_during_lost_control_is_not_taken_again(lab: Lab, scope: Scope) -> None:
     lab.begin_unheard(REGION, in_s=20.0)
     lab.at(5.0, lambda: lab.flag(TIP))
     lab.at(40.0, lambda: lab.clear(TIP))
@@ -349,7 +345,7 @@ def test_a_scan_that_went_on_unheard_while_control_was_lost_is_not_taken_again(l
     assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
 
 
-def test_a_scan_that_never_began_before_control_was_lost_is_asked_for_with_the_same_id(lab: Lab, scope: Scope) -> None:
+def test_scan_not_begun_before_lost_control_is_requested_with_the_same_id(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.NO_RESPONSE)
         if request.subject == "start-scan" and lab.clock.passed_s < 20.0
@@ -362,7 +358,7 @@ def test_a_scan_that_never_began_before_control_was_lost_is_asked_for_with_the_s
     assert len({request.id for request in lab.requests if request.subject == "start-scan"}) == 1
 
 
-def test_a_scan_of_somebody_else_while_control_was_lost_is_not_ours(lab: Lab, scope: Scope) -> None:
+def test_foreign_scan_during_lost_control_does_not_count(lab: Lab, scope: Scope) -> None:
     lab.begin_unheard(OTHER_REGION, in_s=20.0)  # a test scan of the repair; ours was begun and is lost
     lab.at(5.0, lambda: lab.flag(TIP))
     lab.at(40.0, lambda: lab.clear(TIP))
@@ -370,7 +366,7 @@ def test_a_scan_of_somebody_else_while_control_was_lost_is_not_ours(lab: Lab, sc
     assert lab.begun_scans == 2
 
 
-def test_a_translator_that_is_silent_for_a_while_is_asked_with_the_same_id(lab: Lab, scope: Scope) -> None:
+def test_silent_translator_gets_the_request_again_with_the_same_id(lab: Lab, scope: Scope) -> None:
     def silent(request: model.Request) -> Response | str:
         late = lab.clock.passed_s < 20.0 and request.kind == ControlRequest.SET_SCAN_PARAMS
         return Response(ControlResponse.NO_RESPONSE) if late else "go on"
@@ -382,7 +378,7 @@ def test_a_translator_that_is_silent_for_a_while_is_asked_with_the_same_id(lab: 
 
 
 @pytest.mark.parametrize(("late_s", "warnings"), [(3.0, 0), (9.0, 1)])
-def test_a_translator_that_is_not_yet_connected_is_worth_a_warning_only_if_it_stays_so(
+def test_translator_without_a_connection_is_warned_of_only_after_a_while(
     lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture, late_s: float, warnings: int
 ) -> None:
     until_s, reason = lab.clock.passed_s + late_s, "not sent: the translator is not connected"
@@ -398,7 +394,7 @@ def test_a_translator_that_is_not_yet_connected_is_worth_a_warning_only_if_it_st
     assert [reason in record.getMessage() for record in caplog.records] == [True] * warnings
 
 
-def test_a_translator_that_stays_silent_is_told(lab: Lab, scope: Scope) -> None:
+def test_translator_that_stays_silent_is_reported(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.NO_RESPONSE) if request.kind == ControlRequest.PARAM else "go on"
     )
@@ -406,7 +402,7 @@ def test_a_translator_that_stays_silent_is_told(lab: Lab, scope: Scope) -> None:
         scope.set("tip-bias-voltage", 1.0)
 
 
-def test_what_the_scheduler_says_of_a_slow_translator_is_heard_before_it_is_asked_again(lab: Lab, scope: Scope) -> None:
+def test_schedulers_answer_about_a_slow_translator_precedes_a_repetition(lab: Lab, scope: Scope) -> None:
     done_s = lab.clock.passed_s + 25.0
     unanswered: set[float] = set()
 
@@ -430,13 +426,13 @@ def test_what_the_scheduler_says_of_a_slow_translator_is_heard_before_it_is_aske
     assert lab.clock.passed_s == pytest.approx(done_s, abs=0.1)
 
 
-def test_a_scheduler_that_never_answers_is_told(lab: Lab, scope: Scope) -> None:
+def test_scheduler_that_never_answers_is_reported(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: None
-    with pytest.raises(NoResponse, match="asked 4 times"):
+    with pytest.raises(NoResponse, match="sent 4 times"):
         scope.flag(TIP)
 
 
-def test_a_scheduler_that_is_restarted_is_asked_again_with_the_same_id(lab: Lab, scope: Scope) -> None:
+def test_restarted_scheduler_gets_the_request_again_with_the_same_id(lab: Lab, scope: Scope) -> None:
     down: list[str] = []
 
     def dies(request: model.Request) -> str | None:
@@ -462,28 +458,28 @@ def test_the_answer_to_an_earlier_request_is_not_taken_for_this_ones(lab: Lab, s
     scope.flag(TIP)
 
 
-def test_nothing_is_measured_before_what_a_scheduler_of_ours_publishes_is_heard(lab: Lab, scope: Scope) -> None:
-    """It may tell that we have measured already."""
+def test_nothing_is_measured_before_the_schedulers_packets_arrive(lab: Lab, scope: Scope) -> None:
+    """The cache may show that the measurement is already done."""
     lab._inbox.remove(CaughtUp(SOURCE))
     lab.at(100.0, lambda: lab._inbox.append(CaughtUp(SOURCE)))
     scope.scan(REGION)
     assert lab.clock.passed_s == pytest.approx(100.0 + SCAN_S, abs=5.0)
 
 
-def test_a_measurement_that_nothing_is_heard_for_ends_when_its_time_is_over(lab: Lab, scope: Scope) -> None:
+def test_measurement_without_packets_ends_at_its_timeout(lab: Lab, scope: Scope) -> None:
     lab._inbox.remove(CaughtUp(SOURCE))
-    with pytest.raises(NoResponse, match="nothing is heard of what it publishes"):
+    with pytest.raises(NoResponse, match="its packets do not arrive"):
         scope.scan(REGION, timeout_s=10.0)
     assert lab.begun_scans == 0
 
 
-def test_a_scheduler_of_ours_is_asked_to_clear_what_may_be_flagged_unheard(lab: Lab, scope: Scope) -> None:
+def test_problem_that_may_be_flagged_unseen_is_cleared(lab: Lab, scope: Scope) -> None:
     scope.flag(Problem.THERMAL_DRIFT)
     scope.clear(TIP)
     assert lab.count(ControlRequest.RMV_EXP_PRBLM) == 1
 
 
-def test_that_the_microscope_tells_no_state_is_said_once(
+def test_missing_state_of_the_microscope_is_logged_once(
     lab: Lab, scope: Scope, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab._inbox = [one for one in lab._inbox if getattr(getattr(one, "packet", None), "envelope", "") != "ScopeStateMsg"]
@@ -493,7 +489,7 @@ def test_that_the_microscope_tells_no_state_is_said_once(
     assert lab.clock.passed_s == pytest.approx(20.0, abs=1.0)
 
 
-def test_timeouts_are_told_in_words(lab: Lab, scope: Scope) -> None:
+def test_timeouts_are_reported_in_words(lab: Lab, scope: Scope) -> None:
     with pytest.raises(NoResponse, match="not finished in time"):
         scope.scan(REGION, timeout_s=50.0)
     lab.stop()
@@ -503,7 +499,7 @@ def test_timeouts_are_told_in_words(lab: Lab, scope: Scope) -> None:
     assert lab.clock.passed_s < 60.0
 
 
-def test_all_problems_are_cleared_and_none_that_is_not_flagged(lab: Lab, scope: Scope) -> None:
+def test_only_flagged_problems_are_cleared(lab: Lab, scope: Scope) -> None:
     assert scope.clear_all() == ()
     lab.flag(TIP)
     lab.flag(4)
@@ -522,13 +518,13 @@ def test_a_solver_gets_control_and_loses_it_when_it_has_solved(lab: Lab, scope: 
     assert not lab.control.problems
 
 
-def test_solving_what_is_not_flagged_is_refused_at_once(lab: Lab, scope: Scope) -> None:
+def test_solving_an_unflagged_problem_is_refused_at_once(lab: Lab, scope: Scope) -> None:
     with pytest.raises(ControlLost, match="not flagged"), scope.control(solving=TIP):
         pass
     assert lab.clock.passed_s < 1.0
 
 
-def test_a_solver_that_waits_is_told_when_another_has_solved_it(lab: Lab, scope: Scope) -> None:
+def test_waiting_solver_gets_an_error_when_another_has_solved_the_problem(lab: Lab, scope: Scope) -> None:
     from afspm.scheduler.control.arbitration import ArbitrationEvent
 
     lab.flag(TIP)
@@ -546,7 +542,7 @@ def test_an_error_in_the_block_still_gives_control_back(lab: Lab, scope: Scope) 
 
 
 def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) -> None:
-    """Control was granted; a state from before that arrives only now."""
+    """Control was granted; a state from before the grant arrives later."""
 
     def grant_quietly(request: model.Request) -> Response | str:
         if request.kind != ControlRequest.REQUEST_CTRL:
@@ -565,7 +561,7 @@ def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) ->
     assert lab.count(ControlRequest.REQUEST_CTRL) == 1
 
 
-def test_changes_that_leave_the_obstacle_are_no_reason_to_ask(lab: Lab, scope: Scope) -> None:
+def test_changes_that_leave_the_obstacle_cause_no_request(lab: Lab, scope: Scope) -> None:
     lab.flag(TIP)
     for second in range(1, 9):
         lab.at(second, lambda second=second: lab.flag(second + 10))  # type: ignore[misc]
@@ -575,7 +571,7 @@ def test_changes_that_leave_the_obstacle_are_no_reason_to_ask(lab: Lab, scope: S
     assert lab.count(ControlRequest.REQUEST_CTRL) == 2
 
 
-def test_a_scheduler_that_is_restarted_again_and_again_is_waited_for(lab: Lab, scope: Scope) -> None:
+def test_request_survives_repeated_restarts_of_the_scheduler(lab: Lab, scope: Scope) -> None:
     lives: list[str] = []
 
     def dies(request: model.Request) -> str | None:
@@ -591,7 +587,7 @@ def test_a_scheduler_that_is_restarted_again_and_again_is_waited_for(lab: Lab, s
     assert len(set(lives)) == 1
 
 
-def test_a_spectrum_is_taken_where_it_was_asked_for(lab: Lab, scope: Scope) -> None:
+def test_spectrum_is_taken_at_the_requested_place(lab: Lab, scope: Scope) -> None:
     spectrum = scope.spectrum((2e-7, 3e-7), kind="IV")
     assert spectrum.position_m == (2e-7, 3e-7)
     assert lab.values["x-spec-kind"] == "IV"
@@ -614,7 +610,7 @@ def test_a_shape_may_be_of_numpy(lab: Lab, scope: Scope, shape: tuple[int, int])
     assert scope.scan(REGION, shape=shape, key="once").first.shape == (4, 6)
 
 
-def test_after_it_was_closed_a_scope_says_that_it_was(lab: Lab, scope: Scope) -> None:
+def test_closed_scope_is_reported_as_closed(lab: Lab, scope: Scope) -> None:
     scope.scan(REGION)
     scope.close()
     for call in (lambda: scope.scan(REGION), lambda: scope.state, lambda: next(scope.events())):
@@ -628,7 +624,7 @@ def test_a_place_may_be_an_array(lab: Lab, scope: Scope) -> None:
     assert scope.spectrum(place).position_m == (2e-7, 3e-7)  # type: ignore[arg-type]
 
 
-def test_what_is_no_place_region_or_time_is_told_with_what_would_be_right(lab: Lab, scope: Scope) -> None:
+def test_invalid_place_region_or_time_is_refused_with_a_valid_example(lab: Lab, scope: Scope) -> None:
     for wrong, hint in (
         (lambda: scope.spectrum(0), "(1e-7, 0)"),  # type: ignore[arg-type]
         (lambda: scope.move_probe((0.0, 0.0, 0.0)), "(1e-7, 0)"),  # type: ignore[arg-type]
@@ -655,7 +651,7 @@ def test_a_unit_of_another_kind_is_refused(lab: Lab, scope: Scope) -> None:
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_number_that_is_none_is_not_even_sent(lab: Lab, scope: Scope, value: float) -> None:
+def test_value_that_is_not_finite_is_not_sent(lab: Lab, scope: Scope, value: float) -> None:
     with pytest.raises(InvalidValue):
         scope.set("tip-bias-voltage", value)
     assert not any(request.kind == ControlRequest.PARAM for request in lab.requests)
@@ -677,7 +673,7 @@ def test_reading_needs_no_control(lab: Lab, scope: Scope) -> None:
     assert lab.count(ControlRequest.REQUEST_CTRL) == 0
 
 
-def test_a_scheduler_that_tells_values_only_in_control_is_asked_in_control(lab: Lab, scope: Scope) -> None:
+def test_reading_takes_control_if_the_scheduler_requires_it(lab: Lab, scope: Scope) -> None:
     lab.intercept = lambda request: (
         Response(ControlResponse.NOT_IN_CONTROL)
         if request.kind == ControlRequest.PARAM and lab.control.holder != lab.name
@@ -686,7 +682,7 @@ def test_a_scheduler_that_tells_values_only_in_control_is_asked_in_control(lab: 
     assert scope.get("tip-bias-voltage") == 0.5
 
 
-def test_feedback_is_known_once_it_is_set(lab: Lab, scope: Scope) -> None:
+def test_set_feedback_returns_when_the_feedback_is_published(lab: Lab, scope: Scope) -> None:
     scope.set_feedback(on=False, setpoint=2.0)
     assert scope.feedback == model.Feedback(on=False, setpoint=2.0)
 
@@ -737,7 +733,7 @@ def test_the_end_of_the_experiment_ends_an_iteration(lab: Lab, scope: Scope) -> 
     assert [event.envelope for event in scope.events("Scan2d")] == []
 
 
-def test_waiting_until_something_is_so(lab: Lab, scope: Scope) -> None:
+def test_wait_until_returns_when_the_condition_holds(lab: Lab, scope: Scope) -> None:
     lab.at(40.0, lambda: lab.flag(TIP))
     assert scope.wait_until(lambda: TIP in scope.control_state.problems, timeout_s=100.0)
     assert 40.0 <= lab.clock.passed_s < 41.0
@@ -749,8 +745,8 @@ def test_sleeping_passes_the_time_of_the_experiment(lab: Lab, scope: Scope) -> N
     assert lab.clock.passed_s == pytest.approx(900.0)
 
 
-def test_control_that_is_lost_while_the_microscope_is_silent_is_waited_for(lab: Lab, scope: Scope) -> None:
-    """Then the answer is never coming: nobody asks for somebody who is not in control."""
+def test_request_waits_for_control_lost_during_silence(lab: Lab, scope: Scope) -> None:
+    """Then the answer never comes: the scheduler forwards requests only for the holder of control."""
     lab.intercept = lambda request: (
         Response(ControlResponse.NO_RESPONSE)
         if request.subject == "start-scan" and lab.clock.passed_s < 300.0
@@ -793,7 +789,7 @@ def test_a_scan_that_is_seen_to_begin_needs_no_answer(lab: Lab, scope: Scope) ->
     assert lab.begun_scans == 1
 
 
-def test_of_progress_told_in_a_tight_loop_only_the_newest_waits_and_arrives(lab: Lab, scope: Scope) -> None:
+def test_only_the_newest_progress_of_a_tight_loop_waits_and_arrives(lab: Lab, scope: Scope) -> None:
     scope.scan(REGION)
     for done in range(10_000):
         scope.progress(done, 10_000)
@@ -804,7 +800,7 @@ def test_of_progress_told_in_a_tight_loop_only_the_newest_waits_and_arrives(lab:
     assert wire.decode(told[-1].message, told[-1].payload).done == 9_999
 
 
-def test_a_note_needs_no_control_and_says_when_its_scan_was_finished(lab: Lab, scope: Scope) -> None:
+def test_note_needs_no_control_and_has_the_time_of_its_scan(lab: Lab, scope: Scope) -> None:
     scans = scope.scan(REGION)
     scope.note("tip changed here", scan=scans)
     scope.note("the door slammed", time_ns=7)
@@ -817,9 +813,9 @@ def test_a_note_needs_no_control_and_says_when_its_scan_was_finished(lab: Lab, s
     assert lab.count(ControlRequest.REQUEST_CTRL) == 1
 
 
-def test_a_note_on_a_scan_of_which_the_time_is_not_known_is_refused(scope: Scope) -> None:
+def test_note_on_a_scan_of_unknown_time_is_refused(scope: Scope) -> None:
     scan = Scan(REGION, "Height", "m", np.zeros((2, 2)))
-    with pytest.raises(InvalidValue, match="when it was finished"):
+    with pytest.raises(InvalidValue, match="has no time of its end"):
         scope.note("here", scan=scan)
 
 
@@ -834,6 +830,6 @@ def test_states_and_modes_are_shown_by_their_names(lab: Lab, scope: Scope) -> No
     assert (str(scope.state), f"{scope.mode}") == ("FREE", "AUTOMATED")
 
 
-def test_a_scope_shows_what_is_so_now(lab: Lab, scope: Scope) -> None:
+def test_properties_of_a_scope_show_the_present_state(lab: Lab, scope: Scope) -> None:
     lab.flag(TIP)
     assert "tip-shape-changed is flagged" in repr(scope)

@@ -1,4 +1,4 @@
-"""What hangs together is done in one tenure of control, or begun again."""
+"""Requests that belong together are sent in one tenure of control, or from the beginning again."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ TIP = Problem.TIP_SHAPE_CHANGED
 
 
 def taken_over_before(lab: Lab, subject: str) -> None:
-    """A person sets MANUAL just before this action is heard of, and hands back later."""
+    """Have a person set MANUAL just before this action arrives, and hand back later."""
 
     def person(request: model.Request) -> Response | str:
         if request.subject == subject:
@@ -26,7 +26,7 @@ def taken_over_before(lab: Lab, subject: str) -> None:
     lab.intercept = person
 
 
-def test_what_hangs_together_is_not_gone_on_with_when_control_was_lost_in_between(lab: Lab, scope: Scope) -> None:
+def test_unbroken_block_does_not_continue_after_lost_control(lab: Lab, scope: Scope) -> None:
     taken_over_before(lab, "start-spec")
     with scope.control(unbroken=True):
         scope.move_probe((1e-6, 0.0))
@@ -39,7 +39,7 @@ def test_what_hangs_together_is_not_gone_on_with_when_control_was_lost_in_betwee
     assert lab.control.holder is None
 
 
-def test_an_unbroken_block_stays_broken_though_control_could_be_had_again(lab: Lab, scope: Scope) -> None:
+def test_unbroken_block_stays_broken_though_control_is_free_again(lab: Lab, scope: Scope) -> None:
     with scope.control():
         with scope.control(unbroken=True):
             lab.set_mode(ControlMode.MANUAL)
@@ -63,9 +63,7 @@ def test_a_scan_in_an_unbroken_block_is_not_taken_again(lab: Lab, scope: Scope) 
     assert len(scope.scan(REGION).interruptions) == 0
 
 
-def test_an_action_that_may_have_been_done_before_control_was_lost_is_told_from_one_that_was_not(
-    lab: Lab, scope: Scope
-) -> None:
+def test_action_of_unknown_outcome_is_distinguished_from_one_not_done(lab: Lab, scope: Scope) -> None:
     def silent(request: model.Request) -> Response | str:
         if request.subject != "start-spec":
             return "go on"

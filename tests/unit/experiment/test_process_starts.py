@@ -82,7 +82,7 @@ def test_a_class_whose_packages_are_not_installed_is_refused_where_it_is_started
     experiment = write(CORRECTOR + '[watcher]\ncomponent = true\nclass = "needy.Needy"\n')
     (finding,) = experiment.check()
     assert finding.is_error
-    assert finding.what == "[watcher] class: Needy needs what is not installed: no-such-package"
+    assert finding.what == "[watcher] class: Needy needs packages that are not installed: no-such-package"
     assert finding.hint == 'pip install "no-such-package>=2"'
     with pytest.raises(ConfigError, match="no-such-package"):
         starts(experiment)

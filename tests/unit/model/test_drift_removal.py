@@ -1,4 +1,4 @@
-"""A scan is freed from the drift during its own acquisition, against the simulator's truth."""
+"""Drift during a scan's own acquisition is removed, judged by the simulator's truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ QUIET = {
 
 
 def scanned(surface: str, velocity_px: tuple[float, float], region: Region, direction: str = "up") -> Scan:
-    """In a world that drifts by so many pixels a frame."""
+    """Return a scan in a world that drifts by some pixels per frame."""
     velocity = [v * PIXEL_M / DURATION_S for v in velocity_px]
     settings = {"surface": SURFACES[surface], **QUIET, "drift": {"velocity_m_per_s": [*velocity, 0.0]}}
     world = World.from_settings(settings, seed=3, start_s=0.0)
@@ -54,7 +54,7 @@ def distortion_px(scan: Array, truth: Array) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("direction", ["up", "down"])
 @pytest.mark.parametrize("surface", SURFACES)
-def test_the_distortion_is_gone(surface: str, direction: str) -> None:
+def test_distortion_is_removed(surface: str, direction: str) -> None:
     velocity_px, upwards = (1.6, -1.2), direction == "up"
     region = Region((0.0, 0.0), (SIZE_M, SIZE_M))
     scan = scanned(surface, velocity_px, region, direction)
@@ -77,7 +77,7 @@ def ramp(region: Region, shape: tuple[int, int], slope: tuple[float, float]) -> 
 
 @pytest.mark.parametrize("upwards", [True, False])
 @pytest.mark.parametrize("angle_rad", [0.0, 0.7, -2.0])
-def test_a_tilted_plane_is_put_where_it_was(angle_rad: float, *, upwards: bool) -> None:
+def test_tilted_plane_is_restored(angle_rad: float, *, upwards: bool) -> None:
     """What a spline interpolates exactly, in a turned region with pixels that are not square."""
     region, shape = Region((3e-7, -2e-7), (1e-6, 0.5e-6), angle_rad), (40, 50)
     velocity, duration_s, slope = np.array([0.08e-9, -0.05e-9]), 400.0, (0.3, -0.2)
@@ -91,7 +91,7 @@ def test_a_tilted_plane_is_put_where_it_was(angle_rad: float, *, upwards: bool) 
     assert np.abs(found - truth)[inner].max() < 1e-3 * np.abs(values - truth)[inner].max()
 
 
-def test_what_lies_outside_of_what_was_scanned_is_unknown() -> None:
+def test_values_outside_of_the_scan_are_nan() -> None:
     """A sample that moved up with the rows was stretched: it fills more rows than it should."""
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     scan = Scan(region, "Height", "m", np.ones((11, 11)))
@@ -103,7 +103,7 @@ def test_what_lies_outside_of_what_was_scanned_is_unknown() -> None:
 
 
 @pytest.mark.parametrize("pixel", [(5, 5), (0, 0)])
-def test_nothing_is_made_of_what_was_not_measured(pixel: tuple[int, int]) -> None:
+def test_missing_values_stay_missing(pixel: tuple[int, int]) -> None:
     values = np.random.default_rng(1).standard_normal((11, 11))
     values[pixel] = np.nan
     scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", values)
@@ -123,7 +123,7 @@ def test_a_scan_without_any_value_stays_so() -> None:
     ("velocity", "duration_s"),
     [((math.nan, 0.0), 1.0), ((0.0, 0.0), math.inf), ((0.0, 0.0), -1.0), ((0.0, 1e-8), 100.0)],
 )
-def test_what_has_no_meaning_is_refused(velocity: tuple[float, float], duration_s: float) -> None:
+def test_invalid_velocity_or_duration_is_refused(velocity: tuple[float, float], duration_s: float) -> None:
     scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.ones((5, 5)))
     with pytest.raises(InvalidValue):
         scan.undistorted(velocity, duration_s)

@@ -74,7 +74,7 @@ def test_a_change_keeps_the_corner_of_the_unturned_rectangle() -> None:
     assert (changed.size_m, changed.angle_rad) == ((4.0, 2.0), 0.5)
 
 
-def test_a_part_of_a_region_needs_one_to_change() -> None:
+def test_part_of_a_region_needs_a_whole_region() -> None:
     with pytest.raises(InvalidValue, match="whole"):
         ScanParameters(RegionChange(width_m=1.0)).onto(ScanParameters())
 
@@ -85,6 +85,6 @@ def test_a_region_takes_text_with_units() -> None:
 
 
 @pytest.mark.parametrize("width", ["1e-6", "1 V", "wide", "1,5 um"])
-def test_text_that_is_no_length_is_refused(width: str) -> None:
+def test_text_without_a_length_is_refused(width: str) -> None:
     with pytest.raises(UnitError, match=r"unit|V|number|comma"):
         Region((0.0, 0.0), (width, 1e-6))  # type: ignore[arg-type]

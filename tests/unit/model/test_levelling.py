@@ -42,7 +42,7 @@ def test_particles_do_not_lead_a_robust_fit_astray(fit: str) -> None:
     assert plain[~PARTICLES].std() > 3.0 * flat[~PARTICLES].std()
 
 
-def test_what_was_not_measured_stays_so_and_takes_no_part() -> None:
+def test_missing_values_stay_missing_and_do_not_affect_the_fit() -> None:
     values = substrate(1)
     values[30:] = np.nan
     flat = scan(values).levelled().values
@@ -54,7 +54,7 @@ def test_a_scan_of_one_height_is_level() -> None:
     assert np.abs(scan(np.full(SHAPE, 7e-9)).levelled(1, "huber").values).max() < 1e-20
 
 
-def test_what_can_not_be_levelled_is_refused() -> None:
+def test_scan_that_can_not_be_levelled_is_refused() -> None:
     with pytest.raises(InvalidValue, match="no fit 'median'"):
         scan(substrate(1)).levelled(1, "median")
     with pytest.raises(InvalidValue, match="order 7"):

@@ -15,7 +15,7 @@ SCAN = Scan(Region((1e-6, 2e-6), (3e-7, 2e-7), 0.1), "Height", "m", VALUES, 1_75
 
 
 @pytest.mark.parametrize("kind", ["image", "contour", "surface"])
-def test_a_scan_is_drawn_where_it_is(kind: str) -> None:
+def test_scan_is_drawn_at_its_position(kind: str) -> None:
     axes = SCAN.plot(kind)
     axes.figure.canvas.draw()
     assert axes.get_xlim() == pytest.approx((850e-9, 1150e-9), abs=80e-9)
@@ -28,7 +28,7 @@ def test_a_scan_is_drawn_where_it_is(kind: str) -> None:
     mpl.pyplot.close(axes.figure)
 
 
-def test_a_scan_over_another_lies_where_it_was_taken_without_a_second_colour_bar() -> None:
+def test_scan_over_another_is_drawn_at_its_position_without_a_second_colour_bar() -> None:
     axes = Scan(Region((0.0, 0.0), (5e-6, 5e-6)), "Height", "m", VALUES).plot()
     assert SCAN.plot(axes=axes) is axes
     axes.figure.canvas.draw()
@@ -61,7 +61,7 @@ def test_a_scan_is_drawn_without_a_colour_bar_and_between_given_values() -> None
         SCAN.plot(vmin=2e-9, vmax=1e-9)
 
 
-def test_what_can_not_be_drawn_is_refused() -> None:
+def test_scan_that_can_not_be_drawn_is_refused() -> None:
     with pytest.raises(InvalidValue, match="'map'"):
         SCAN.plot("map")
     with pytest.raises(InvalidValue, match="no values"):

@@ -1,4 +1,4 @@
-"""Scans and spectra as people hold them."""
+"""Scans and spectra in the hands of a user."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_a_scan_without_values_has_the_shape_that_it_was_taken_with() -> None:
     assert scan.undistorted((0.0, 0.0), 1.0).shape == (3, 4)
 
 
-def test_a_scan_of_which_not_even_the_shape_is_known_has_parameters() -> None:
+def test_scan_of_unknown_shape_has_parameters() -> None:
     scan = Scan(REGION, "Height", "m", np.empty((0, 0)))
     assert scan.shape == (0, 0)
     assert scan.parameters == ScanParameters(REGION, unit="m")
@@ -41,7 +41,7 @@ def test_a_scan_of_which_not_even_the_shape_is_known_has_parameters() -> None:
 
 
 @pytest.mark.parametrize("pixels", [(4, 3), (0, 0), (3,)])
-def test_pixels_that_the_values_contradict_or_that_are_none_are_refused(pixels: tuple[int, int]) -> None:
+def test_invalid_or_contradictory_pixels_are_refused(pixels: tuple[int, int]) -> None:
     with pytest.raises(InvalidValue):
         Scan(REGION, "Height", "m", SCAN.values, pixels=pixels)
 
@@ -90,6 +90,6 @@ def test_problems_are_known_by_many_spellings() -> None:
 
 
 @pytest.mark.parametrize("named", [{"a": 3}, {"a": 256}, {"thermal-drift": 9}, {"a": 9, "b": 9}])
-def test_a_problem_needs_a_name_and_number_of_its_own(named: dict[str, int]) -> None:
+def test_problem_needs_a_unique_name_and_number(named: dict[str, int]) -> None:
     with pytest.raises(InvalidValue):
         ProblemNames(named)

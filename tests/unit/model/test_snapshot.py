@@ -1,4 +1,4 @@
-"""Snapshots of dataclasses: what is saved is what comes back, and nothing else is taken for it."""
+"""Snapshots of dataclasses: saved values come back unchanged, and other data are refused."""
 
 from __future__ import annotations
 

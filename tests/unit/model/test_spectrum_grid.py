@@ -42,7 +42,7 @@ def test_curves_lie_where_they_were_measured() -> None:
     assert arrays.attrs["kind"] == "IV"
 
 
-def test_what_is_missing_is_nan_and_what_was_repeated_is_counted() -> None:
+def test_missing_curves_are_nan_and_repeats_are_counted() -> None:
     measured = [place for number, place in enumerate(places(3, 3)) if number != 4]
     arrays = stacked([iv(place) for place in [*measured, measured[0]]]).to_xarray()
     assert dict(arrays.sizes) == {"y": 3, "x": 3, "repeat": 2, "direction": 2, "z": 11}
@@ -69,7 +69,7 @@ def test_a_sweep_that_turns_round_has_two_directions() -> None:
     assert arrays.Force.values.ravel().tolist() == [*range(8), *range(15, 7, -1)]
 
 
-def test_what_forms_no_grid_is_refused_with_the_reason() -> None:
+def test_positions_without_a_grid_are_refused_with_the_reason() -> None:
     random = np.random.default_rng(0)
     with pytest.raises(InvalidValue, match="no grid"):
         stacked([iv((float(x), float(y))) for x, y in random.uniform(0, 1e-7, (9, 2))]).to_xarray()

@@ -1,4 +1,4 @@
-"""Files to cut and damage: those of real microscopes, where they are, and small ones as the controllers write them."""
+"""Files to cut and damage: those of real microscopes, if present, and small ones in the controllers' formats."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ REAL = sorted({re.sub(r"\w+\.h5$|\d+", "", name): name for name in reversed(_FIL
 
 @cache
 def whole(name: str) -> bytes:
-    """Of one of `WHOLE` or `REAL`."""
+    """Return the bytes of a file in `WHOLE` or `REAL`."""
     if name not in WHOLE:
         return (DATA / name).read_bytes()
     with TemporaryDirectory() as folder:
@@ -32,7 +32,7 @@ def whole(name: str) -> bytes:
 
 
 def reading(content: bytes, name: str) -> FileContent:
-    """What is in a file of that name. Raises FileError: as `afspm.read`."""
+    """Return the content of a file with that name. Raises FileError, as `afspm.read`."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / Path(name).name
         path.write_bytes(content)
@@ -40,6 +40,6 @@ def reading(content: bytes, name: str) -> FileContent:
 
 
 def to_damage(names: Iterable[str]) -> list[Any]:
-    """Parameters of a test that reads damaged files."""
+    """Return the parameters of a test that reads damaged files."""
     old = not_on_wine("the older HDF5 that runs there ends the process on some damaged files")
     return [pytest.param(name, marks=old) if name.endswith((".nc", ".h5", ".nhf")) else name for name in names]

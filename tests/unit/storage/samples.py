@@ -1,4 +1,4 @@
-"""Small files as the controllers write them, made from an image and a curve that every reader must give back."""
+"""Small files in the controllers' formats, made from an image and a curve that every reader must return."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ NOTE = (
 
 
 def ibw() -> bytes:
-    """[x, y, channel], both ascending whichever way it was scanned."""
+    """Return [x, y, channel], both ascending for either scan direction."""
     square = np.stack([HEIGHT_M.T, OTHER.T], axis=2)
     return wave(square, "m", (10e-9, 10e-9), ["HeightRetrace", "PhaseRetrace"], NOTE)
 
@@ -178,7 +178,7 @@ def nsid(path: Path) -> None:
 
 
 def nhf(path: Path) -> None:
-    """Of format 1, as the maker's example."""
+    """Write a file of format 1, like the maker's example."""
     import h5py
 
     with h5py.File(path, "w") as file:
@@ -197,7 +197,7 @@ def nhf(path: Path) -> None:
 
 
 def nid() -> bytes:
-    """An image and a curve of two lines."""
+    """Return a file with an image and a curve of two lines."""
     image = (
         f"Version=2\r\nPoints={NX}\r\nLines={NY}\r\nFrame=Scan forward\r\nDim0Unit=m\r\nDim0Range=5e-08\r\n"
         "Dim1Range=3e-08\r\nDim2Name=Z-Axis\r\nDim2Unit=m\r\nDim2Range=2e-06\r\nDim2Min=-1e-06\r\nSaveBits=32\r\n"

@@ -1,7 +1,7 @@
-"""Any bytes at all, under any suffix: they are refused by name, or what comes of them makes sense.
+"""Any bytes under any suffix are refused with a name, or give sensible content.
 
-They are made of pieces of the files of real microscopes and of small ones as the controllers write them, with numbers
-in them that no file should have. Nothing may take more memory or time than the file's size warrants.
+They are pieces of files of real microscopes and of small ones in the controllers' formats, with numbers that no file
+should have. No reader may take more memory or time than the file's size justifies.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def ends(name: str) -> tuple[bytes, bytes]:
 
 
 def require_sense(content: bytes, name: str) -> None:
-    """Of what is in a file, or of its refusal."""
+    """Require sensible content of a file, or a refusal."""
     try:
         found = reading(content, name)
     except FileError as error:
@@ -90,8 +90,8 @@ def test_pieces_of_files_are_refused_or_make_sense(pieces: list[bytes], suffix: 
 @pytest.mark.parametrize("name", to_damage([*WHOLE, *REAL]))
 @settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_number_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
-    """Of text: one of the numbers in it, of the same length where places are counted."""
+def test_impossible_number_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
+    """In a text, one of its numbers, of the same length in formats with fixed positions."""
     content = whole(name)
     numbers = list(re.finditer(rb"[-+]?\d[\d.]*(?:[eE][-+]?\d+)?", content[:HEAD]))
     found = data.draw(st.sampled_from(numbers))
@@ -105,7 +105,7 @@ BINARY = [name for name in [*WHOLE, *REAL] if name.endswith((".ibw", ".nc", ".h5
 
 
 def mended(content: bytes, name: str) -> bytes:
-    """With the checksum of Igor's header right, which would keep all else from being looked at."""
+    """Return the content with a correct checksum of Igor's header, without which nothing else would be read."""
     if not name.endswith(".ibw"):
         return content
     order = "<" if content[0] else ">"
@@ -119,7 +119,7 @@ def mended(content: bytes, name: str) -> bytes:
 @pytest.mark.parametrize("name", BINARY)
 @settings(max_examples=10, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
-def test_a_size_that_can_not_be_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
+def test_impossible_size_is_refused_or_makes_sense(name: str, data: st.DataObject) -> None:
     content = bytearray(whole(name))
     most = min(len(content), 4096) - 8
     for _ in range(data.draw(st.integers(1, 2))):

@@ -1,4 +1,4 @@
-"""A file that is saved often outlives a kill as it is, and a power cut as it was a moment before."""
+"""A file that is saved often survives a kill unchanged, and a power cut in the state of a moment before."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CUT = [b"", b"\0" * 40, b'{"control": {"mo']
 
 
 def saved(path: Path, *contents: bytes) -> None:
-    """Saved one after the other, each made sure of."""
+    """Save contents one after the other, each synced."""
     for content in contents:
         kept = CheckpointFile(path)
         kept.save(content)
@@ -37,13 +37,13 @@ def number(content: bytes) -> int:
     return int(content)
 
 
-def test_what_was_saved_last_is_read(tmp_path: Path) -> None:
+def test_last_generation_is_read(tmp_path: Path) -> None:
     path = tmp_path / "state" / "x"
     saved(path, b"1", b"2")
     assert load_checkpoint(path, number) == (2, "")
 
 
-def test_what_was_closed_is_there_twice(tmp_path: Path) -> None:
+def test_closed_checkpoint_has_two_copies(tmp_path: Path) -> None:
     path = tmp_path / "x"
     kept = CheckpointFile(path)
     for n in range(50):
@@ -53,7 +53,7 @@ def test_what_was_closed_is_there_twice(tmp_path: Path) -> None:
     assert (path.read_bytes().splitlines()[-1], previous_generation(path).read_bytes()) == (b"49", b"49\n")
 
 
-def test_a_file_that_has_grown_long_is_begun_anew(tmp_path: Path) -> None:
+def test_long_checkpoint_file_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "x"
     kept = CheckpointFile(path, longest=10)
     for n in range(10, 50):
@@ -63,7 +63,7 @@ def test_a_file_that_has_grown_long_is_begun_anew(tmp_path: Path) -> None:
     kept.close()
 
 
-def test_where_a_kill_left_a_part_of_a_generation_that_before_is_read(tmp_path: Path) -> None:
+def test_generation_before_half_a_generation_is_read(tmp_path: Path) -> None:
     path = tmp_path / "x"
     kept = CheckpointFile(path, period_s=100.0)
     for text in (b"{}", b'{"a": 1}', b'{"a": 2}'):
@@ -76,7 +76,7 @@ def test_where_a_kill_left_a_part_of_a_generation_that_before_is_read(tmp_path: 
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file can't be removed there")
-def test_a_file_that_is_removed_meanwhile_is_there_again_with_the_next_generation(tmp_path: Path) -> None:
+def test_removed_file_is_written_again_with_the_next_generation(tmp_path: Path) -> None:
     path = tmp_path / "x"
     kept = CheckpointFile(path)
     kept.save(b"1")
@@ -87,7 +87,7 @@ def test_a_file_that_is_removed_meanwhile_is_there_again_with_the_next_generatio
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit on the size of files")
-def test_on_a_full_disk_what_was_saved_before_is_still_the_last(tmp_path: Path) -> None:
+def test_full_disk_keeps_the_generation_before(tmp_path: Path) -> None:
     script = """
 import resource, signal, sys
 from pathlib import Path
@@ -111,7 +111,7 @@ print(saved)
     assert (done.stdout.strip(), done.stderr) == ("270", ""), "after each failure it is tried to begin the file anew"
 
 
-def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_path: Path) -> None:
+def test_previous_generation_is_synced_in_the_background(tmp_path: Path) -> None:
     path = tmp_path / "x"
     kept = CheckpointFile(path, period_s=0.001)
     n = 0
@@ -122,7 +122,7 @@ def test_while_it_is_saved_the_generation_before_is_made_sure_of_by_itself(tmp_p
 
 
 class Reader:
-    """Has a file open, as only Windows minds, for some tries."""
+    """A reader that keeps a file open for some tries, which only Windows minds."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, tries: int) -> None:
         self.left = tries
@@ -139,16 +139,14 @@ class Reader:
         monkeypatch.setattr(atomic.sys, "platform", "win32")
 
 
-def test_a_file_that_somebody_reads_for_a_moment_is_replaced_after_all(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_file_open_for_a_moment_is_replaced_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reader = Reader(monkeypatch, tries=3)
     atomic.replace_file(tmp_path / "x", [b"1"], synced=False)
     assert (tmp_path / "x").read_bytes() == b"1"
     assert reader.left == -1
 
 
-def test_a_file_that_somebody_keeps_open_is_told_and_nothing_is_left_beside_it(
+def test_file_that_stays_open_is_reported_and_no_temporary_file_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Reader(monkeypatch, tries=1000)
@@ -158,7 +156,7 @@ def test_a_file_that_somebody_keeps_open_is_told_and_nothing_is_left_beside_it(
 
 
 @pytest.mark.parametrize("left", CUT)
-def test_after_a_power_cut_the_generation_before_is_read_and_that_is_told(tmp_path: Path, left: bytes) -> None:
+def test_earlier_generation_after_a_power_cut_is_read_and_reported(tmp_path: Path, left: bytes) -> None:
     path = tmp_path / "x"
     saved(path, b"1")
     path.write_bytes(left)
@@ -167,7 +165,7 @@ def test_after_a_power_cut_the_generation_before_is_read_and_that_is_told(tmp_pa
     assert damage
 
 
-def test_where_neither_can_be_read_nothing_is_guessed(tmp_path: Path) -> None:
+def test_two_unreadable_generations_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x"
     saved(path, b"1")
     path.write_bytes(b"")
@@ -176,7 +174,7 @@ def test_where_neither_can_be_read_nothing_is_guessed(tmp_path: Path) -> None:
         load_checkpoint(path, number)
 
 
-def test_a_file_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
+def test_removed_checkpoint_starts_empty(tmp_path: Path) -> None:
     path = tmp_path / "x"
     saved(path, b"1")
     SYNCER.now(10.0)  # it is open until it is synced
@@ -185,7 +183,7 @@ def test_a_file_that_was_removed_is_begun_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("left", CUT)
-def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_nobody(
+def test_scheduler_after_a_power_cut_keeps_problems_and_gives_no_control(
     tmp_path: Path, left: bytes, caplog: pytest.LogCaptureFixture
 ) -> None:
     log = logging.getLogger("scheduler")
@@ -203,7 +201,7 @@ def test_a_scheduler_after_a_power_cut_knows_the_problems_and_gives_control_to_n
     assert "no component in control" in caplog.text
 
 
-def test_what_is_saved_without_waiting_for_the_disk_has_a_generation_before(tmp_path: Path) -> None:
+def test_checkpoint_without_a_sync_has_a_generation_before(tmp_path: Path) -> None:
     memory = Memory(tmp_path / "microscope.json", synced=False)
     memory["tip"] = "blunt"
     memory.save()
@@ -269,7 +267,7 @@ def test_a_disk_that_is_slow_is_one_warning_with_how_long(outage: Outage) -> Non
 
 
 @pytest.mark.parametrize("error", [DiskBacklogFull(), OSError(errno.ENOSPC, "No space left"), FileError("is gone")])
-def test_what_is_not_written_at_all_is_critical_at_once(outage: Outage, error: Exception) -> None:
+def test_data_that_are_never_written_are_critical_at_once(outage: Outage, error: Exception) -> None:
     outage.write(error)
     outage.write(error)
     outage.write()

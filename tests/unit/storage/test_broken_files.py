@@ -1,4 +1,4 @@
-"""Broken files: what is cut off is refused, and no damage does more than be refused."""
+"""Broken files: cut files are refused, and damage has no worse effect than a refusal."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def need(name: str) -> None:
 @settings(max_examples=20)
 @given(data=st.data())
 def test_a_file_that_was_cut_off_is_refused_or_holds_the_same(name: str, data: st.DataObject) -> None:
-    """The same: what follows the last that is needed; and a table of text that ends with a line is a shorter one."""
+    """The same content if only unneeded bytes are cut off; a table of text cut at a line is a shorter table."""
     need(name)
     content = whole(name)
     length = data.draw(
@@ -85,7 +85,7 @@ def test_damaged_bytes_are_refused_or_read_and_nothing_else(name: str, data: st.
 
 
 @pytest.mark.parametrize("size", [0, 2**63])
-def test_a_heap_of_texts_in_which_the_library_would_go_round_for_ever_is_refused(size: int) -> None:
+def test_string_heap_that_would_make_the_library_loop_is_refused(size: int) -> None:
     damaged = bytearray(whole("nsid.h5"))
     second = damaged.index(b"GCOL") + 16 + 16 + 8  # its first text is no longer than 8 bytes
     damaged[second + 8 : second + 16] = size.to_bytes(8, "little")
@@ -111,7 +111,7 @@ def _by_virtual_dataset(file: Any, name: str, secret: Path) -> None:
 def test_values_that_are_in_another_file_are_refused(
     elsewhere: Callable[[Any, str, Path], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else a scan of somebody else, drawn or exported, would show what is in a file of this computer."""
+    """Otherwise a picture or export of a stranger's scan would show the content of a file of this computer."""
     monkeypatch.chdir(tmp_path)  # where external storage is looked for
     with h5py.File(tmp_path / "secret.h5", "w") as secret:
         secret["values"] = np.full((2, 4), 42.0)

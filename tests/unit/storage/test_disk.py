@@ -1,4 +1,4 @@
-"""Work for a disk: in order, waited for, but not for long."""
+"""Work for a disk: in order, and with short waits only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DEADLINE_S = 10.0
 
 
 class Hanging:
-    """Work that is not done before it is let go."""
+    """Work that lasts until it is released."""
 
     def __init__(self) -> None:
         self.done: list[str] = []
@@ -28,7 +28,7 @@ class Hanging:
         self.done.append("hung")
 
 
-def test_what_is_asked_for_is_done_in_order_and_its_error_is_told() -> None:
+def test_tasks_run_in_order_and_raise_their_errors() -> None:
     done: list[int] = []
     work = DiskThread()
     for number in range(100):
@@ -40,7 +40,7 @@ def test_what_is_asked_for_is_done_in_order_and_its_error_is_told() -> None:
     assert done == [*range(100)]
 
 
-def test_who_asks_goes_on_while_the_disk_hangs_and_all_is_done_later_in_order() -> None:
+def test_caller_goes_on_while_the_disk_hangs_and_tasks_run_later_in_order() -> None:
     hanging, work = Hanging(), DiskThread(deadline_s=0.01)
     with pytest.raises(DiskTimeout):
         work.run(hanging.hang)
@@ -53,7 +53,7 @@ def test_who_asks_goes_on_while_the_disk_hangs_and_all_is_done_later_in_order() 
     assert not work.hangs
 
 
-def test_no_more_than_a_bound_waits_for_a_disk_that_hangs() -> None:
+def test_tasks_for_a_hanging_disk_are_bounded() -> None:
     hanging, work = Hanging(), DiskThread(deadline_s=0.01, most_bytes=100)
     with pytest.raises(DiskTimeout):
         work.run(hanging.hang)
@@ -65,7 +65,7 @@ def test_no_more_than_a_bound_waits_for_a_disk_that_hangs() -> None:
     assert hanging.done == ["hung", "60", "30"]
 
 
-def test_what_is_read_once_is_not_waited_for_without_end() -> None:
+def test_single_read_has_a_time_limit() -> None:
     hanging = Hanging()
     assert run_bounded(lambda: 7, DEADLINE_S) == 7
     with pytest.raises(DiskTimeout):
@@ -75,7 +75,7 @@ def test_what_is_read_once_is_not_waited_for_without_end() -> None:
 
 @pytest.fixture
 def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[int]:
-    """The files of the test that were synced, by number. What earlier tests have left running may sync others."""
+    """Return the inodes of the test's synced files; threads of earlier tests may sync others."""
     found: list[int] = []
 
     def note(descriptor: int) -> None:
@@ -87,7 +87,7 @@ def synced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[int]:
     return found
 
 
-def test_what_was_written_is_on_the_disk_a_moment_later_though_it_was_closed(tmp_path: Path, synced: list[int]) -> None:
+def test_written_data_are_synced_a_moment_later_though_the_file_was_closed(tmp_path: Path, synced: list[int]) -> None:
     syncer, done = Syncer(period_s=0.01), threading.Event()
     for name in ("a", "b"):
         with (tmp_path / name).open("wb", buffering=0) as file:
@@ -100,7 +100,7 @@ def test_what_was_written_is_on_the_disk_a_moment_later_though_it_was_closed(tmp
         pass
 
 
-def test_what_is_wanted_now_is_on_the_disk_now(tmp_path: Path, synced: list[int]) -> None:
+def test_sync_now_waits_for_the_disk(tmp_path: Path, synced: list[int]) -> None:
     syncer = Syncer(period_s=100.0)
     syncer.now(DEADLINE_S)  # nothing was written
     with (tmp_path / "a").open("wb", buffering=0) as file:
@@ -110,7 +110,7 @@ def test_what_is_wanted_now_is_on_the_disk_now(tmp_path: Path, synced: list[int]
         assert synced == [os.fstat(file.fileno()).st_ino]
 
 
-def test_a_disk_that_does_not_sync_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_sync_is_logged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     goes_on = threading.Event()
     monkeypatch.setattr(disk, "sync_data", lambda descriptor: goes_on.wait(DEADLINE_S))
     syncer = Syncer(period_s=100.0)
@@ -140,7 +140,7 @@ def test_sync_that_the_disk_refuses_is_raised_to_the_next_that_waits_and_logged_
         syncer.soon(file.fileno())
         syncer.now(DEADLINE_S)
     assert [(record.levelname, record.message) for record in caplog.records] == [
-        ("CRITICAL", "what was written in the last moment may not outlive a power cut: [Errno 5] Input/output error"),
+        ("CRITICAL", "the data written in the last moment may be lost in a power cut: [Errno 5] Input/output error"),
         ("INFO", "the disk syncs again"),
     ]
 

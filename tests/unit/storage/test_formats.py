@@ -1,4 +1,4 @@
-"""Every format: values, geometry and times come out as the controller meant them."""
+"""Every format: values, geometry and times are read as the controller meant them."""
 
 from __future__ import annotations
 
@@ -71,14 +71,14 @@ def _of_another_instrument(path: Path, unit: str, per_m: float) -> Path:
     return path
 
 
-def test_the_axes_of_nsid_are_in_the_unit_that_they_say(tmp_path: Path) -> None:
+def test_axes_of_nsid_are_in_their_stated_unit(tmp_path: Path) -> None:
     region = afspm.read(_of_another_instrument(tmp_path / "other.h5", "nm", 1e9), zone=UTC).scans[0].region
     same(region, Region((25e-9, 15e-9), REGION.size_m))
     with pytest.raises(FileError, match="deg"):
         afspm.read(_of_another_instrument(tmp_path / "angles.h5", "deg", 1.0), zone=UTC)
 
 
-def test_channels_of_one_name_are_told_apart(tmp_path: Path) -> None:
+def test_channels_of_one_name_are_numbered(tmp_path: Path) -> None:
     path = tmp_path / "two.sxm"
     path.write_bytes(sxm().replace(b"\t0\tCurrent\tA\tforward", b"\t0\tZ\tm\tforward"))
     first, _, second = afspm.read(path, zone=UTC).scans
@@ -95,7 +95,7 @@ TIMES = {
 
 
 @pytest.mark.parametrize("name", TIMES)
-def test_it_is_told_when_and_which_way_it_was_taken(name: str, tmp_path: Path) -> None:
+def test_time_and_direction_of_a_scan_are_read(name: str, tmp_path: Path) -> None:
     content = read(name, tmp_path)
     lasted_s, upwards = TIMES[name]
     end_ns = None if name == "field.gsf" else END_NS
@@ -109,13 +109,13 @@ def test_it_is_told_when_and_which_way_it_was_taken(name: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("name", ["up.sxm", "spectrum.dat", "scan.ibw", "nsid.h5", "curve-VP001-VP.vpdata"])
-def test_clocks_without_a_zone_are_read_in_the_one_that_is_given(name: str, tmp_path: Path) -> None:
+def test_times_without_a_zone_are_read_in_the_given_zone(name: str, tmp_path: Path) -> None:
     WHOLE[name](tmp_path / name)
     east = afspm.read(tmp_path / name, zone=timezone(timedelta(hours=2)))
     assert east.end_ns == END_NS - 2 * 3600 * 10**9
 
 
-def test_of_a_gwyddion_field_top_is_up_and_its_sides_are_of_whole_pixels(tmp_path: Path) -> None:
+def test_gwyddion_field_is_turned_upright_and_its_sides_include_whole_pixels(tmp_path: Path) -> None:
     content = read("field.gsf", tmp_path)
     np.testing.assert_allclose(content.scans[0].values, HEIGHT_M, rtol=1e-6)
     same(content.scans[0].region, Region((130e-9, -20e-9), (50e-9, 30e-9)))
@@ -123,7 +123,7 @@ def test_of_a_gwyddion_field_top_is_up_and_its_sides_are_of_whole_pixels(tmp_pat
 
 
 @pytest.mark.parametrize("name", ["gxsm3.nc", "gxsm4.nc"])
-def test_what_a_file_of_gxsm_says_of_itself_is_in_the_header(name: str, tmp_path: Path) -> None:
+def test_attributes_of_a_gxsm_file_are_in_the_header(name: str, tmp_path: Path) -> None:
     header = read(name, tmp_path).header
     assert (header["Creator"], header["Version"]) == (name.removesuffix(".nc"), "1.2.3")
     assert header["rangex"] == 500.0
@@ -212,13 +212,13 @@ def test_a_format_without_a_reader_is_refused_with_those_there_are(name: str, tm
 
 
 @pytest.mark.parametrize("name", ["folder", "scan.xyz"])
-def test_what_is_not_there_is_not_told_to_have_the_wrong_suffix(name: str, tmp_path: Path) -> None:
+def test_missing_file_is_not_blamed_on_its_suffix(name: str, tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no such file"):
         afspm.read(tmp_path / name)
 
 
 @pytest.mark.parametrize("suffix", suffixes())
-def test_what_is_not_there_or_something_else_is_refused_by_its_name(suffix: str, tmp_path: Path) -> None:
+def test_missing_or_other_file_is_refused_by_its_name(suffix: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{suffix}"
     with pytest.raises(FileError, match="no such file"):
         afspm.read(path)

@@ -1,4 +1,4 @@
-"""Files of Nanosurf's programs: the maker's examples, where they are installed, and what the emulator writes."""
+"""Files of Nanosurf's programs: the maker's examples, if installed, and the emulator's files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ START_S = 1.7e9
 
 
 def scanned(folder: Path, *, upwards: bool = True) -> tuple[Path, Instrument]:
-    """A file of the emulator, and the instrument that it was scanned with."""
+    """Return a file of the emulator, and the simulated instrument."""
     rig = Instrument({"surface": "steps"}, 3, START_S)
     rig.setup.region, rig.setup.shape = Region((40e-9, -25e-9), (300e-9, 100e-9), np.deg2rad(30)), (6, 10)
     rig.setup.upwards = upwards
@@ -56,7 +56,7 @@ def test_an_image_comes_back_as_it_was_scanned(tmp_path: Path, *, upwards: bool)
 
 @pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
 def test_nsfopen_reads_the_same_heights_and_curves(tmp_path: Path) -> None:
-    """It takes the range of each channel for one about zero, as it is in a file of a real Studio."""
+    """NSFopen assumes a range about zero for each channel, as in a file of a real Studio."""
     reading = pytest.importorskip("NSFopen.read")
     path, rig = scanned(tmp_path)
     assert rig.scan is not None
@@ -95,7 +95,7 @@ def test_a_curve_goes_there_and_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(curve["Deflection"][len(z) :], back, atol=1e-9 * np.ptp(back))
 
 
-def test_the_makers_image() -> None:
+def test_image_of_the_maker_is_read() -> None:
     content = afspm.read(example("Calculate_Roughness/sapphire.nid"))
     assert content.controller == "Nanosurf 3.8.3.5"
     assert [scan.channel for scan in content.scans][:2] == ["Z-Axis forward", "Amplitude forward"]
@@ -107,7 +107,7 @@ def test_the_makers_image() -> None:
     assert content.upwards is True
 
 
-def test_the_makers_image_that_is_turned_and_off_the_middle() -> None:
+def test_rotated_image_of_the_maker_is_read() -> None:
     region = afspm.read(example("Plane_Removal/grid.nid")).scans[0].region
     assert region.center_m == (1.2982e-06, -1.65728e-07)
     assert np.degrees(region.angle_rad) == pytest.approx(45.0)
@@ -135,7 +135,7 @@ def test_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")  # of the maker's reader, about pandas
-def test_heights_of_a_real_studio_are_those_that_nsfopen_reads() -> None:
+def test_heights_of_a_real_studio_agree_with_nsfopen() -> None:
     """Of format 1; its channels have a range about zero, as those of the emulator."""
     nanosurf = importlib.util.find_spec("nanosurf")
     folder = Path(nanosurf.origin if nanosurf is not None and nanosurf.origin else "/").parent

@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def logging(folder: Path) -> Iterator[Logging]:
-    """Opens the log, another life each time."""
+    """Open the log, each time as another life."""
     made: list[PacketLog] = []
 
     def make(**settings: int) -> PacketLog:
@@ -65,12 +65,12 @@ def logging(folder: Path) -> Iterator[Logging]:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Segments of a few packets, and no more than four of them."""
+    """Limit the log to four segments of a few packets."""
     monkeypatch.setattr(packet_log, "SEGMENT_BYTES", SMALL_SEGMENT)
     monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 4 * SMALL_SEGMENT)
 
 
-def test_packets_are_found_in_the_order_in_which_they_were_appended(logging: Logging, folder: Path) -> None:
+def test_packets_are_read_in_the_order_of_appending(logging: Logging, folder: Path) -> None:
     log = logging()
     wanted = [
         LoggedPacket(entry(1, 0).packet, 1, 3),
@@ -129,7 +129,7 @@ def test_the_cache_is_rebuilt_with_as_many_of_each_envelope_as_it_held(logging: 
     assert [one.packet.time_ns for one in cached_packets(folder)] == [9, 107, 108, 109]
 
 
-def test_what_is_cached_stays_in_the_log_however_old_it_is(logging: Logging, folder: Path, small: None) -> None:
+def test_cached_packets_of_any_age_stay_in_the_log(logging: Logging, folder: Path, small: None) -> None:
     log = logging()
     old = [entry(1, 40, "ScanParameters2d"), entry(2, 40, "ControlState")]
     for one in old:
@@ -142,7 +142,7 @@ def test_what_is_cached_stays_in_the_log_however_old_it_is(logging: Logging, fol
     assert len(segments(folder)) <= 6
 
 
-def test_what_is_carried_forward_is_on_the_disk_before_the_old_copy_is_freed(
+def test_carried_packets_are_synced_before_the_old_copy_is_freed(
     logging: Logging, folder: Path, small: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = logging()
@@ -180,7 +180,7 @@ def test_segments_that_are_not_recorded_yet_are_kept(logging: Logging, folder: P
     assert kept[0] > 20
 
 
-def test_segments_that_are_recorded_are_written_over(logging: Logging, folder: Path, small: None) -> None:
+def test_recorded_segments_are_overwritten(logging: Logging, folder: Path, small: None) -> None:
     expect_recorder(folder)
     log = logging()
     for time_ns in range(1, 200):
@@ -192,7 +192,7 @@ def test_segments_that_are_recorded_are_written_over(logging: Logging, folder: P
     assert kept == list(range(kept[0], 200)), "what was in the files before is not found again"
 
 
-def test_another_life_does_not_take_what_was_written_over_for_new(logging: Logging, folder: Path, small: None) -> None:
+def test_new_life_ignores_remains_in_an_overwritten_segment(logging: Logging, folder: Path, small: None) -> None:
     log = logging()
     for time_ns in range(1, 60):
         log.append(entry(time_ns, 40))
@@ -209,7 +209,7 @@ def test_another_life_does_not_take_what_was_written_over_for_new(logging: Loggi
         assert packet.payload == entry(packet.time_ns or 0, len(packet.payload)).packet.payload
 
 
-def test_the_oldest_is_given_up_where_the_recorder_is_too_far_behind_and_that_is_told(
+def test_oldest_segment_is_given_up_and_reported_if_the_recorder_is_too_late(
     logging: Logging, folder: Path, small: None
 ) -> None:
     expect_recorder(folder)
@@ -259,7 +259,7 @@ def test_a_full_disk_is_not_filled_with_files_nor_with_halves(logging: Logging, 
     real = segment._file
 
     class Full:
-        """Has room for a few bytes more."""
+        """A disk with room for a few bytes."""
 
         def write(self, data: memoryview) -> int:
             real.write(data[:3])
@@ -295,7 +295,7 @@ def test_a_reader_follows_the_log_over_segments_and_lives(logging: Logging, fold
     assert found == list(range(1, 61))
 
 
-def test_a_reader_goes_on_where_another_was(logging: Logging, folder: Path, small: None) -> None:
+def test_reader_continues_at_the_position_of_another(logging: Logging, folder: Path, small: None) -> None:
     log = logging()
     for time_ns in range(1, 30):
         log.append(entry(time_ns, 40))
@@ -330,7 +330,7 @@ def test_a_reader_of_segments_that_are_gone_goes_on_with_the_oldest_there_is(
     assert found == times(folder)
 
 
-def test_how_far_it_is_recorded_is_known_from_the_beginning(folder: Path) -> None:
+def test_committed_position_exists_from_the_beginning(folder: Path) -> None:
     assert committed(folder) is None
     expect_recorder(folder)
     assert committed(folder) == START
@@ -341,7 +341,7 @@ def test_how_far_it_is_recorded_is_known_from_the_beginning(folder: Path) -> Non
     assert committed(folder) == START
 
 
-def test_after_the_end_nothing_is_left_if_all_is_recorded(logging: Logging, folder: Path) -> None:
+def test_fully_recorded_log_is_removed_after_the_end(logging: Logging, folder: Path) -> None:
     expect_recorder(folder)
     log = logging()
     log.append(entry(1))

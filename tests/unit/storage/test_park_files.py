@@ -1,4 +1,4 @@
-"""Park's TIFF files: what the emulator writes, judged by Gwyddion where it is installed, and what is refused."""
+"""Park's TIFF files: the emulator's files, judged by Gwyddion if installed, and refusals."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Drawn:
 
 @pytest.fixture
 def written(tmp_path: Path) -> dict[str, Path]:
-    """The files of a scan, by channel and direction."""
+    """Return the files of a scan, by channel and direction."""
     scan = ScanActivity(1, REGION, (12, 20), 0.0, 0.5, True, Feedback(setpoint=0.7), 0.2)
     scan.draw(Drawn())
     for name, content in files.images(scan, 1.7e9, "NCM"):
@@ -54,7 +54,7 @@ def test_a_channel_is_read_as_it_was_scanned(written: dict[str, Path]) -> None:
     assert content.start_ns == 1.7e18
 
 
-def test_directions_and_units_are_told_apart(written: dict[str, Path]) -> None:
+def test_directions_and_units_are_distinguished(written: dict[str, Path]) -> None:
     (back,), (phase,) = (afspm.read(written[name]).scans for name in ("Z Height_Backward", "Phase_Forward"))
     assert (back.channel, phase.channel, phase.unit) == ("Z Height Backward", "Phase Forward", "deg")
     np.testing.assert_allclose(phase.values, HEIGHTS * 1e9, rtol=1e-6)
@@ -100,7 +100,7 @@ def test_curves_that_are_not_whole_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_makers_own_reader_reads_the_same(written: dict[str, Path], tmp_path: Path) -> None:
-    """It wants a picture in colours and in several strips, which every Park file has."""
+    """The reader needs a coloured picture in several strips, which every Park file has."""
     tiff = pytest.importorskip(
         "pspylib.tiff", reason="pspylib, Park's own reader, is not installed (pip install pspylib)"
     )

@@ -1,4 +1,4 @@
-"""Files of real microscopes: what is known of them comes out."""
+"""Files of real microscopes: their known facts are read."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def alike(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.corrcoef(a[known], b[known])[0, 1])
 
 
-def test_the_wave_of_asylum_is_what_another_reader_finds() -> None:
+def test_wave_of_asylum_agrees_with_another_reader() -> None:
     igor2 = pytest.importorskip("igor2.binarywave")
     content = real("asylum/DTMicroscope_scan_0001.ibw")
     raw = igor2.load(str(DATA / "asylum/DTMicroscope_scan_0001.ibw"))["wave"]["wData"]

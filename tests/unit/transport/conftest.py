@@ -1,4 +1,4 @@
-"""What the tests of the transport share: ports that are closed at the end, and waiting with a deadline."""
+"""Shared fixtures of the transport: ports that are closed at the end, and waiting with a deadline."""
 
 from __future__ import annotations
 

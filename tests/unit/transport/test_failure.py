@@ -1,4 +1,4 @@
-"""What a person is told when their code raises: their lines, without ours."""
+"""The text of an error in a user's code: the user's lines, without those of afspm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OURS = Path(MessageDispatcher.give.__code__.co_filename).parents[1]
 
 
 def made_up(code: str, **names: object) -> dict[str, Any]:
-    """The names that `code` defines, as if it stood in a file of ours."""
+    """Return the names that `code` defines, as if it were a file of afspm."""
     exec(compile(code, str(OURS / "client" / "made_up.py"), "exec"), names)
     return names
 
@@ -35,7 +35,7 @@ def call(function):
 
 
 def raised(function: Callable[[], object]) -> BaseException:
-    """What it raises when it is called by code of ours."""
+    """Return the error that a function raises when afspm's code calls it."""
     error = made_up(CALL)["call"](function)
     assert isinstance(error, BaseException)
     return error
@@ -51,14 +51,14 @@ def refuse() -> None:
     made_up(REFUSE, Refused=Refused)["refuse"]()
 
 
-def test_first_comes_what_happened_then_the_lines_of_whoever_wrote_the_component() -> None:
+def test_error_text_has_the_message_before_the_users_lines() -> None:
     lines = describe(raised(lambda: {}["sharpness"])).splitlines()
     assert lines[0] == "KeyError: 'sharpness'"
     assert all("made_up.py" not in line for line in lines[1:])
     assert any("test_failure.py" in line for line in lines[1:])
 
 
-def test_what_we_refused_is_told_at_the_line_that_asked_for_it() -> None:
+def test_refusal_is_shown_at_the_users_line() -> None:
     text = describe(raised(refuse), "series")
     assert text.splitlines()[0] == "too far"
     assert "made_up.py" not in text
@@ -77,24 +77,24 @@ def run():
 """
 
 
-def test_what_a_component_of_ours_was_refused_within_a_context_is_told() -> None:
+def test_refusal_inside_a_context_of_an_own_component_is_shown() -> None:
     run = made_up(WITHIN, Refused=Refused, contextmanager=contextmanager)["run"]
     assert describe(raised(run), "series").splitlines()[0].startswith("too far")
 
 
-def test_an_error_of_ours_alone_is_told_whole() -> None:
+def test_error_of_afspm_alone_is_shown_whole() -> None:
     text = describe(raised(lambda: 1 / 0), package=Path(__file__).parents[3])  # as if all of this were ours
     assert "made_up.py" in text
     assert "test_failure.py" in text
 
 
-def test_a_refusal_of_what_a_component_of_ours_asked_for_is_told_in_its_words() -> None:
+def test_refusal_of_an_own_component_is_only_its_message() -> None:
     error = raised(refuse)
     error.__cause__ = raised(lambda: {}["of a library that we called"])
     assert describe(error, "series", package=Path(__file__).parents[3]) == "too far"
 
 
-def test_what_led_to_it_is_told_too() -> None:
+def test_chained_errors_are_shown() -> None:
     def careless() -> None:
         try:
             {}["first"]
@@ -107,7 +107,7 @@ def test_what_led_to_it_is_told_too() -> None:
     assert "made_up.py" not in text
 
 
-def test_asking_for_the_scope_too_early_is_told_at_the_line_that_did() -> None:
+def test_scope_used_too_early_is_shown_at_its_line() -> None:
     class Early(Component):
         def __init__(self) -> None:
             self.region = self.scope.scan_parameters
@@ -128,5 +128,5 @@ def test_asking_for_the_scope_too_early_is_told_at_the_line_that_did() -> None:
         lambda: ScanParameters(shape=("64", 64)),
     ],
 )
-def test_values_of_the_wrong_kind_are_told_with_what_would_be_right(wrong: Callable[[], object]) -> None:
+def test_value_of_the_wrong_type_is_refused_with_the_right_one(wrong: Callable[[], object]) -> None:
     assert "e.g. " in describe(raised(wrong)).splitlines()[0]

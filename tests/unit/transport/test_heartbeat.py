@@ -1,4 +1,4 @@
-"""Heartbeats: they come while a process is busy, and say so."""
+"""Heartbeats of idle and busy processes."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def test_the_first_beat_comes_at_once_and_others_follow_with_the_age_of_the_step
     assert beats(listener, 1)[-1] == Heartbeat("Component", True, 1.5, 30.0)
 
 
-def test_beats_come_at_their_period_while_the_main_thread_does_nothing_of_the_kind(open_: Any) -> None:
+def test_heartbeats_keep_their_period_while_the_main_thread_is_busy(open_: Any) -> None:
     listener = open_(HeartbeatListener())
     open_(HeartbeatSender(listener.listen("Component")[0], 0.02, lambda: 0.0, lambda: 30.0))
     assert len(beats(listener, 5)) >= 5
 
 
-def test_each_process_is_heard_under_its_own_name(open_: Any) -> None:
+def test_heartbeats_arrive_under_the_name_of_their_process(open_: Any) -> None:
     listener = open_(HeartbeatListener())
     for name in ("One", "Two"):
         open_(HeartbeatSender(listener.listen(name)[0], 0.02, lambda: 0.0, lambda: 30.0))
@@ -47,8 +47,8 @@ def test_each_process_is_heard_under_its_own_name(open_: Any) -> None:
 
 
 @pytest.mark.parametrize("needs_token", [True, False])
-def test_nobody_else_can_say_that_a_process_closes_or_lives(open_: Any, needs_token: bool) -> None:
-    """A process that knows its token is known by it: from the beginning, or from its first beat on."""
+def test_only_the_process_itself_can_send_its_heartbeats(open_: Any, needs_token: bool) -> None:
+    """A token identifies the process, from the beginning or from its first heartbeat on."""
     listener = open_(HeartbeatListener())
     address = listener.listen("Component", token="secret", needs_token=needs_token)[0]
     sender = open_(HeartbeatSender(address, 0.02, lambda: 0.0, lambda: 30.0, "secret"))
@@ -66,7 +66,7 @@ def test_nobody_else_can_say_that_a_process_closes_or_lives(open_: Any, needs_to
     assert beats(listener, 1)[-1].closing
 
 
-def test_a_program_of_version_1_is_heard_without_a_token(open_: Any) -> None:
+def test_heartbeats_of_version_1_need_no_token(open_: Any) -> None:
     listener = open_(HeartbeatListener())
     open_(HeartbeatSender(listener.listen("Component", token="secret")[0], 0.02, lambda: 0.0, lambda: 30.0))
     assert not beats(listener, 2)[-1].closing
@@ -95,5 +95,7 @@ def test_waiting_for_beats_ends_when_woken_up(open_: Any) -> None:
         ([], None),
     ],
 )
-def test_beats_of_ours_and_of_version_1_are_read_and_nothing_else(frames: list[bytes], beat: Heartbeat | None) -> None:
+def test_heartbeats_of_both_versions_are_read_and_other_messages_ignored(
+    frames: list[bytes], beat: Heartbeat | None
+) -> None:
     assert read_beat("C", frames) == beat

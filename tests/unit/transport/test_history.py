@@ -1,4 +1,4 @@
-"""What a publisher keeps for those who come later."""
+"""Packets that a publisher keeps for late joiners."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.transport.publisher import Publisher
 CLOCK = ExperimentClock.real()
 
 
-def test_what_is_of_this_moment_only_is_not_sent_to_who_comes_later() -> None:
+def test_packet_about_the_moment_is_not_sent_to_late_joiners() -> None:
     published = PublishedHistory(CLOCK, most_packets=3)
     scan = published.stamp("Scan2d", b"scan")
     lines = [published.stamp("ScanLines", b"line", keep=False) for _ in range(10)]
@@ -45,7 +45,7 @@ def test_a_history_gives_only_packets_newer_than_the_time_asked_for(
 def test_a_replay_has_only_packets_newer_than_the_time_in_its_marker(
     three: tuple[PublishedHistory, list[Packet]], plain: Any, open_: Any, until: Any
 ) -> None:
-    """Subscribers drop what they have had, so only the wire shows that it was sent again."""
+    """Subscribers drop repeated packets, so only the wire shows a needless replay."""
     published, packets = three
     network = open_(Network())
     publisher = Publisher(network, "tcp://127.0.0.1:0", published)

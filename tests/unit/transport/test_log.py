@@ -1,4 +1,4 @@
-"""What a process writes to standard error."""
+"""Lines of a process on standard error."""
 
 from __future__ import annotations
 
@@ -15,6 +15,6 @@ logging.getLogger("matplotlib").warning("no such font")
 """
 
 
-def test_details_are_ours_alone_and_libraries_only_warn() -> None:
+def test_debug_records_of_libraries_are_dropped() -> None:
     ran = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, encoding="utf-8", check=True)
     assert ran.stderr.splitlines() == ["DEBUG ours", "WARNING no such font"]

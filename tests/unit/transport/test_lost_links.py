@@ -31,7 +31,7 @@ def unreachable() -> Iterator[int]:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems refuse where what waits is full")
-def test_an_attempt_to_connect_is_given_up_and_begun_again(
+def test_attempt_to_connect_is_ended_and_begun_again(
     unreachable: int, open_: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert network._CONNECT_MS <= 3_000  # a partition is to heal within ten seconds
@@ -52,9 +52,9 @@ def test_a_host_name_listens_at_every_address_of_the_computer(open_: Any, monkey
     assert bound.startswith("tcp://0.0.0.0:")
 
 
-@pytest.mark.parametrize(("ip", "told"), [("192.0.2.7", "another computer: 192.0.2.7"), ("", "no name")])
+@pytest.mark.parametrize(("ip", "reason"), [("192.0.2.7", "another computer: 192.0.2.7"), ("", "not know the name")])
 def test_the_name_of_another_computer_is_refused(
-    open_: Any, monkeypatch: pytest.MonkeyPatch, ip: str, told: str
+    open_: Any, monkeypatch: pytest.MonkeyPatch, ip: str, reason: str
 ) -> None:
     def lookup(*_: object) -> Any:
         if not ip:
@@ -63,5 +63,5 @@ def test_the_name_of_another_computer_is_refused(
 
     monkeypatch.setattr(socket, "getaddrinfo", lookup)
     ours = open_(Network(insecure=True))
-    with pytest.raises(TransportError, match=told):
+    with pytest.raises(TransportError, match=reason):
         ours.bind(ours.socket(zmq.ROUTER), "tcp://microscope-7:29001")

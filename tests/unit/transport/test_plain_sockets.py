@@ -1,4 +1,4 @@
-"""Programs of other makes, as plain sockets with the golden bytes, in every place that they can take."""
+"""Programs of other makes in every role, as plain sockets with the golden bytes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def random_port(socket: Any) -> str:
     return f"tcp://127.0.0.1:{socket.bind_to_random_port('tcp://127.0.0.1')}"
 
 
-def test_a_plain_req_socket_asks_our_server(open_: Any, plain: Any, until: Any) -> None:
+def test_plain_req_socket_gets_answers_of_the_server(open_: Any, plain: Any, until: Any) -> None:
     server, requester = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None)), plain(zmq.REQ)
     requester.connect(server.serve_address)
     for request, response in zip(REQUESTS, RESPONSES * len(REQUESTS), strict=False):
@@ -42,7 +42,7 @@ def test_a_plain_req_socket_asks_our_server(open_: Any, plain: Any, until: Any) 
         assert requester.recv_multipart() == response
 
 
-def test_a_name_that_is_in_use_is_heard_by_its_newest_connection(open_: Any, plain: Any, until: Any) -> None:
+def test_newest_connection_of_a_name_is_served(open_: Any, plain: Any, until: Any) -> None:
     server = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=None))
     for _ in range(3):  # of which none is closed: who crashed with its computer is not found dead for seconds
         requester, asked = plain(zmq.REQ), []
@@ -54,7 +54,7 @@ def test_a_name_that_is_in_use_is_heard_by_its_newest_connection(open_: Any, pla
         assert requester.recv_multipart() == RESPONSES[0]
 
 
-def test_our_component_asks_a_plain_router(open_: Any, plain: Any, until: Any) -> None:
+def test_component_gets_answers_of_a_plain_router(open_: Any, plain: Any, until: Any) -> None:
     router, found = plain(zmq.ROUTER), []
     port = open_(ZmqPort(Network(), "Component", CLOCK, control=random_port(router)))
     until(lambda: ControlConnected() in found, (port, found))
@@ -69,9 +69,7 @@ def test_our_component_asks_a_plain_router(open_: Any, plain: Any, until: Any) -
         assert found == [ReplyReceived(wire.decode_response(response))]
 
 
-def test_our_component_says_nothing_to_a_router_before_it_has_something_to_ask(
-    open_: Any, plain: Any, until: Any
-) -> None:
+def test_component_sends_nothing_to_a_router_before_its_first_request(open_: Any, plain: Any, until: Any) -> None:
     router, found = plain(zmq.ROUTER), []
     port = open_(ZmqPort(Network(), "Component", CLOCK, control=random_port(router)))
     until(lambda: ControlConnected() in found, (port, found))
@@ -79,7 +77,7 @@ def test_our_component_says_nothing_to_a_router_before_it_has_something_to_ask(
 
 
 @pytest.mark.parametrize("with_time", [True, False])
-def test_our_component_subscribes_to_a_plain_pub(open_: Any, plain: Any, until: Any, with_time: bool) -> None:
+def test_component_subscribes_to_a_plain_pub(open_: Any, plain: Any, until: Any, with_time: bool) -> None:
     publisher, found = plain(zmq.XPUB), []
     port = open_(ZmqPort(Network(), "Component", CLOCK, subscribe=[random_port(publisher)], envelopes=["Scan2d"]))
     seen = set()
@@ -95,7 +93,7 @@ def test_our_component_subscribes_to_a_plain_pub(open_: Any, plain: Any, until: 
     assert not any(isinstance(incoming, CaughtUp) for incoming in found)
 
 
-def test_our_component_drops_what_a_plain_pub_repeats(open_: Any, plain: Any, until: Any) -> None:
+def test_component_drops_repeated_packets_of_a_plain_pub(open_: Any, plain: Any, until: Any) -> None:
     publisher, found = plain(zmq.XPUB), []
     port = open_(ZmqPort(Network(), "Component", CLOCK, subscribe=[random_port(publisher)]))
     while publisher.recv() != b"\1":
@@ -110,7 +108,7 @@ def test_our_component_drops_what_a_plain_pub_repeats(open_: Any, plain: Any, un
 
 
 @pytest.mark.parametrize("prefix", [b"", b"Scan2d"])
-def test_a_plain_sub_gets_what_was_published_before_oldest_first_and_then_what_follows(
+def test_plain_sub_gets_earlier_packets_oldest_first_then_live_ones(
     open_: Any, plain: Any, until: Any, prefix: bytes
 ) -> None:
     publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
@@ -130,7 +128,7 @@ def test_a_plain_sub_gets_what_was_published_before_oldest_first_and_then_what_f
     assert times == sorted(set(times))
 
 
-def test_a_plain_sub_to_everything_does_not_see_the_replay_for_one_of_ours(open_: Any, plain: Any, until: Any) -> None:
+def test_plain_sub_to_everything_does_not_see_another_replay(open_: Any, plain: Any, until: Any) -> None:
     publisher, subscriber = open_(ZmqServerPort(Network(), CLOCK, serve=ANY, publish=ANY)), plain(zmq.SUB)
     subscriber.setsockopt(zmq.SUBSCRIBE, b"")
     subscriber.connect(publisher.publish_address)

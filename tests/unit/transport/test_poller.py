@@ -1,4 +1,4 @@
-"""How long is waited, and for what."""
+"""Timeouts and sources of the poller."""
 
 from __future__ import annotations
 
@@ -22,20 +22,18 @@ def wake_up() -> Iterator[WakeUp[str]]:
 
 
 @pytest.mark.parametrize("timeout_s", [3e6, 1e30, math.inf])
-def test_a_deadline_beyond_what_a_poller_can_wait_for_is_waited_for_in_parts(
-    wake_up: WakeUp[str], timeout_s: float
-) -> None:
+def test_deadline_beyond_the_pollers_limit_is_reached_in_parts(wake_up: WakeUp[str], timeout_s: float) -> None:
     wake_up.post("come")
     _, woken = Poller(wake_up).wait(milliseconds(timeout_s))
     assert woken
     assert wake_up.take() == ["come"]
 
 
-def test_no_deadline_is_none_and_a_part_of_a_millisecond_is_one() -> None:
+def test_timeouts_are_rounded_up_and_none_is_unlimited() -> None:
     assert (milliseconds(None), milliseconds(0.0001), milliseconds(-1.0)) == (None, 1, 0)
 
 
-def test_sources_are_named_when_their_sockets_can_be_read(wake_up: WakeUp[str], plain: Callable[[int], Any]) -> None:
+def test_poller_returns_the_sources_of_readable_sockets(wake_up: WakeUp[str], plain: Callable[[int], Any]) -> None:
     near, far = plain(zmq.PAIR), plain(zmq.PAIR)
     near.connect(f"tcp://127.0.0.1:{far.bind_to_random_port('tcp://127.0.0.1')}")
     waiting: Poller[str] = Poller(wake_up)

@@ -44,7 +44,7 @@ def kinds(found: list[Any]) -> set[type]:
     return {type(incoming) for incoming in found}
 
 
-def test_who_comes_late_gets_what_was_published_before_in_order_then_what_follows(open_: Any, until: Any) -> None:
+def test_late_joiner_gets_earlier_packets_in_order_then_live_ones(open_: Any, until: Any) -> None:
     publisher, found = open_(server()), []
     for n in range(20):
         publisher.publish(f"Scan2d_{n % 3}", b"%d" % n)
@@ -55,7 +55,7 @@ def test_who_comes_late_gets_what_was_published_before_in_order_then_what_follow
     assert payloads(found) == [b"%d" % n for n in range(20)] + [b"live"]
 
 
-def test_only_the_late_one_is_sent_it_again(open_: Any, until: Any) -> None:
+def test_replay_reaches_only_the_late_joiner(open_: Any, until: Any) -> None:
     publisher, early_found, late_found = open_(server()), [], []
     early = open_(component("Early", subscribe=[publisher.publish_address]))
     until(lambda: CaughtUp in kinds(early_found), (publisher, []), (early, early_found))
@@ -70,7 +70,7 @@ def test_only_the_late_one_is_sent_it_again(open_: Any, until: Any) -> None:
     assert payloads(early_found) == payloads(late_found) == [b"one", b"two"]
 
 
-def test_two_that_take_everything_do_not_see_each_others_replay(open_: Any, until: Any) -> None:
+def test_two_subscribers_to_everything_do_not_see_each_others_replay(open_: Any, until: Any) -> None:
     publisher = open_(server())
     publisher.publish("Scan2d", b"one")
     ports = [open_(component(f"C{n}", subscribe=[publisher.publish_address])) for n in range(4)]
@@ -79,7 +79,7 @@ def test_two_that_take_everything_do_not_see_each_others_replay(open_: Any, unti
     assert [payloads(f) for f in found] == [[b"one"]] * 4
 
 
-def test_only_the_envelopes_asked_for_arrive(open_: Any, until: Any) -> None:
+def test_only_subscribed_envelopes_arrive(open_: Any, until: Any) -> None:
     publisher, found = open_(server()), []
     publisher.publish("Scan2d_5.0_Height", b"scan")
     publisher.publish("ScopeStateMsg", b"state")
@@ -91,7 +91,7 @@ def test_only_the_envelopes_asked_for_arrive(open_: Any, until: Any) -> None:
     assert payloads(found) == [b"scan", b"spectrum"]
 
 
-def test_a_restarted_publisher_is_found_again_and_what_was_had_does_not_come_twice(open_: Any, until: Any) -> None:
+def test_restarted_publisher_is_found_and_packets_do_not_come_twice(open_: Any, until: Any) -> None:
     publisher, found = server(), []
     address = publisher.publish_address
     port = open_(component(subscribe=[address]))
@@ -139,7 +139,7 @@ def test_a_component_publishes_to_others(open_: Any, until: Any) -> None:
         second.publish("Score", b"")
 
 
-def test_a_request_is_answered_and_the_servers_coming_and_going_is_told(open_: Any, until: Any) -> None:
+def test_request_is_answered_and_connections_of_the_server_are_events(open_: Any, until: Any) -> None:
     translator, found, asked = server(), [], []
     address = translator.serve_address
     port = open_(component(control=address))
@@ -178,13 +178,13 @@ def test_a_server_takes_one_request_at_a_time_and_may_leave_one_unanswered(open_
     assert replies == [b"second"]
 
 
-def test_another_thread_ends_a_wait_and_says_why(open_: Any) -> None:
+def test_another_thread_ends_a_wait_with_an_event(open_: Any) -> None:
     port = open_(component())
     threading.Timer(0.05, lambda: port.wake_up(ParentGone())).start()
     assert port.poll(None) == [ParentGone()]
 
 
-def test_closing_takes_less_than_half_a_second_even_when_nobody_answers() -> None:
+def test_closing_takes_less_than_half_a_second_without_a_peer() -> None:
     publisher = server()
     ports = [component(f"C{n}", subscribe=[publisher.publish_address], control=ANY[:-1] + "1") for n in range(3)]
     for port in ports:

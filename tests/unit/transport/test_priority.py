@@ -1,4 +1,4 @@
-"""Who only looks on lets others have the processor first."""
+"""Processes that only observe have a lower priority."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_on_windows_the_whole_process_steps_back() -> None:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are classes of priority there")
-def test_threads_that_come_later_step_back_and_on_linux_those_that_beat_do_not() -> None:
+def test_later_threads_step_back_and_on_linux_the_heartbeat_does_not() -> None:
     ours = os.nice(0)
     early, late = map(int, subprocess.run((sys.executable, "-c", TOLD), capture_output=True, check=True).stdout.split())
     assert late == min(19, ours + 10)

@@ -24,7 +24,7 @@ CLOCK = ExperimentClock.real()
 
 
 class Listening:
-    """A router and everything that it has told."""
+    """A router and all its events."""
 
     def __init__(self, open_: Any, own: Keys | None = None) -> None:
         self.network = open_(Network(own))
@@ -33,7 +33,7 @@ class Listening:
         self.told: list[Any] = []
 
     def until(self, count: int, kind: type = PeerAsked, *ports: ZmqPort) -> list[Any]:
-        """What was told of a kind, once it is so much; `ports` of ours are waited for meanwhile."""
+        """Return the events of a kind once there are `count`, while polling `ports`."""
         deadline_s = time.monotonic() + 5.0
         while len(found := [event for event in self.told if isinstance(event, kind)]) < count:
             assert time.monotonic() < deadline_s, self.told
@@ -50,7 +50,7 @@ def peer(plain: Any, listening: Listening, name: bytes, kind: int = zmq.DEALER) 
     return made
 
 
-def test_req_and_dealer_peers_are_heard_by_name_and_answered(open_: Any, plain: Any) -> None:
+def test_req_and_dealer_peers_are_known_by_name_and_answered(open_: Any, plain: Any) -> None:
     listening = Listening(open_)
     for name, kind in ((b"Req", zmq.REQ), (b"Dealer", zmq.DEALER)):
         asking = peer(plain, listening, name, kind)
@@ -62,7 +62,7 @@ def test_req_and_dealer_peers_are_heard_by_name_and_answered(open_: Any, plain: 
         listening.told.clear()
 
 
-def test_a_connection_is_told_before_what_it_says_and_its_end_after(open_: Any, plain: Any) -> None:
+def test_connection_event_precedes_requests_and_its_end_follows(open_: Any, plain: Any) -> None:
     listening = Listening(open_)
     talking = peer(plain, listening, b"A")
     for n in range(100):
@@ -74,7 +74,7 @@ def test_a_connection_is_told_before_what_it_says_and_its_end_after(open_: Any, 
     assert listening.told == [PeerConnected(connection), *expected, PeerDisconnected(connection)]
 
 
-def test_a_restarted_peer_comes_after_its_former_life_was_told_to_be_over(open_: Any, plain: Any) -> None:
+def test_end_of_a_former_life_precedes_the_restarted_peer(open_: Any, plain: Any) -> None:
     listening = Listening(open_)
     for _ in range(5):
         asking = peer(plain, listening, b"A")
@@ -87,7 +87,7 @@ def test_a_restarted_peer_comes_after_its_former_life_was_told_to_be_over(open_:
         listening.told.clear()
 
 
-def test_end_of_a_req_socket_is_found_and_others_are_sent_nothing_but_answers(open_: Any, plain: Any) -> None:
+def test_end_of_a_req_socket_is_found_without_probes(open_: Any, plain: Any) -> None:
     listening = Listening(open_)
     asking, witness = peer(plain, listening, b"A", zmq.REQ), peer(plain, listening, b"B", zmq.REQ)
     asking.send(b"\7")
@@ -112,7 +112,7 @@ def test_peers_without_a_name_have_none(open_: Any, plain: Any) -> None:
     assert [asked.name for asked in listening.until(2)] == ["", ""]
 
 
-def test_what_is_no_request_is_dropped_and_the_next_is_heard(open_: Any, plain: Any) -> None:
+def test_malformed_request_is_dropped_and_the_next_is_received(open_: Any, plain: Any) -> None:
     listening = Listening(open_)
     talking = peer(plain, listening, b"A")
     for frames in ([b"x"], [b"x", b"", b"\7"], [b""], [b"", b"\7"]):
@@ -131,7 +131,7 @@ def test_a_message_that_is_too_large_ends_its_connection_and_nothing_else(open_:
     assert [asked.name for asked in listening.until(2)] == ["Large", "Other"]
 
 
-def test_those_that_speak_another_protocol_come_and_go(open_: Any, plain: Any) -> None:
+def test_peers_of_another_protocol_do_no_harm(open_: Any, plain: Any) -> None:
     listening = Listening(open_)
     port = int(listening.router.address.rpartition(":")[2])
     for sent in (b"", b"GET / HTTP/1.0\r\n\r\n", b"\x01\x00" * 100, b"\xff\0\0\0\0\0\0\0\1\x7f\3\0NULL"):
@@ -141,7 +141,7 @@ def test_those_that_speak_another_protocol_come_and_go(open_: Any, plain: Any) -
     assert [asked.name for asked in listening.until(1)] == ["A"]
 
 
-def test_to_be_looked_for_disturbs_no_component(open_: Any, until: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_probe_disturbs_no_component(open_: Any, until: Any, caplog: pytest.LogCaptureFixture) -> None:
     listening, found = Listening(open_), []
     component = open_(ZmqPort(Network(), "A", CLOCK, control=listening.router.address))
     until(lambda: ControlConnected() in found, (component, found))
@@ -155,7 +155,7 @@ def test_to_be_looked_for_disturbs_no_component(open_: Any, until: Any, caplog: 
 
 
 class Run:
-    """A router with keys that were made for a run, and clients of it."""
+    """A router with keys made for a run, and its clients."""
 
     def __init__(self, open_: Any) -> None:
         self._open = open_
@@ -181,7 +181,7 @@ class Run:
 
 
 def answered(port: ZmqPort) -> list[bytes]:
-    """The payloads of what the port is answered within a moment."""
+    """Return the payloads of the answers within a moment."""
     found: list[Any] = []
     deadline_s = time.monotonic() + 0.5
     while not found and time.monotonic() < deadline_s:
@@ -189,7 +189,7 @@ def answered(port: ZmqPort) -> list[bytes]:
     return [bytes(incoming.response.payload) for incoming in found]
 
 
-def test_nobody_takes_the_answers_of_another_by_its_name(open_: Any, plain: Any) -> None:
+def test_second_sender_of_a_name_gets_no_answers_of_the_first(open_: Any, plain: Any) -> None:
     run = Run(open_)
     series = run.client("series")
     series.send(wire.encode_request(Request(CLOCK_REQUEST, id="series/x/1")))
@@ -213,7 +213,7 @@ def test_nobody_takes_the_answers_of_another_by_its_name(open_: Any, plain: Any)
         assert bare.recv_multipart() == [b""]  # a look whether it is there
 
 
-def test_one_that_is_started_again_has_its_name_again_while_its_old_connection_stands(open_: Any) -> None:
+def test_restarted_sender_has_its_name_while_its_old_connection_stands(open_: Any) -> None:
     run = Run(open_)
     for life in range(2):
         port = run.client("series")
@@ -224,7 +224,7 @@ def test_one_that_is_started_again_has_its_name_again_while_its_old_connection_s
     assert answered(port) == [b"anew"]
 
 
-def test_second_process_of_a_name_leaves_the_first_its_answers(open_: Any) -> None:
+def test_second_process_of_a_name_does_not_take_answers(open_: Any) -> None:
     run = Run(open_)
     first = run.client(GUEST, "notebook")
     first.send(wire.encode_request(Request(CLOCK_REQUEST, id="notebook/first/1")))
@@ -245,7 +245,7 @@ def test_second_process_of_a_name_leaves_the_first_its_answers(open_: Any) -> No
     assert not [event for event in run.listening.told if isinstance(event, PeerDisconnected)]
 
 
-def test_restarted_peer_is_passed_on_after_the_end_of_its_former_life(open_: Any) -> None:
+def test_restarted_peer_is_reported_after_the_end_of_its_former_life(open_: Any) -> None:
     run = Run(open_)
     for life in range(5):
         port = run.client("series")
@@ -266,7 +266,7 @@ def test_guests_have_any_name_but_that_of_a_process(open_: Any) -> None:
     assert heard == ["notebook", "dashboard", GUEST, GUEST, GUEST, GUEST]
 
 
-def test_one_without_a_key_is_not_heard_and_that_is_told_once(
+def test_peer_without_a_key_is_refused_and_logged_once(
     open_: Any, plain: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
     run = Run(open_)

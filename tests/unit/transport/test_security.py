@@ -1,4 +1,4 @@
-"""What is let in: this computer, or the owners of keys."""
+"""Accepted peers: this computer, or the owners of keys."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zmq.utils import z85
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, TransportError
 from afspm.transport import keys
-from afspm.transport.authenticator import Authenticator
+from afspm.transport.keys import Authenticator
 from afspm.transport.network import Network, is_local
 from afspm.transport.port import CaughtUp, ControlConnected, PacketReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
@@ -45,13 +45,13 @@ def test_addresses_that_are_not_for_this_computer_only_are_refused_without_keys(
         assert "insecure" in refused.value.hint
 
 
-def test_insecure_has_to_be_said(open_: Any) -> None:
+def test_insecure_must_be_set_explicitly(open_: Any) -> None:
     network = open_(Network.from_launch("A", {"insecure": "true"}))
     assert network.bind(network.socket(zmq.PUB), "tcp://0.0.0.0:0").startswith("tcp://0.0.0.0:")
     assert open_(Network.from_launch("A", None)).keys is None
 
 
-def test_a_taken_port_is_said(open_: Any) -> None:
+def test_taken_port_is_reported(open_: Any) -> None:
     network = open_(Network())
     address = network.bind(network.socket(zmq.PUB), ANY)
     with pytest.raises(TransportError, match="can't bind") as refused:
@@ -60,7 +60,7 @@ def test_a_taken_port_is_said(open_: Any) -> None:
     assert str(refused.value).count(address) == 1
 
 
-def test_an_address_of_another_computer_is_said(open_: Any) -> None:
+def test_address_of_another_computer_is_reported(open_: Any) -> None:
     network = open_(Network(insecure=True))
     with pytest.raises(TransportError, match="can't bind") as refused:
         network.bind(network.socket(zmq.PUB), "tcp://192.0.2.1:0")  # kept for documents: nobody has it
@@ -95,7 +95,7 @@ def test_the_public_key_of_a_process_elsewhere_is_left_alone(tmp_path: Path) -> 
         keys.load(tmp_path, "elsewhere")
 
 
-def test_a_public_key_that_got_lost_is_the_same_again(tmp_path: Path) -> None:
+def test_lost_public_key_is_restored(tmp_path: Path) -> None:
     keys.generate(tmp_path, ["A"])
     before = keys.load(tmp_path, "A")
     (tmp_path / "public" / "A.key").unlink()
@@ -104,12 +104,12 @@ def test_a_public_key_that_got_lost_is_the_same_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../evil", "", "a/b", ".hidden", "x" * 200])
-def test_a_name_that_is_no_file_name_is_refused(tmp_path: Path, name: str) -> None:
+def test_name_that_is_not_valid_for_a_file_is_refused(tmp_path: Path, name: str) -> None:
     with pytest.raises(ConfigError):
         keys.generate(tmp_path, [name])
 
 
-def test_missing_and_broken_keys_are_told_apart(tmp_path: Path) -> None:
+def test_missing_and_broken_keys_are_distinguished(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="can't be read"):
         keys.load(tmp_path, "Nobody")
     keys.generate(tmp_path, ["A"])
@@ -130,7 +130,7 @@ def locked_component(folder: Path, name: str, server: ZmqServerPort, claimed: st
     return ZmqPort(network, claimed or name, CLOCK, subscribe=[server.publish_address], control=server.serve_address)
 
 
-def test_with_keys_the_server_knows_who_asks_and_packets_arrive(tmp_path: Path, open_: Any, until: Any) -> None:
+def test_with_keys_the_server_knows_the_sender_and_packets_arrive(tmp_path: Path, open_: Any, until: Any) -> None:
     keys.generate(tmp_path, ["translator", "scheduler"])
     server = open_(locked_server(tmp_path))
     server.publish("Scan2d", b"scan")
@@ -146,7 +146,7 @@ def test_with_keys_the_server_knows_who_asks_and_packets_arrive(tmp_path: Path, 
     assert RequestReceived([b"\1", b"", b""], "scheduler") in asked
 
 
-def test_a_key_that_is_made_while_it_runs_is_let_in(tmp_path: Path, open_: Any, until: Any) -> None:
+def test_key_made_during_the_run_is_accepted(tmp_path: Path, open_: Any, until: Any) -> None:
     keys.generate(tmp_path, ["translator"])
     server = open_(locked_server(tmp_path))
     keys.generate(tmp_path, ["scheduler"])
@@ -155,7 +155,7 @@ def test_a_key_that_is_made_while_it_runs_is_let_in(tmp_path: Path, open_: Any, 
     until(lambda: ControlConnected() in found, (server, []), (port, found))
 
 
-def test_who_knocks_while_a_key_is_being_written_does_not_spoil_it(tmp_path: Path) -> None:
+def test_connection_during_the_writing_of_a_key_does_no_harm(tmp_path: Path) -> None:
     keys.generate(tmp_path, ["translator", "late"])
     whole = (tmp_path / "public" / "late.key").read_bytes()
     (tmp_path / "public" / "late.key").unlink()
@@ -175,9 +175,7 @@ def test_who_knocks_while_a_key_is_being_written_does_not_spoil_it(tmp_path: Pat
     context.term()
 
 
-def test_a_known_key_that_is_not_the_schedulers_may_not_ask_a_translator(
-    tmp_path: Path, open_: Any, until: Any
-) -> None:
+def test_translator_refuses_known_keys_except_the_schedulers(tmp_path: Path, open_: Any, until: Any) -> None:
     keys.generate(tmp_path, ["translator", "scheduler", "visitor"])
     server = open_(locked_server(tmp_path))
     port = open_(locked_component(tmp_path, "visitor", server, claimed="scheduler"))
@@ -192,7 +190,7 @@ def test_a_known_key_that_is_not_the_schedulers_may_not_ask_a_translator(
 
 
 @pytest.mark.parametrize("stranger", ["a key of its own", "no key"])
-def test_strangers_are_not_let_in(tmp_path: Path, open_: Any, until: Any, plain: Any, stranger: str) -> None:
+def test_unknown_keys_are_refused(tmp_path: Path, open_: Any, until: Any, plain: Any, stranger: str) -> None:
     keys.generate(tmp_path, ["translator", "scheduler"])
     server = open_(locked_server(tmp_path))
     requester = plain(zmq.DEALER)
@@ -209,7 +207,7 @@ def test_strangers_are_not_let_in(tmp_path: Path, open_: Any, until: Any, plain:
     assert [a.frames for a in asked if isinstance(a, RequestReceived)] == [[b"\7", b"", b"friend"]]
 
 
-def test_an_address_whose_owner_is_not_known_is_refused(tmp_path: Path, open_: Any) -> None:
+def test_address_with_an_unknown_owner_is_refused(tmp_path: Path, open_: Any) -> None:
     keys.generate(tmp_path, ["A", "B"])
     network = open_(Network(keys.load(tmp_path, "A", {"tcp://127.0.0.1:5": "C"})))
     with pytest.raises(ConfigError, match="no key is set"):
@@ -220,7 +218,7 @@ def test_an_address_whose_owner_is_not_known_is_refused(tmp_path: Path, open_: A
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files have no modes there")
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o644])
-def test_a_secret_key_that_others_may_read_is_refused(tmp_path: Path, mode: int) -> None:
+def test_secret_key_readable_by_others_is_refused(tmp_path: Path, mode: int) -> None:
     keys.generate(tmp_path, ["series"])
     (tmp_path / "private" / "series.key_secret").chmod(mode)
     with pytest.raises(ConfigError, match=f"its mode is {mode:04o}") as refused:

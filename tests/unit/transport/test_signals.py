@@ -1,4 +1,4 @@
-"""What ends a program is told to the supervisor instead, the closing of the terminal too."""
+"""Signals that end a program are passed on, also SIGHUP of a closed terminal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.transport.process import signals
 
 @pytest.fixture
 def writer() -> Iterator[int]:
-    """What wakes a poller up."""
+    """Yield the descriptor that wakes a poller up."""
     ours, theirs = socket.socketpair()
     theirs.setblocking(False)
     with ours, theirs:
@@ -22,7 +22,7 @@ def writer() -> Iterator[int]:
 
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
-def test_each_is_told_and_ends_nothing_by_itself(name: str, writer: int) -> None:
+def test_caught_signal_is_passed_on_and_ends_nothing(name: str, writer: int) -> None:
     number = getattr(signal, name, None)
     if number is None or (sys.platform == "win32" and name == "SIGTERM"):
         pytest.skip("no such signal here")

@@ -1,4 +1,4 @@
-"""A subscriber that takes nothing any more: what waits for it is dropped, and once it goes on it gets everything."""
+"""A stalled subscriber: its waiting packets are dropped, and it gets them when it continues."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SOON_S = 6.0  # earlier than anything else disconnects it
 
 @pytest.fixture
 def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
-    """One that waits for a peer for half a second and remembers its last packet alone."""
+    """Return a publisher that waits for a peer for half a second and keeps only its last packet."""
     monkeypatch.setattr(network, "_STALLED_MS", 500)
     published = PublishedHistory(CLOCK, most_packets=2 * SCANS, most_bytes=2 * SCANS * len(SCAN))
 
@@ -54,7 +54,7 @@ def publisher(monkeypatch: pytest.MonkeyPatch, open_: Any) -> Any:
 
 
 @WITHOUT_MAXRT
-def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing(
+def test_packets_for_a_stalled_subscriber_are_dropped_and_others_miss_nothing(
     publisher: Any, plain: Any, open_: Any, until: Any
 ) -> None:
     stalled = plain(zmq.SUB)
@@ -83,7 +83,7 @@ def test_what_waits_for_one_that_stands_still_is_dropped_and_others_miss_nothing
 
 
 @WITHOUT_MAXRT
-def test_one_that_goes_on_after_standing_still_gets_everything_once(
+def test_stalled_subscriber_that_continues_gets_everything_once(
     publisher: Any, open_: Any, until: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = Network.socket

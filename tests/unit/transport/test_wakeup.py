@@ -1,4 +1,4 @@
-"""What other threads post is taken in turns that end."""
+"""Items from other threads are taken in bounded turns."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def wake_up() -> Iterator[WakeUp[int]]:
     made.close()
 
 
-def test_what_is_posted_is_taken_in_order_once(wake_up: WakeUp[int]) -> None:
+def test_posted_items_are_taken_in_order_once(wake_up: WakeUp[int]) -> None:
     for i in range(5):
         wake_up.post(i)
     assert wake_up.take() == [0, 1, 2, 3, 4]
     assert wake_up.take() == []
 
 
-def test_one_who_posts_all_the_time_does_not_keep_us_from_going_on(wake_up: WakeUp[int]) -> None:
+def test_constant_posting_does_not_block_the_taker(wake_up: WakeUp[int]) -> None:
     most = 10_000
 
     class Refilled(deque[int]):
-        """Whenever one is taken another is there, as from a thread that does nothing but post."""
+        """A queue that is never empty, as with a thread that posts all the time."""
 
         taken = 0
 

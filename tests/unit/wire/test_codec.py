@@ -1,4 +1,4 @@
-"""Arrays without lists, envelopes, users' own messages, and bytes that are none."""
+"""Arrays as views, envelopes, users' own messages, and bytes without a message."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_lines_of_a_scan_survive() -> None:
 
 
 @pytest.mark.parametrize(("first_row", "columns"), [(4, 4), (2, 3), (0, 0)])
-def test_lines_that_are_none_of_their_scan_are_refused(first_row: int, columns: int) -> None:
+def test_lines_outside_of_their_scan_are_refused(first_row: int, columns: int) -> None:
     from afspm.wire.generated.lines_pb2 import ScanLines as Message
 
     message = Message.FromString(wire.encode(LINES)[1])
@@ -82,7 +82,7 @@ def test_a_scans_values_are_a_view_of_the_buffer() -> None:
     assert scan.values[1, 1] == -5.0
 
 
-def test_a_scan_survives_whatever_the_layout_of_its_array() -> None:
+def test_scan_survives_with_any_layout_of_its_array() -> None:
     values = np.arange(24.0).reshape(4, 6)[::-1, ::2]
     scan = Scan(SCAN.region, "Height", "m", values)
     np.testing.assert_array_equal(wire.decode("Scan2d", wire.encode(scan)[1]).values, values)
@@ -135,7 +135,7 @@ def test_only_the_fields_that_are_present_are_set() -> None:
     assert (changed.region.angle_rad, changed.shape) == (0.25, (3, 4))
 
 
-def test_one_coordinate_or_one_number_of_pixels_alone_can_be_asked_for() -> None:
+def test_single_coordinate_or_number_of_pixels_can_be_requested() -> None:
     from afspm.wire.generated.spectroscopy_pb2 import ProbePosition as Message
 
     message = Message(units="um")
@@ -158,11 +158,17 @@ def test_one_coordinate_or_one_number_of_pixels_alone_can_be_asked_for() -> None
         ScanParameters(RegionChange(left_m=float("inf"))),
     ],
 )
-def test_values_that_make_no_sense_are_refused(subject: object) -> None:
+def test_invalid_values_are_refused(subject: object) -> None:
     kind = {Feedback: 4, ProbePosition: 5, ScanParameters: 3}[type(subject)]  # type: ignore[index]
     with pytest.raises(WireError) as refused:
         wire.decode_request([bytes([kind]), encode_subject(subject)])
     assert refused.value.response == ControlResponse.PARAM_ERROR
+
+
+def test_empty_region_is_refused_with_its_size_in_a_readable_unit() -> None:
+    payload = encode_subject(ScanParameters(RegionChange(height_m=-7.5e-6)))
+    with pytest.raises(WireError, match=r"the height of the region is -7\.5 µm"):
+        wire.decode_request([bytes([ControlRequest.SET_SCAN_PARAMS]), payload])
 
 
 def test_an_unknown_request_is_not_supported() -> None:
@@ -188,12 +194,12 @@ def test_a_response_carries_reason_id_and_detail() -> None:
     assert len(wire.encode_response(plain)) == 4
 
 
-def test_what_a_newer_peer_appends_to_a_response_is_not_looked_at() -> None:
+def test_frames_appended_by_a_newer_peer_are_ignored() -> None:
     newer = [b"\1", b"", b"why", b"a/1/2", bytes([200]), b"more"]
     assert wire.decode_response(newer) == Response(ControlResponse.FAILURE, b"", "why", "a/1/2")
 
 
-def test_a_parameter_without_a_value_asks_for_it() -> None:
+def test_parameter_without_a_value_is_a_reading() -> None:
     request = wire.decode_request(wire.encode_request(Request(ControlRequest.PARAM, Parameter("scan-speed"), id="1")))
     assert request.subject == Parameter("scan-speed")
 
@@ -207,12 +213,12 @@ def test_a_parameter_without_a_value_asks_for_it() -> None:
         ("ScanParameters2d", "ScanParameters2d"),
     ],
 )
-def test_the_message_of_an_envelope(envelope: str, message: str) -> None:
+def test_message_of_an_envelope_is_found(envelope: str, message: str) -> None:
     assert wire.message_of(envelope) == message
 
 
 @pytest.mark.parametrize("envelope", ["", "Scan", "Scan2", "Scan2dx", "Nobody_knows", "_", "KILL"])
-def test_an_envelope_of_no_message(envelope: str) -> None:
+def test_envelope_without_a_message_is_refused(envelope: str) -> None:
     with pytest.raises(WireError):
         wire.message_of(envelope)
 
@@ -231,7 +237,7 @@ def test_users_may_add_a_message_type() -> None:
     assert wire.header(name, payload).message == "CrystalAngle"
 
 
-def test_what_is_no_message_cannot_be_sent() -> None:
+def test_object_that_is_no_message_cannot_be_sent() -> None:
     with pytest.raises(InvalidValue, match="dict"):
         wire.encode({})
 
@@ -290,7 +296,7 @@ def test_any_frames_are_understood_or_refused(frames: list[bytes]) -> None:
 
 
 @pytest.mark.parametrize("lease_s", [1e-9, 0.5, 20.0, 86_400.0])
-def test_a_lease_is_told_in_seconds(lease_s: float) -> None:
+def test_lease_is_sent_in_seconds(lease_s: float) -> None:
     assert wire.decode_request(wire.encode_request(Request(LEASE_REQUEST, lease_s, id="1"))).subject == lease_s
 
 

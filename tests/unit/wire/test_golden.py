@@ -42,13 +42,13 @@ def parsed(name: str, payload: bytes) -> Any:
 
 
 @each("messages")
-def test_a_peers_bytes_say_what_they_should(entry: Any) -> None:
+def test_bytes_of_a_peer_are_decoded_as_specified(entry: Any) -> None:
     expected = json_format.ParseDict(entry["fields"], message_type(entry["type"])(), ignore_unknown_fields=False)
     assert parsed(entry["type"], bytes.fromhex(entry["hex"])) == expected
 
 
 @each("messages")
-def test_our_messages_are_the_reference_bytes(entry: Any) -> None:
+def test_encoded_messages_equal_the_reference_bytes(entry: Any) -> None:
     message = json_format.ParseDict(entry["fields"], message_type(entry["type"])())
     assert message.SerializeToString(deterministic=True).hex() == entry["hex"]
 
@@ -57,7 +57,7 @@ def test_our_messages_are_the_reference_bytes(entry: Any) -> None:
     "entry", [e for e in GOLDEN["messages"] if e["type"] in AS_MODEL], ids=lambda entry: entry["name"]
 )
 def test_model_objects_survive_a_round_trip(entry: Any) -> None:
-    """What we make of a peer's message and send on says the same in SI units, with the same presence."""
+    """A peer's message, decoded and sent on, has the same content in SI units and the same fields."""
     received = wire.decode(entry["type"], bytes.fromhex(entry["hex"]))
     name, sent = wire.encode(received)
     assert name == entry["type"]
@@ -67,7 +67,7 @@ def test_model_objects_survive_a_round_trip(entry: Any) -> None:
 
 
 def _presence(message: Any) -> Any:
-    """Which fields are there, all the way down."""
+    # the present fields at every level
     return {
         field.name: _presence(value) if field.message_type and not field.is_repeated else None
         for field, value in message.ListFields()
@@ -162,7 +162,7 @@ def test_signals_and_heartbeats() -> None:
     assert [wire.BEAT.hex(), wire.CLOSING.hex()] == [beat["frames"][0] for beat in GOLDEN["heartbeats"]]
 
 
-def test_our_enumerations_have_the_numbers_of_the_contract() -> None:
+def test_enumerations_have_the_numbers_of_the_contract() -> None:
     from afspm.wire.generated import control_pb2
 
     for ours, theirs, prefix in (

@@ -1,4 +1,4 @@
-"""A message is declared once: everything that goes by its name follows from the declaration."""
+"""A message is declared once, and everything else follows from its declaration."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def message_class(name: str, package: str = "lab") -> Any:
 
 @pytest.fixture
 def tilt(monkeypatch: pytest.MonkeyPatch) -> MessageDeclaration:
-    """A message that only a declaration makes known."""
+    """Declare a message that is not built in."""
     monkeypatch.setattr(messages, "_declared", dict(messages._declared))
     return wire.declare(
         MessageDeclaration(

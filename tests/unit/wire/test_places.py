@@ -1,4 +1,4 @@
-"""A message in other coordinates: the place changes, and nothing else."""
+"""A message in other coordinates: only its place changes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_spectrum_keeps_its_curves() -> None:
     assert (moved.kind, moved.time_ns, moved.filename) == ("IV", 7, "b.nc")
 
 
-def test_what_was_asked_for_is_given_back_in_its_own_unit() -> None:
+def test_requested_place_is_returned_in_its_own_unit() -> None:
     asked = wire.encode(ScanParameters(HERE, (64, 128), "nm"))[1]
     set_ = wire.encode(ScanParameters(THERE, (32, 128), "m"))[1]
     told = wire.relocated("ScanParameters2d", set_, wire.place_in("ScanParameters2d", asked))
@@ -60,7 +60,7 @@ def test_what_was_asked_for_is_given_back_in_its_own_unit() -> None:
 
 
 @pytest.mark.parametrize("name", ["Scan2d", "Spec1d", "ScanParameters2d"])
-def test_what_is_no_such_message_is_told(name: str) -> None:
+def test_bytes_of_another_message_are_refused(name: str) -> None:
     with pytest.raises(WireError):
         wire.relocated(name, b"\x0a\xff\xff", wire.encode_place(HERE))
 

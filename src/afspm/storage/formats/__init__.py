@@ -1,10 +1,10 @@
-"""Readers of the files that controllers write. Each format is a module; libraries are imported only when needed.
+"""Readers of the controllers' files. Each format is a module; libraries are imported only when needed.
 
     from afspm.storage.formats import read
     content = read("scan0001.ibw")
     content.scans[0].values      # [y, x], both ascending
 
-A reader is a function from a path and a time zone to a `FileContent`; packages declare readers by the suffix of their
+A reader is a function from a path and a time zone to a `FileContent`. Packages declare readers by the suffixes of their
 files (`afspm.basics.entry_points`).
 """
 

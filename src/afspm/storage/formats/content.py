@@ -1,4 +1,4 @@
-"""The content of a file of a controller, and the times in it."""
+"""`FileContent`: the content of a controller's file, with helpers for its times and column names."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from typing import Any
 from afspm.basics.errors import FileError
 from afspm.model import Scan, Spectrum
 
-_UNIT = re.compile(r"\s*\(((?:[^()]|\([^()]*\))*)\)")  # one pair of parentheses may stand in another: A/sqrt(Hz)
+_UNIT = re.compile(r"\s*\(((?:[^()]|\([^()]*\))*)\)")  # nested parentheses occur: A/sqrt(Hz)
 _TOPOGRAPHY = ("height", "zsensor", "topo", "zs-topo", "z")
 
 
 class OtherFormat(FileError):
-    """A file of another format with the same suffix: the next reader of the suffix is tried."""
+    """A file of another format with the same suffix; the next reader of the suffix is tried."""
 
     code = "file-format"
 
 
 @dataclass(frozen=True, eq=False)
 class FileContent:
-    """Everything of one file, in the model's geometry and units of the controller's (lengths in m).
+    """The content of one file, in the model's geometry and the controller's units (lengths in m).
 
     Attributes:
-        controller: who wrote it, e.g. "Nanonis".
-        scans: one for each channel.
-        spectra: of one file, one in most formats.
-        header: what the file says besides, as it says it.
-        start_ns, end_ns: when it was begun and finished, ns since the Unix epoch; None if that is not known.
-        upwards: whether small y was scanned first; None if that is not known.
+        controller: the controller that wrote it, e.g. "Nanonis".
+        scans: one scan for each channel.
+        spectra: the spectra of the file; in most formats one.
+        header: all further entries, unchanged.
+        start_ns, end_ns: start and end of the measurement, ns since the Unix epoch; None if unknown.
+        upwards: whether small y was scanned first; None if unknown.
     """
 
     controller: str
@@ -48,7 +48,7 @@ class FileContent:
 
     @property
     def topography(self) -> Scan | None:
-        """The first scan of heights; None if there is none."""
+        """Return the first scan of heights; None if there is none."""
         heights = [scan for scan in self.scans if scan.unit == "m"]
         for start in _TOPOGRAPHY:
             for scan in heights:
@@ -58,7 +58,7 @@ class FileContent:
 
 
 def name_and_unit(column: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit, which is the last text in parentheses; "" if none is.
+    """Return a column's name without its unit, and the unit, which is the last text in parentheses; "" without one.
 
     "Current (A) [filt]" is ("Current [filt]", "A"), and "Current PSD (A/sqrt(Hz))" is ("Current PSD", "A/sqrt(Hz)").
     """
@@ -73,12 +73,12 @@ def local_ns(text: str, layout: str, zone: tzinfo | None) -> int:
     """Return a date and time of the controller's clock in ns since the Unix epoch.
 
     Raises:
-        ValueError: it is not of that layout (as of `datetime.strptime`).
+        ValueError: the text does not follow the layout (as in `datetime.strptime`).
     """
     return clock_ns(datetime.strptime(text.strip(), layout), zone)  # noqa: DTZ007  (the zone comes next)
 
 
 def clock_ns(time: datetime, zone: tzinfo | None) -> int:
-    """Return a time without a zone, of the controller's clock, in ns since the Unix epoch."""
+    """Return a time of the controller's clock, without a zone, in ns since the Unix epoch."""
     moment = time.astimezone() if zone is None else time.replace(tzinfo=zone)
     return round(moment.timestamp() * 1e6) * 1000

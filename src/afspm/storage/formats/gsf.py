@@ -1,4 +1,4 @@
-"""Gwyddion Simple Field (.gsf): one image, as Gwyddion and others exchange it.
+"""Gwyddion Simple Field (.gsf): one image, the exchange format of Gwyddion and other programs.
 
 Format: "Gwyddion Simple Field 1.0", lines `name = value`, one to four NUL bytes up to a multiple of four, then float32,
 little-endian, from the top left (Gwyddion user guide, "Gwyddion Simple Field").
@@ -19,8 +19,13 @@ _MAGIC = b"Gwyddion Simple Field 1.0\n"
 
 
 def read_field(path: Path, zone: tzinfo | None) -> FileContent:
-    """The image. Its region is that of the field turned upright: the format's y points down, so where it says YOffset
-    the field ends at -YOffset. Raises FileError and ValueError: broken."""
+    """Return the image of a file.
+
+    The format's y points down, so its YOffset is the negative upper edge of the region.
+
+    Raises:
+        FileError, ValueError: the file is broken.
+    """
     data = path.read_bytes()
     end = data.find(b"\0")
     if not data.startswith(_MAGIC) or end < 0:
@@ -37,7 +42,7 @@ def read_field(path: Path, zone: tzinfo | None) -> FileContent:
         raise FileError("lacks the size of the scan")
     width, height = float(header["XReal"]), float(header["YReal"])
     left, top = float(header.get("XOffset", "0")), -float(header.get("YOffset", "0"))
-    # XReal is that of whole pixels; a region ends at the middles of the outermost.
+    # XReal includes the outer halves of the outermost pixels; a region ends at the centres of these pixels
     size_m = (width * (nx - 1) / nx, height * (ny - 1) / ny)
     region = Region((left + width / 2, top - height / 2), size_m)
     values = np.frombuffer(data, "<f4", nx * ny, start).reshape(ny, nx)[::-1].astype(np.float64)

@@ -1,4 +1,4 @@
-"""Opens HDF5 files, and reads arrays of them without trusting their sizes."""
+"""Safe access to HDF5 files: damaged sizes and parts in other files are refused."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 MAGIC = b"\x89HDF\r\n\x1a\n"
 _HEAP = b"GCOL\x01\0\0\0"
-_OBJECT = 16  # bytes of its head
-_VALUES_PER_BYTE = 16  # if it is well compressed; a damaged header may promise any size
+_OBJECT = 16  # bytes of the header of an object
+_VALUES_PER_BYTE = 16  # well compressed data; a damaged header may announce any size
 
 
 def is_hdf5(path: Path) -> bool:
@@ -26,7 +26,11 @@ def is_hdf5(path: Path) -> bool:
 
 
 def opened(path: Path) -> h5py.File:
-    """The file; to be closed. Raises FileError: it is none, or has a part in another file."""
+    """Return the open file, which the caller closes.
+
+    Raises:
+        FileError: the file is not HDF5, is damaged, or has a part in another file.
+    """
     import h5py
 
     if not is_hdf5(path):
@@ -35,15 +39,15 @@ def opened(path: Path) -> h5py.File:
     file = h5py.File(path, "r")
     try:
         _check_links(file, path)
-    except BaseException:
+    except BaseException:  # whatever the check raises, the caller gets no file to close
         file.close()
         raise
     return file
 
 
 def _check_links(file: h5py.File, path: Path) -> None:
-    # values in other files: the library would read any file of this computer, and a scan that comes from elsewhere,
-    # drawn or exported, would show its content
+    # security: through a link the library reads any file of this computer, and a picture or export of a stranger's
+    # scan would show its content
     import h5py
 
     def is_elsewhere(name: bytes, info: h5py.h5l.LinkInfo) -> bytes | None:
@@ -60,11 +64,9 @@ def _check_links(file: h5py.File, path: Path) -> None:
 
 
 def _check_heaps(data: bytes, path: Path) -> None:
-    """Heaps of texts whose sizes do not add up are refused here: the library would go round in them for ever.
-
-    A heap: "GCOL", the version (1), its size; objects of number, count of references, size and data up to a multiple
-    of 8; number 0 is the free rest, its size that with its head (HDF5 file format specification, III.E).
-    """
+    # With wrong sizes in a heap of strings, the library loops for ever. A heap: "GCOL", the version (1), its size;
+    # objects of number, reference count, size and data up to a multiple of 8; number 0 is the free rest, whose size
+    # includes its header (HDF5 file format specification, III.E).
     at = data.find(_HEAP)
     while at >= 0:
         (size,) = struct.unpack_from("<Q", data.ljust(at + 16, b"\0"), at + 8)
@@ -83,7 +85,11 @@ def _adds_up(data: bytes, place: int, end: int) -> bool:
 
 
 def array(dataset: h5py.Dataset) -> NDArray[np.float64]:
-    """All values of a dataset of numbers. Raises FileError: it promises more than the file can hold."""
+    """Return all values of a numeric dataset.
+
+    Raises:
+        FileError: the dataset announces more values than the file can hold.
+    """
     most = _VALUES_PER_BYTE * dataset.file.id.get_filesize()
     if dataset.size is None or dataset.size > most:
         raise FileError(f"announces {dataset.size} values in {dataset.name} and holds fewer")
@@ -91,12 +97,12 @@ def array(dataset: h5py.Dataset) -> NDArray[np.float64]:
 
 
 def texts(attributes: h5py.AttributeManager) -> dict[str, str]:
-    """The attributes that are texts."""
+    """Return the attributes with text values."""
     return {key: text(value) for key, value in attributes.items() if isinstance(value, bytes | str)}
 
 
 def text(value: object) -> str:
-    """An attribute, or a dataset of characters, as text."""
+    """Return an attribute, or a dataset of characters, as text."""
     if isinstance(value, np.ndarray):
         value = value.tobytes()
     if isinstance(value, bytes):

@@ -10,22 +10,22 @@ import numpy as np
 
 from afspm.basics.errors import FileError
 
-_DATA = 384  # where values begin: after a header of 64 bytes and one of 320
+_DATA = 384  # offset of the values, after a header of 64 bytes and one of 320
 _LABEL = 32
 _KINDS = {2: "f4", 4: "f8", 8: "i1", 16: "i2", 32: "i4", 72: "u1", 80: "u2", 96: "u4"}
 
 
 @dataclass(frozen=True, eq=False)
 class Wave:
-    """A wave.
+    """An Igor wave.
 
     Attributes:
-        name: of it.
+        name: name of the wave.
         values: with up to four dimensions.
-        unit: of the values.
-        steps, dimension_units: of each of four dimensions.
-        labels: for each of four dimensions the names of its elements; empty where there are none.
-        note: its text.
+        unit: unit of the values.
+        steps, dimension_units: for each of four dimensions.
+        labels: names of the elements of each dimension; empty without names.
+        note: text of the wave's note.
     """
 
     name: str
@@ -38,19 +38,21 @@ class Wave:
 
 
 def read_wave(data: bytes) -> Wave:
-    """The wave in the bytes of a file.
+    """Return the wave in the bytes of a file.
 
     Raises:
-        FileError: of another version, not whole, or its checksum is wrong.
+        FileError: the file has another version, is incomplete, or its checksum is wrong.
     """
     if len(data) < _DATA:
         raise FileError(f"is incomplete: {len(data)} bytes are too few for an Igor wave")
+    # the version, a 16-bit number below 256, comes first: its first byte is 0 in a big-endian file
     order = "<" if data[0] else ">"
     (version,) = struct.unpack_from(f"{order}h", data)
     if version != 5:
         raise FileError(f"is an Igor wave of version {version}, not 5", hint="save it again in Igor, as version 5")
+    # the 16-bit words of both headers sum to zero (Technical Note 003)
     if int(np.frombuffer(data, f"{order}i2", _DATA // 2).sum(dtype=np.int64)) & 0xFFFF:
-        raise FileError("its header is damaged: the checksum is wrong")
+        raise FileError("has a damaged header: the checksum is wrong")
     formula, note = struct.unpack_from(f"{order}2i", data, 8)
     unit, *units = struct.unpack_from(f"{order}5i", data, 16)
     sizes = [formula, note, unit, *units, *struct.unpack_from(f"{order}4i", data, 36)]
@@ -74,7 +76,9 @@ def read_wave(data: bytes) -> Wave:
 
 
 def decoded(text: bytes) -> str:
-    """Igor 7 and later write UTF-8, older ones what the system had (a degree sign of Windows, which is Latin-1)."""
+    """Return text from bytes: Igor 7 and later write UTF-8, older versions the system's encoding, here taken as
+    Latin-1.
+    """
     try:
         return text.decode("utf-8")
     except UnicodeDecodeError:
@@ -82,25 +86,25 @@ def decoded(text: bytes) -> str:
 
 
 def _values(data: bytes, order: str) -> tuple[np.ndarray, int]:
-    """The values in their shape, and where what follows them begins."""
+    # values in their shape, and the offset after them
     (count,) = struct.unpack_from(f"{order}i", data, 76)
     (kind,) = struct.unpack_from(f"{order}h", data, 80)
     if kind not in _KINDS:
         raise FileError(f"an Igor wave of type {kind}, which is not real numbers")
     lengths = struct.unpack_from(f"{order}4i", data, 132)
     used = [n for n in lengths if n]
-    # lengths after the first 0 are not used
+    # the first length of 0 ends the list of dimensions
     if not used or min(used) < 0 or list(lengths[: len(used)]) != used or math.prod(used) != count:
         raise FileError(f"an Igor wave of {count} values can't have the shape {used}")
     kind_of = np.dtype(f"{order}{_KINDS[kind]}")
     end = _DATA + count * kind_of.itemsize
     if end > len(data):
-        raise FileError(f"is incomplete: values of {end - _DATA} bytes, of which {len(data) - _DATA} are there")
+        raise FileError(f"is incomplete: {len(data) - _DATA} of {end - _DATA} bytes of values")
     return np.frombuffer(data, kind_of, count, _DATA).reshape(used, order="F"), end
 
 
 def _labels(text: bytes, count: int) -> list[str]:
-    """The first label is that of the dimension itself. What follows a NUL is left from a longer text."""
+    # the first label names the dimension itself; a NUL ends a label, and the bytes after it are left from a longer text
     if not text:
         return []
     if len(text) != _LABEL * (count + 1):

@@ -1,6 +1,6 @@
 """NetCDF, classic format: arrays with named dimensions, units and attributes in one file, through scipy.
 
-xarray, MATLAB, Gwyddion's users' scripts, `ncdump` … read it. What is written are float64.
+xarray, MATLAB, `ncdump` and many scripts read it. Written values are float64.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Attributes = Mapping[str, str | float]
 
 @dataclass(frozen=True)
 class Variable:
-    """One array: the names of its dimensions, float64 values, attributes such as its units."""
+    """One array: the names of its dimensions, float64 values, attributes such as units."""
 
     dimensions: tuple[str, ...]
     values: NDArray[np.float64]
@@ -31,7 +31,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class File:
-    """The arrays of numbers in a file, those of characters as texts, and the attributes of the whole."""
+    """The numeric arrays of a file, its character arrays as texts, and the global attributes."""
 
     variables: Mapping[str, Variable]
     texts: Mapping[str, str]
@@ -42,7 +42,7 @@ def encoded(variables: Mapping[str, Variable], attributes: Attributes) -> bytes:
     """Return the bytes of a file."""
     made = io.BytesIO()
     file = _netcdf_file(made, "w")
-    file._attributes.update(_as_bytes(attributes))  # as attributes of the object, some names would be its own
+    file._attributes.update(_as_bytes(attributes))  # not by setattr: some names are attributes of the scipy object
     for name, variable in variables.items():
         for axis, size in zip(variable.dimensions, variable.values.shape, strict=True):
             if axis not in file.dimensions:
@@ -55,10 +55,10 @@ def encoded(variables: Mapping[str, Variable], attributes: Attributes) -> bytes:
 
 
 def read(path: Path) -> File:
-    """Return the variables and the global attributes of a file.
+    """Return the variables and global attributes of a file.
 
     Raises:
-        FileError: missing, not whole, something else, or scipy is missing.
+        FileError: the file is missing, incomplete or of another format, or scipy is missing.
     """
     try:
         content = path.read_bytes()
@@ -69,11 +69,11 @@ def read(path: Path) -> File:
     try:
         file = _netcdf_file(
             io.BytesIO(content), "r"
-        )  # a file on disk would set aside whatever a damaged header asks for
+        )  # not the file on disk: for that scipy allocates any size that a damaged header announces
         return _file(file)
     except FileError:
         raise
-    except Exception as error:  # scipy stumbles in any way over a broken file
+    except Exception as error:  # on a damaged file scipy raises errors of many types
         raise FileError(f"is incomplete: {type(error).__name__}: {error}", where=str(path)) from error
 
 
@@ -84,8 +84,8 @@ def _file(file: Any) -> File:
         if found.data.dtype.kind == "S":
             texts[name] = _text(found.data.tobytes())
         else:
-            variables[name] = Variable(found.dimensions, found.data.astype(np.float64), _told(found._attributes))
-    return File(variables, texts, _told(file._attributes))
+            variables[name] = Variable(found.dimensions, found.data.astype(np.float64), _plain(found._attributes))
+    return File(variables, texts, _plain(file._attributes))
 
 
 def _netcdf_file(content: io.BytesIO, mode: Literal["r", "w"]) -> Any:
@@ -98,8 +98,8 @@ def _as_bytes(attributes: Attributes) -> Plain:
     return {name: value.encode() if isinstance(value, str) else np.float64(value) for name, value in attributes.items()}
 
 
-def _told(attributes: PlainMapping) -> dict[str, str | float]:
-    """Return text as it is, of numbers the first."""
+def _plain(attributes: PlainMapping) -> dict[str, str | float]:
+    # text as text; of an array of numbers only the first
     return {
         name: _text(value) if isinstance(value, bytes) else float(np.ravel(value)[0])
         for name, value in attributes.items()

@@ -1,8 +1,8 @@
-"""`read`: any file that a controller wrote.
+"""`read`: reading any controller's file.
 
-A reader is declared by the suffix of its files ("sxm"). Where several controllers write files of one suffix, each
-further reader adds a name of its own ("nc.gxsm"): the readers of a suffix are tried in the order of their names until
-one does not raise `OtherFormat`.
+A reader is declared by the suffix of its files ("sxm"). If several controllers write files with one suffix, each
+further reader adds its own name ("nc.gxsm"): the readers of a suffix are tried in the order of their names until one
+does not raise `OtherFormat`.
 """
 
 from __future__ import annotations
@@ -21,22 +21,22 @@ Reader = Callable[[Path, tzinfo | None], FileContent]
 
 
 def suffixes() -> tuple[str, ...]:
-    """Return the suffixes of files that can be read, with their dots."""
+    """Return the suffixes of readable files, with their dots."""
     return tuple(dict.fromkeys(f".{name.partition('.')[0]}" for name in entry_points.names(entry_points.READERS)))
 
 
 def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
-    """The scans and spectra of a file.
+    """Return the scans and spectra of a file.
 
-    The suffix of the file chooses the reader: of a maker's format, of Gwyddion's simple fields (.gsf), or of afspm's
-    own files: of the record, and of a grid of spectra that was exported (.h5). `afspm doctor` lists the suffixes. Of
-    channels of one name, the second is "name #2".
+    The suffix of the file selects the reader: of a maker's format, of Gwyddion's simple fields (.gsf), of afspm's
+    record or of an exported grid of spectra (.h5). `afspm doctor` lists the suffixes. If two channels have one name,
+    the second becomes "name #2".
 
     Args:
-        zone: of the clock of the controller, which most write without saying which it was; None: that of this computer.
+        zone: time zone of the controller's clock, which most files do not state; None: the zone of this computer.
 
     Raises:
-        FileError: missing, not whole, not what its suffix says, without a reader, or its library is missing.
+        FileError: the file is missing, incomplete or in another format, or there is no reader or library for it.
     """
     path = Path(path)
     if not path.is_file():
@@ -49,12 +49,12 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
             hint=f"read: {' '.join(suffixes())}",
         )
     try:
-        return _told_apart(_first_that_reads(readers, path, zone))
+        return _with_unique_channels(_first_that_reads(readers, path, zone))
     except FileError as error:
         if error.where:
             raise
         raise FileError(error.what, where=str(path), hint=error.hint) from error
-    except Exception as error:  # a reader may stumble in any way over a broken file
+    except Exception as error:  # on a damaged file a reader may raise errors of any type
         why = f"{type(error).__name__}: {error}"
         raise FileError(f"is not readable as {path.suffix}: {why}", where=str(path)) from error
 
@@ -75,8 +75,8 @@ def _read(name: str, path: Path, zone: tzinfo | None) -> FileContent:
     return reader(path, zone)
 
 
-def _told_apart(content: FileContent) -> FileContent:
-    """With a name of its own for each channel: users may give two signals of a controller the same."""
+def _with_unique_channels(content: FileContent) -> FileContent:
+    # users may give two signals of a controller the same name
     taken: set[str] = set()
     scans = []
     for scan in content.scans:

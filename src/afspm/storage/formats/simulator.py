@@ -1,4 +1,4 @@
-"""The files of the simulated microscope: NetCDF with a variable for each channel of a scan, or of a spectrum."""
+"""Reader of the simulated microscope's files: NetCDF with a variable for each channel of a scan, or of a spectrum."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
     """Return the scan or spectrum of a file.
 
     Raises:
-        OtherFormat: another program wrote it.
-        FileError: something of it is missing.
+        OtherFormat: another program wrote the file.
+        FileError: a part of it is missing.
     """
     if hdf5.is_hdf5(path):
         raise OtherFormat("is NetCDF-4, which the simulated microscope does not write")
@@ -53,7 +53,7 @@ def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _start_ns(header: dict[str, object], scan: Scan, end_ns: int) -> int | None:
-    """Every line is scanned there and back."""
+    # the simulated microscope scans every line forward and backward
     speed_m_s = header.get(f"{names.SCAN_SPEED} [m/s]")
     if not isinstance(speed_m_s, float) or not speed_m_s > 0.0:
         return None

@@ -1,1 +1,1 @@
-"""The context of a process of an experiment: bond to the parent, loading of classes, signals, failures, log."""
+"""The context of an experiment's process: bond to the parent, loading of classes, signals, failures, log."""

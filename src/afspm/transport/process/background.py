@@ -1,4 +1,4 @@
-"""Work beside everything else, in a thread that no process waits for at its end."""
+"""Background work in a thread that does not delay the end of the process."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from threading import Thread
 
 
 def in_background(work: Callable[[], None]) -> None:
-    """Run a function in a thread of its own; it reports its errors itself."""
-    # not an executor's thread: those are waited for when the process ends
+    """Run a function in its own thread; the function must handle its errors."""
+    # not an executor, whose threads delay the end of the process
     Thread(target=work, daemon=True, name="background").start()

@@ -1,4 +1,4 @@
-"""A process of an experiment as its host sees it, and the context that it runs in."""
+"""The interface between a process of an experiment and its host, with the context that the host provides."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DEFAULT_LONGEST_STEP_S = 30.0
 
 
 class ProcessActivity:
-    """The age of the current step, which tells a busy process from a frozen one.
+    """The age of the current step, which distinguishes a busy process from a frozen one.
 
     Written by the process, read by the thread that sends its heartbeats.
     """
@@ -31,7 +31,7 @@ class ProcessActivity:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Something is being worked on in this block."""
+        """Count the block as one step."""
         before, self.since_s = self.since_s, self._clock.monotonic_s()
         try:
             yield
@@ -40,7 +40,7 @@ class ProcessActivity:
 
     @contextmanager
     def waiting(self) -> Iterator[None]:
-        """Within a step: this block only waits. The step counts anew afterwards."""
+        """Stop counting within a step while the block waits; afterwards the step's age starts at zero."""
         before, self.since_s = self.since_s, None
         try:
             yield
@@ -54,12 +54,13 @@ class ProcessActivity:
 
 
 def new_session(run: str) -> str:
-    """Return an identity of this life of a process, with that of its run (empty: none is known)."""
+    """Return a random identity of this life of a process, after the identity of its run, if known."""
     return "-".join(filter(None, [run, os.urandom(4).hex()]))
 
 
 def _never(_: Callable[[], object]) -> None:
-    """Register nothing: nobody stops a process that has no host."""
+    # a process without a host is never stopped
+    ...
 
 
 @dataclass
@@ -67,21 +68,21 @@ class ProcessContext:
     """The context that the host gives to a process.
 
     Attributes:
-        launch: the line that we were started with.
-        clock: the experiment's.
-        open_port: connects to the experiment as a component does (scheduler and translators have sockets of their own);
-            with a tuple of envelopes, hears these instead of those of the launch line.
-        log: records go to the supervisor, and to the log collector if there is one.
-        activity: to be told of steps that take time.
-        when_stopping: registers what is called, from another thread, when the parent has gone or wants us to stop
-            (a port made by `open_port` is told by itself).
-        tip_in_danger: registers what says, then and from another thread, whether there is a tip to see to, which takes
-            longer than an end is given.
-        session: differs between two lives of a process, for ids that must not meet.
+        launch: the launch line of the process.
+        clock: the experiment's clock.
+        open_port: connects to the experiment as a component does (scheduler and translators have their own sockets); a
+            tuple of envelopes replaces those of the launch line.
+        log: logger of the process; its records go to the supervisor, and to the log collector if there is one.
+        activity: marks steps that take time.
+        when_stopping: registers a callback, called from another thread when the parent is gone or stops the process (a
+            port made by `open_port` gets an event anyway).
+        tip_in_danger: registers a function, called from another thread at that moment, that returns whether the tip
+            needs attention, which takes longer than an ordinary end may.
+        session: differs between two lives of a process, for ids that must not collide.
         problems: the problems of the experiment by name.
 
     Raises:
-        ConfigError: two problems have the same number, say.
+        ConfigError: invalid entries, such as two problems with the same number.
     """
 
     launch: Launch
@@ -107,12 +108,12 @@ class ProcessContext:
 
 @runtime_checkable
 class ExperimentProcess(Protocol):
-    """A process that the host can run: a component, a scheduler, a translator, made with its settings as arguments."""
+    """A process that the host can run: a component, scheduler or translator, constructed with its settings."""
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until done, ended or stopped; returns an `ExitCode`.
+        """Run until done, ended or stopped; return an `ExitCode`.
 
-        Called on the main thread. To end within a second of a stop it must wait in one poller that
+        Called on the main thread. To end within a second of a stop, the process must wait in one poller that
         `context.when_stopping` (or the port) can wake.
         """
         ...

@@ -1,4 +1,4 @@
-"""An exception in words: what happened, and where in the user's own code."""
+"""Exceptions as text: what happened, and the place in the user's own code."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from pathlib import Path
 from afspm.basics.errors import AfspmError, FileError, Refused, RequestError, TransportError
 from afspm.model import ControlResponse
 
-PACKAGE = Path(__file__).parents[2]  # not resolved: as the paths in tracebacks
-_BELOW_START = 2  # of `python -m`: what Python itself does first
+PACKAGE = Path(__file__).parents[2]  # not resolved, since tracebacks have unresolved paths
+_BELOW_START = 2  # frames of runpy below a module run by `python -m`
 _REFUSED_AGAIN = {
     ControlResponse.CMD_NOT_SUPPORTED,
     ControlResponse.PARAM_NOT_SUPPORTED,
     ControlResponse.PARAM_ERROR,
     ControlResponse.ACTION_NOT_SUPPORTED,
 }
-"""What is refused for what was asked, by a limit for example, is refused again."""
+"""Refusals because of the request itself, e.g. by a limit: a repetition is refused again."""
 
 
 def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
-    """Return the message of an exception, and below it the lines of code that led to it.
+    """Return the message of an exception, followed by the lines of code that led to it.
 
-    Our frames above the user's are left out; where we refused on purpose what the user's code asked for, those below it
-    as well. An error from our code alone is shown whole, unless it is one that we foresaw.
+    afspm's frames above the user's are left out; for a deliberate refusal also those below. An error from afspm's code
+    alone is shown with all frames, unless it was foreseen.
 
     Args:
-        name: of the component, which the reader knows already.
-        package: the folder of the code that is ours.
+        name: name of the component, which is left out of the message.
+        package: folder of afspm's code.
     """
     trace = traceback.TracebackException.from_exception(error)
     if isinstance(error, AfspmError) and all(_is_passage(frame, package) for frame in trace.stack):
-        return _words(error, name)  # no code of anybody's: how we came to say so helps nobody to put it right
+        return _words(error, name)  # no user code involved: afspm's own frames would not help
     is_chained = False
     link: traceback.TracebackException | None = trace
     seen: set[int] = set()
@@ -50,14 +50,14 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
 
 
 def may_pass(error: BaseException) -> bool:
-    """Return whether an error may be a passing one, of the controller or the computer, and not the code's own."""
+    """Return whether an error may pass by itself, as one of controller or computer, unlike a fault of the code."""
     if isinstance(error, Refused):
         return error.response not in _REFUSED_AGAIN
     return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))
 
 
 def place_of(error: BaseException, package: Path = PACKAGE) -> str:
-    """Return file and line of the user's code that an exception came from; of ours if there is none."""
+    """Return file and line of the user's code that raised an exception; of afspm's code if there is none."""
     frames = traceback.extract_tb(error.__traceback__)
     of_user = [frame for frame in frames if not _is_passage(frame, package)]
     last = (of_user or frames)[-1]
@@ -65,20 +65,19 @@ def place_of(error: BaseException, package: Path = PACKAGE) -> str:
 
 
 def log(logger: logging.Logger, error: BaseException, name: str) -> None:
-    """Log an exception that ends a process."""
     logger.error("%s", describe(error, name))
     logger.debug("the full traceback", exc_info=error)
 
 
 def where_now(thread_id: int, package: Path = PACKAGE) -> str:
-    """Return the lines of code that a thread is in just now, from the user's own on."""
+    """Return the lines of code that a thread is running, from the user's own code on."""
     frame = sys._current_frames().get(thread_id)
     stack = traceback.extract_stack(frame) if frame is not None else []
     return "".join(traceback.format_list(_kept(stack[_BELOW_START:], package, is_foreseen=False))).rstrip("\n")
 
 
 def _is_foreseen(error: BaseException, frames: Sequence[traceback.FrameSummary], package: Path) -> bool:
-    """True if we raised it on purpose, for what was asked of us; then its message says all."""
+    # raised on purpose, about an argument of the user: the message suffices
     last = frames[-1] if frames else None
     return isinstance(error, AfspmError) or (
         last is not None and _is_ours(last, package) and (last.line or "").startswith("raise ")
@@ -109,5 +108,5 @@ def _is_ours(frame: traceback.FrameSummary, package: Path) -> bool:
 
 
 def _is_passage(frame: traceback.FrameSummary, package: Path) -> bool:
-    """True for ours, and for what Python does between two calls of ours."""
+    # afspm's frames, and library frames between two of them
     return _is_ours(frame, package) or Path(frame.filename).name == "contextlib.py"

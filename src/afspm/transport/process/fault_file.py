@@ -1,4 +1,4 @@
-"""The file by which a component tells its supervisor of a fault of its own code."""
+"""The file that reports a fault of a component's own code to its supervisor."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from afspm.storage.atomic import write_atomic
 
 
 def write_fault(state_dir: Path, name: str, fault: OwnFault) -> None:
-    with suppress(FileError):  # on a full disk it is restarted as after any other error
+    with suppress(FileError):  # on a full disk the fault counts as an ordinary crash
         write_atomic(_path(state_dir, name), [json.dumps(asdict(fault)).encode()])
 
 
 def take_fault(state_dir: Path, name: str) -> OwnFault | None:
-    """Return the fault that a component has told of, and remove it; None if it can't be read."""
+    """Return the reported fault, and remove its file; None without a readable file."""
     try:
         fault = OwnFault(**json.loads(_path(state_dir, name).read_bytes()))
         _path(state_dir, name).unlink()

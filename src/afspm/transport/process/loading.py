@@ -1,4 +1,4 @@
-"""Loads the class that a launch line names, and calls it with the settings."""
+"""Loading of the class in a launch line, and its construction with the settings."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ def load(launch: Launch) -> ExperimentProcess:
     """Return the component, scheduler or translator of a launch line.
 
     Raises:
-        ConfigError: there is no such class, or it can't be made with these settings. A restart would not help.
+        ConfigError: the class does not exist, or can't be constructed with these settings. A restart would not help.
     """
     class_ = find_class(launch.class_, launch.name)
     _check_settings(class_, launch)
     try:
-        plain = getattr(class_, "plain_settings", ())  # tables in which it looks for a `class` by itself
+        plain = getattr(class_, "plain_settings", ())  # tables whose `class` the class handles itself
         made = class_(
             **{name: value if name in plain else made_of(value, launch.name) for name, value in launch.settings.items()}
         )
@@ -37,7 +37,7 @@ def load(launch: Launch) -> ExperimentProcess:
 
 
 def made_of(value: object, where: str) -> object:
-    """Return a setting, each table in it with a `class` as the object that this makes."""
+    """Return a setting in which each table with a `class` is replaced by the object that it constructs."""
     if isinstance(value, list | tuple):
         return [made_of(item, where) for item in value]
     if not isinstance(value, dict):
@@ -50,7 +50,11 @@ def made_of(value: object, where: str) -> object:
 
 
 def find_class(path: str, where: str) -> type[object]:
-    """Return the class "package.module.Name". Raises ConfigError if there is none."""
+    """Return the class "package.module.Name".
+
+    Raises:
+        ConfigError: there is no such class.
+    """
     class_ = find_object(path, where, "class")
     if not isinstance(class_, type):
         raise ConfigError(f"{path} is not a class", where=where)
@@ -58,10 +62,13 @@ def find_class(path: str, where: str) -> type[object]:
 
 
 def find_object(path: str, where: str, what: str = "function") -> object:
-    """Return the object "package.module.name". Raises ConfigError if there is none.
+    """Return the object "package.module.name".
 
     Args:
-        what: it should be, for the error.
+        what: kind of the object, for the error.
+
+    Raises:
+        ConfigError: there is no such object.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name:
@@ -84,12 +91,12 @@ def find_object(path: str, where: str, what: str = "function") -> object:
 
 
 def _check_settings(class_: type[object], launch: Launch) -> None:
-    """Report a typo as one, and not as a TypeError from within a constructor."""
+    # before the call, so that a misspelt setting is no TypeError from inside a constructor
     try:
         signature = inspect.signature(class_)
         signature.bind(**launch.settings)
     except ValueError:
-        return  # a class of C code without a signature
+        return  # a class in C without a signature can't be checked
     except TypeError as error:
         names = [name for name in signature.parameters if name not in ("args", "kwargs")]
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""Log records to standard error, as the supervisor reads them: the level, then the message."""
+"""Log records on standard error in the supervisor's format: the level, then the message."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ ROOT = "afspm"
 
 
 class LineFormatter(logging.Formatter):
-    """ "WARNING the tip is blunt". Further lines (a traceback) have no level and are indented."""
+    """A formatter for "WARNING the tip is blunt"; further lines (a traceback) are indented, without a level."""
 
     def __init__(self) -> None:
         super().__init__("%(levelname)s %(message)s")
@@ -19,8 +19,7 @@ class LineFormatter(logging.Formatter):
 
 
 def set_up(name: str, level: str) -> logging.Logger:
-    """Send records of `level` and above to standard error, of libraries only warnings; returns the logger of the
-    component `name`."""
+    """Send records from `level` on to standard error, of libraries only warnings; return the component's logger."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(LineFormatter())
     root = logging.getLogger()

@@ -1,6 +1,6 @@
-"""The bond to the process that started us: its end of our standard input.
+"""The bond to the parent process: its end of the standard input of this process.
 
-It closes when the parent wants us to stop, and when the parent dies, however it dies: on every system.
+It closes when the parent stops the process, and when the parent dies in any way, on every system.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ import threading
 from collections.abc import Callable
 
 END_WITHIN_S = 1.5
-TIP_WITHIN_S = 14.0  # with a tip to see to first: its controller may answer slowly, or have to be found again
+TIP_WITHIN_S = 14.0  # time to withdraw the tip: the controller may answer slowly, or need a new connection
 _STDIN = 0
 _CHUNK = 1 << 16
 
 
 def leave_interrupts_to_parent() -> None:
-    """Ignore Ctrl-C, and Ctrl-Break of Windows: they reach the whole terminal, and the parent decides what they end."""
+    """Ignore Ctrl-C and Windows' Ctrl-Break: they reach the whole terminal, and the parent decides what to end."""
     for name in ("SIGINT", "SIGBREAK"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
 
 
 def take_standard_input() -> int:
-    """Return a descriptor of standard input that is ours alone, and leave an empty one in its place.
+    """Return a private descriptor of standard input, and replace standard input by an empty one.
 
-    On Windows, what is asked of a pipe waits for a read of it to end, in whatever thread: with a thread that reads
-    descriptor 0, a library that only looks at its standard input (numpy's does) would never be loaded.
+    On Windows, every operation on a pipe waits for a read of it in another thread. With a thread that reads descriptor
+    0, a library that only inspects its standard input (as numpy's does) would never finish loading.
     """
     pipe = os.dup(_STDIN)
     nothing = os.open(os.devnull, os.O_RDONLY)
@@ -39,9 +39,9 @@ def take_standard_input() -> int:
 
 
 def read_launch_line(pipe: int) -> bytes:
-    """Return the first line of a pipe; empty if it ends before one came.
+    """Return the first line of a pipe; empty if the pipe ends before.
 
-    Read past Python's own buffering: a thread that waits in that one would block the end of the interpreter.
+    It bypasses Python's buffered reader: a thread that waits in that would block the end of the interpreter.
     """
     line = bytearray()
     while (chunk := os.read(pipe, _CHUNK)) and b"\n" not in chunk:
@@ -50,20 +50,20 @@ def read_launch_line(pipe: int) -> bytes:
 
 
 class StopRequested(BaseException):
-    """The parent has gone or wants us to stop.
+    """The parent is gone or stops the process.
 
-    Not an `Exception`, like KeyboardInterrupt: a script's `except Exception` must not keep a process alive.
+    Like KeyboardInterrupt it is no `Exception`: a script's `except Exception` must not keep a process alive.
     """
 
 
 class ParentWatch:
-    """Watches the parent, and calls what was registered, from another thread, when it has gone or lets us go.
+    """A watch over the parent, which runs callbacks in another thread once the parent is gone or stops the process.
 
-    A process that has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs) is ended the hard
-    way, with `code_if_late`; if the tip is in danger, `TIP_WITHIN_S` later.
+    If the process has not ended `END_WITHIN_S` later (a handler that computes, a library that hangs), it exits at once
+    with `code_if_late`; if the tip is in danger, `TIP_WITHIN_S` later.
 
     Args:
-        pipe: the descriptor that the parent holds the other end of.
+        pipe: descriptor of a pipe; the parent holds its other end.
     """
 
     def __init__(self, pipe: int, code_if_late: int) -> None:
@@ -75,7 +75,7 @@ class ParentWatch:
         self._gone = threading.Event()
 
     def watch(self) -> None:
-        """Begin; returns at once."""
+        """Start the watch, and return at once."""
         threading.Thread(target=self._watch, name="parent", daemon=True).start()
 
     @property
@@ -83,7 +83,7 @@ class ParentWatch:
         return self._gone.is_set()
 
     def when_gone(self, callback: Callable[[], None]) -> None:
-        """Register what to call: at once, if the parent has gone already."""
+        """Register a callback; if the parent is gone already, call it at once."""
         with self._lock:
             self._callbacks.append(callback)
             gone = self.gone
@@ -91,7 +91,7 @@ class ParentWatch:
             callback()
 
     def tip_in_danger(self, whether: Callable[[], bool]) -> None:
-        """Register what tells whether it is; it is called once, from another thread."""
+        """Register a function that returns whether the tip is in danger; it is called once, from another thread."""
         self._tip_in_danger = whether
 
     def let_go(self) -> None:
@@ -101,7 +101,7 @@ class ParentWatch:
     def _watch(self) -> None:
         try:
             while os.read(self._pipe, _CHUNK):
-                pass  # nothing more is said to us; it is only held open
+                pass  # the parent writes nothing after the launch line
         except OSError:
             pass
         self._went()
@@ -118,8 +118,8 @@ class ParentWatch:
 
 
 def end_within(seconds: float, code: int) -> None:
-    """End the process with `code` in `seconds`, whatever it is doing then."""
-    # a thread of its own and not a signal: there is no alarm on Windows
+    """End the process with `code` after `seconds`, in any state."""
+    # a thread, since Windows has no alarm signal
     timer = threading.Timer(seconds, os._exit, (code,))
     timer.daemon = True
     timer.start()

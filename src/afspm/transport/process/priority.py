@@ -1,4 +1,4 @@
-"""Processes that only look on let those of the experiment go first."""
+"""Low priority for processes that only observe, so that those of the experiment run first."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import sys
 from contextlib import suppress
 
 STEPS_BACK = 10
-"""Of POSIX' niceness: leaves about a tenth of a core where all cores are busy, and as much as is wanted elsewhere."""
+"""POSIX niceness: with all cores busy the process gets about a tenth of a core, otherwise as much as it needs."""
 
 
 def step_back() -> None:
-    """Take the processor only where no process of ordinary priority wants it, if the system allows that.
+    """Lower the priority of this process below the ordinary one, if the system allows it.
 
-    Call it before threads are started: on Linux those that are there keep their priority, and heartbeats theirs.
+    Call it before threads are started: on Linux existing threads keep their priority, and heartbeats need theirs.
     """
     with suppress(OSError):
         if sys.platform == "win32":

@@ -1,4 +1,4 @@
-"""Ctrl-C and its relatives, as events of a poller."""
+"""Ctrl-C and related signals as events of a poller."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from types import FrameType
 
 CTRL_C = ("SIGINT",)
 ENDING = (*CTRL_C, "SIGTERM", "SIGBREAK", "SIGHUP")
-"""SIGBREAK is Windows' Ctrl-Break and the closing of its console, SIGHUP that of a POSIX terminal."""
+"""SIGBREAK: Ctrl-Break, or a closed console, of Windows. SIGHUP: a closed terminal of POSIX."""
 
 
 @contextmanager
 def caught(tell: Callable[[int], None], wakeup_fd: int, names: Sequence[str] = ENDING) -> Iterator[None]:
-    """Hand signals that end a program to `tell` instead, while in this block; write to `wakeup_fd` with each.
+    """Pass signals that end a program to `tell` while in this block, and write to `wakeup_fd` with each.
 
-    A signal that is ignored already (SIGHUP under nohup) stays ignored. Away from the main thread Python gives no
-    signals: then this does nothing.
+    A signal that is already ignored (SIGHUP under nohup) stays ignored. Outside the main thread Python delivers no
+    signals, and this does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -31,7 +31,7 @@ def caught(tell: Callable[[int], None], wakeup_fd: int, names: Sequence[str] = E
     for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
         if signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, handle)
-    # Windows runs handlers only when the main thread comes back from waiting: this is what brings it back
+    # Windows runs handlers only after the main thread's wait: a byte in this descriptor ends the wait
     fd_before = signal.set_wakeup_fd(wakeup_fd, warn_on_full_buffer=False)
     try:
         yield

@@ -1,6 +1,6 @@
-"""HDF5 files that follow NeXus' NXspm as the record writes them (`record.nexus`), read back without loss.
+"""Reader of the record's HDF5 files, which follow NeXus' NXspm (`record.nexus`), without loss.
 
-The spectra of a grid in one file (`record.export.nexus`), too: of several at one point it has the mean.
+It also reads a grid of spectra in one file (`record.export.nexus`), which holds the mean of several spectra at a point.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ DEFINITION = "NXspm"
 BIAS_SPECTRUM = "NXsts"
 """The definition that a spectrum over the bias of a tunnelling microscope follows."""
 ABOUT = "afspm"
-"""The group with what NeXus has no name for."""
+"""The group for facts without a name in NeXus."""
 GRID = "grid"
 """The content of a file with the spectra of a grid."""
 VENDOR = "vendor"
-"""The group with what the controller's own file said."""
+"""The group with the header of the controller's own file."""
 
 
 def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
-    """Return what a file of the record holds.
+    """Return the content of a file of the record.
 
     Raises:
-        OtherFormat: the record did not write it.
-        FileError: it is broken.
+        OtherFormat: another program wrote the file.
+        FileError: the file is damaged.
     """
     with hdf5.opened(path) as file:
         if not _is_ours(file):
@@ -57,7 +57,11 @@ def read_hdf5(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def about_of(file: h5py.File) -> Plain:
-    """Return what the record noted beside the values: holder of control, problems … Raises FileError: it is damaged."""
+    """Return the facts that the record keeps beside the values: holder of control, problems …
+
+    Raises:
+        FileError: the file is damaged.
+    """
     try:
         about: Plain = json.loads(hdf5.text(file["entry"][ABOUT]["about"][()]))
     except (KeyError, ValueError) as error:
@@ -66,7 +70,7 @@ def about_of(file: h5py.File) -> Plain:
 
 
 def vendor_header(file: h5py.File) -> dict[str, object]:
-    """The header of the controller's own file, as that said it; empty if it was not there to be read."""
+    """Return the header of the controller's own file, unchanged; empty if that file could not be read."""
     group = file["entry"].get(VENDOR)
     if group is None or "header" not in group:
         return {}
@@ -112,7 +116,7 @@ def _spectrum(file: h5py.File, about: Plain) -> Spectrum:
 
 
 def _grid(file: h5py.File, about: Plain) -> Iterator[Spectrum]:
-    """Yield the spectra that were measured, row by row."""
+    # only the points that were measured, row by row
     entry, swept, columns = file["entry"], about["swept"], about["columns"]
     data = [[hdf5.array(entry[way][one["field"]]) for way in one["ways"]] for one in columns]
     forward = entry[columns[0]["ways"][0]]
