@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import bootstrap
@@ -28,6 +29,17 @@ SOURCE, SITE, ENVIRONMENT = BUILD / "site-source", BUILD / "site", BUILD / "docs
 LINK = re.compile(r"(?<!!)\]\((?!\w+:|#)([^)#\s]+)(#[^)]*)?\)")
 DRAWING = re.compile(r"!\[([^\]]*)\]\(([^)]+)\.svg\)")
 SECTION = re.compile(r"^- \*\*(.+?)\*\*:(.*?)(?=^- \*\*|\Z)", re.MULTILINE | re.DOTALL)
+SEARCHES = (
+    "adhesion map",
+    "thermal drift",
+    "tip repair",
+    "feedback gain",
+    "power cut",
+    "force curve",
+    "matlab",
+    "gwyddion",
+)
+"""What people look for: a build fails if the search of the site finds nothing for one of them."""
 FENCES = {".py": "python", ".toml": "toml", ".proto": "protobuf", ".json": "json", ".md": "markdown"}
 
 
@@ -37,6 +49,7 @@ def main() -> None:
     pages = [
         ROOT / "README.md",
         ROOT / "CHANGELOG.md",
+        ROOT / "changes" / "README.md",
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "experiments").rglob("*.md"),
     ]
@@ -52,6 +65,9 @@ def main() -> None:
     broken = sorted(set(_broken_links()))
     if broken:
         sys.exit("\n".join([*broken, f"{len(broken)} broken links"]))
+    index = json.loads((SITE / "search.json").read_text(encoding="utf-8"))["items"]
+    if missed := [words for words in SEARCHES if not _finds(index, words)]:
+        sys.exit(f"the search finds nothing for: {', '.join(missed)}")
     sys.stdout.write(f"{SITE / 'index.html'}: every link leads somewhere\n")
 
 
@@ -149,6 +165,12 @@ def _group(listing: str) -> str:
     pages = [page.relative_to(ROOT).as_posix() for page in sorted(folder.rglob("*.md")) if page != ROOT / listing]
     title = (ROOT / listing).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
     return f"{{ {json.dumps(title)} = {json.dumps([listing, *pages])} }}"
+
+
+def _finds(index: list[dict[str, Any]], words: str) -> bool:
+    """Return whether a section has all the words in its title, its text or the titles above, as the search wants it."""
+    texts = (" ".join([item["title"], item["text"], *item["path"]]).lower() for item in index)
+    return any(all(word in text for word in words.lower().split()) for text in texts)
 
 
 class _Page(HTMLParser):
