@@ -1,4 +1,4 @@
-"""The reference of the Python API has everything that users write with, and says something of each."""
+"""The reference of the Python API has an entry with a text for every public name."""
 
 from __future__ import annotations
 
