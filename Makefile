@@ -1,5 +1,5 @@
 # Two commands: `make demo` runs the main job, `make test` passes the tests. Both set up .venv by themselves:
-# 360 MB for the demonstrations, 640 MB for the tests (800 with those of the page), 900 with the tools of `make check`.
+# 360 MB for the demonstrations, 650 MB for the tests (810 with those of the page), 900 with the tools of `make check`.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -8,7 +8,7 @@ TEST := .venv/.test
 SETUP := .venv/.made
 
 .PHONY: demo demo-drift dev test test-all test-apart mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate power-cut docs clean
+.PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate power-cut docs changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -19,7 +19,7 @@ $(DEMO): $(SOURCES)
 	@touch $@
 
 $(TEST): $(SOURCES)
-	@echo "Setting up .venv for the tests: 640 MB, with a chromium 800 MB …"
+	@echo "Setting up .venv for the tests: 650 MB, with a chromium 810 MB …"
 	@$(PYTHON) tools/bootstrap.py test
 	@touch $(DEMO) $@
 
@@ -166,6 +166,10 @@ power-cut: $(TEST)
 ## the documentation as a site with search: build/site/index.html. A broken link fails
 docs:
 	@$(PYTHON) tools/build_docs.py
+
+## the news fragments of changes/, moved into CHANGELOG.md: make changelog VERSION=0.2.0
+changelog: $(TEST)
+	@$(BIN)/python tools/changelog.py $(VERSION)
 
 clean:
 	rm -rf .venv build runs

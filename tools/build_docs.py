@@ -13,18 +13,33 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import bootstrap
+import drawing_colours
 
 ROOT = Path(__file__).resolve().parents[1]
 BUILD = ROOT / "build"
 SOURCE, SITE, ENVIRONMENT = BUILD / "site-source", BUILD / "site", BUILD / "docs-env"
 LINK = re.compile(r"(?<!!)\]\((?!\w+:|#)([^)#\s]+)(#[^)]*)?\)")
+DRAWING = re.compile(r"!\[([^\]]*)\]\(([^)]+)\.svg\)")
 SECTION = re.compile(r"^- \*\*(.+?)\*\*:(.*?)(?=^- \*\*|\Z)", re.MULTILINE | re.DOTALL)
+SEARCHES = (
+    "adhesion map",
+    "thermal drift",
+    "tip repair",
+    "feedback gain",
+    "power cut",
+    "force curve",
+    "matlab",
+    "gwyddion",
+)
+"""What people look for: a build fails if the search of the site finds nothing for one of them."""
 FENCES = {".py": "python", ".toml": "toml", ".proto": "protobuf", ".json": "json", ".md": "markdown"}
 
 
@@ -34,19 +49,25 @@ def main() -> None:
     pages = [
         ROOT / "README.md",
         ROOT / "CHANGELOG.md",
+        ROOT / "changes" / "README.md",
         *(ROOT / "docs").rglob("*.md"),
         *(ROOT / "experiments").rglob("*.md"),
     ]
     for page in [*pages, *(ROOT / "src").rglob("README.md"), *(ROOT / "clients").glob("*/README.md")]:
         _write(page.relative_to(ROOT).as_posix(), _for_site(page))
     shutil.copytree(ROOT / "docs" / "pictures", SOURCE / "docs" / "pictures")
+    for drawing in (SOURCE / "docs" / "pictures").glob("*.svg"):
+        _two_drawings(drawing)
     config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
-    config = config.replace("[project]\n", f"[project]\nnav = {_nav()}\n", 1)
+    config = config.replace("[project]\n", f"[project]\nnav = {_nav()}\n{_about()}", 1)
     (BUILD / "zensical.toml").write_text(config, encoding="utf-8")
     _zensical()
     broken = sorted(set(_broken_links()))
     if broken:
         sys.exit("\n".join([*broken, f"{len(broken)} broken links"]))
+    index = json.loads((SITE / "search.json").read_text(encoding="utf-8"))["items"]
+    if missed := [words for words in SEARCHES if not _finds(index, words)]:
+        sys.exit(f"the search finds nothing for: {', '.join(missed)}")
     sys.stdout.write(f"{SITE / 'index.html'}: every link leads somewhere\n")
 
 
@@ -78,9 +99,40 @@ def _for_site(page: Path) -> str:
         return f"]({posixpath.relpath(_code_page(target), page.parent.relative_to(ROOT).as_posix())})"
 
     text = LINK.sub(link, page.read_text(encoding="utf-8"))
+    # the page has a switch of its own: a drawing that follows the screen would be dark on a light page
+    text = DRAWING.sub(r"![\1](\2.svg#only-light)\n![\1](\2-dark.svg#only-dark)", text)
     # Python-Markdown wants an empty line before a list, and four spaces within one
     text = re.sub(r"^(?![-*|>#\s]|\d+\. |```)(.+)\n(?=(?:- |\* |1\. ))", r"\1\n\n", text, flags=re.MULTILINE)
     return re.sub(r"^( {2,3})(?=- )", "    ", text, flags=re.MULTILINE)
+
+
+def _two_drawings(drawing: Path) -> None:
+    """Replace a drawing that follows the screen by a light one and a dark one."""
+    text = drawing.read_text(encoding="utf-8")
+    drawing.write_text(drawing_colours.light(text), encoding="utf-8")
+    drawing.with_name(f"{drawing.stem}-dark.svg").write_text(drawing_colours.dark(text), encoding="utf-8")
+
+
+def _about() -> str:
+    """Return the version and the repository for the head and foot of every page, as TOML.
+
+    The repository is `Repository` of `[project.urls]`; without it, the place that this clone came from.
+    """
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    version = f"afspm {project['version']}"
+    lines = [f"site_name = {json.dumps(version)}", f"copyright = {json.dumps(version)}"]
+    repository = project.get("urls", {}).get("Repository") or _origin()
+    if repository:
+        lines += [f"repo_url = {json.dumps(repository)}", 'repo_name = "repository"']
+    else:
+        sys.stderr.write("no link to the repository: [project.urls] has no Repository, and git no https origin\n")
+    return "\n".join(lines) + "\n"
+
+
+def _origin() -> str:
+    ask = ["git", "config", "--get", "remote.origin.url"]
+    url = subprocess.run(ask, cwd=ROOT, capture_output=True, encoding="utf-8", check=False).stdout.strip()
+    return url if url.startswith("https://") else ""
 
 
 def _code_page(target: Path) -> str:
@@ -113,6 +165,12 @@ def _group(listing: str) -> str:
     pages = [page.relative_to(ROOT).as_posix() for page in sorted(folder.rglob("*.md")) if page != ROOT / listing]
     title = (ROOT / listing).read_text(encoding="utf-8").partition("\n")[0].removeprefix("# ")
     return f"{{ {json.dumps(title)} = {json.dumps([listing, *pages])} }}"
+
+
+def _finds(index: list[dict[str, Any]], words: str) -> bool:
+    """Return whether a section has all the words in its title, its text or the titles above, as the search wants it."""
+    texts = (" ".join([item["title"], item["text"], *item["path"]]).lower() for item in index)
+    return any(all(word in text for word in words.lower().split()) for text in texts)
 
 
 class _Page(HTMLParser):

@@ -1,63 +1,21 @@
-"""Draws the diagrams of the documentation: `python tools/drawings.py` (or `--check`)."""
+"""Draws the diagrams of the documentation: `python tools/drawings.py` (or `--check`).
+
+The transfer of control is drawn from the record of a night: `docs/pictures/control-transfer.json` keeps what is
+drawn. `python tools/control_transfer.py runs/tip_repair-…` takes it from another run.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from afspm.experiment.svg import Svg
+from control_transfer import control_transfer
+from message_drawings import message_bytes, two_paths
+from sheet import BAD, CONTROL, DATA, GREY, INK, QUIET, Sheet
 
 FOLDER: Final = Path(__file__).resolve().parents[1] / "docs" / "pictures"
-GREY, DATA, CONTROL, BAD, GOOD = "#777777", "#2c7fb8", "#d95f0e", "#c0392b", "#2a7f3f"
-FILLS: Final = {
-    "component": ("#eaf5ea", GOOD),
-    "scheduler": ("#fdf0e3", CONTROL),
-    "translator": ("#e7f1f8", DATA),
-    "controller": ("#eeeeee", GREY),
-    "frame": ("none", "#bbbbbb"),
-    "decision": ("#fff8dc", "#a08000"),
-}
-XY = tuple[float, float]
-
-
-@dataclass
-class Sheet:
-    """A drawing in the making; boxes are told by their middle."""
-
-    svg: Svg = field(default_factory=Svg)
-
-    def box(self, at: XY, size: XY, kind: str, *lines: str, bold: bool = True) -> None:
-        """A box with lines of text in its middle."""
-        (x, y), (width, height) = at, size
-        fill, stroke = FILLS[kind]
-        self.svg.box(x - width / 2, y - height / 2, width, height, fill=fill, stroke=stroke)
-        for number, line in enumerate(lines):
-            below = (number - (len(lines) - 1) / 2) * 15 + 4
-            self.svg.text(x, y + below, line, size=12, bold=bold and number == 0)
-
-    def frame(self, corner: XY, size: XY, title: str) -> None:
-        """A dashed frame with a title at its top."""
-        fill, stroke = FILLS["frame"]
-        self.svg.box(*corner, *size, fill=fill, stroke=stroke, dashed=True)
-        self.svg.text(corner[0] + 10, corner[1] + 18, title, anchor="start", fill="#555555")
-
-    def arrow(self, *points: XY, stroke: str = GREY, both: bool = False, text: str = "", at: XY | None = None) -> None:
-        """A line through points, with a word beside it."""
-        self.svg.line(points, stroke=stroke, start=both)
-        if text:
-            x, y = at or ((points[0][0] + points[-1][0]) / 2, (points[0][1] + points[-1][1]) / 2 - 5)
-            self.svg.text(x, y, text, size=11, fill=stroke, halo=True)
-
-    def note(self, at: XY, text: str, *, anchor: str = "middle", bold: bool = False, fill: str = "#222222") -> None:
-        """A line of text."""
-        self.svg.text(*at, text, anchor=anchor, bold=bold, fill=fill)
-
-    def document(self, width: float, height: float, title: str) -> str:
-        """The whole picture."""
-        return self.svg.document(width, height, title, (GREY, DATA, CONTROL, BAD, GOOD))
 
 
 def computers() -> str:
@@ -68,7 +26,7 @@ def computers() -> str:
         sheet.frame((left, 30), (290, 150 if apart else 265), "at the microscope")
         if apart:
             sheet.frame((left, 200), (290, 95), "")
-            sheet.note((left + 10, 284), "in the office, or one with a graphics card", anchor="start", fill="#555555")
+            sheet.note((left + 10, 284), "in the office, or one with a graphics card", anchor="start", fill=QUIET)
         x = left + 145
         sheet.box((left + 65, 80), (105, 36), "controller", "controller")
         sheet.box((left + 215, 80), (130, 36), "translator", "Translator")
@@ -168,7 +126,7 @@ def one_dimension() -> str:
             sheet.arrow((x + 50, aimed), (x + 50, sample), stroke=BAD)
         total, rate = drifted, drifted - total if number else 0.0
         for row, (text, colour) in enumerate(
-            ((f"predicted {predicted:g}", DATA), (f"residual {residual:g}", BAD), (f"total {total:g}", "#222222"))
+            ((f"predicted {predicted:g}", DATA), (f"residual {residual:g}", BAD), (f"total {total:g}", INK))
         ):
             sheet.note((x, 250 + row * 18), text, fill=colour)
     sheet.note((368, 120), "…", bold=True)
@@ -204,7 +162,7 @@ def house() -> str:
     for number, guest in enumerate(guests):
         x, y = 567 + number % 2 * 106, 78 + number // 2 * 50
         sheet.box((x, y), (96, 34), "decision", f"{guest}/")
-    sheet.note((620, 345), "… and packages of strangers", fill="#555555")
+    sheet.note((620, 345), "… and packages of strangers", fill=QUIET)
     sheet.arrow((508, 200), (482, 200), stroke=CONTROL, both=True)
     sheet.note((495, 190), "door", fill=CONTROL)
     sheet.note(
@@ -219,6 +177,9 @@ DRAWINGS: dict[str, Callable[[], str]] = {
     "reuse": reuse,
     "drift-workflow": workflow,
     "drift-one-dimension": one_dimension,
+    "two-paths": two_paths,
+    "message-bytes": message_bytes,
+    "control-transfer": control_transfer,
 }
 
 

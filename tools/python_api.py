@@ -50,7 +50,8 @@ GROUPS = {
 BY_THE_LIBRARY = frozenset({"run_process", "give_back_inherited"})
 """Public methods that afspm calls itself."""
 WIDTH = 100
-_ENTRY = re.compile(r"    (\*{0,2}[\w, .*]+): (.*)")
+# A name (or several) at exactly four spaces: a sentence or a continuation line with a colon in it is no entry
+_ENTRY = re.compile(r"    (\*{0,2}[\w.]+(?:, \*{0,2}[\w.]+)*): (.*)")
 
 
 def python_api() -> str:

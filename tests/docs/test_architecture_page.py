@@ -15,7 +15,7 @@ def _folders(parent: Path) -> set[str]:
     return {folder.name for folder in parent.iterdir() if any(folder.glob("*.py"))}
 
 
-def test_layers_are_those_of_the_contract() -> None:
+def test_layers_match_the_contract() -> None:
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["importlinter"][
         "contracts"
     ]
@@ -30,7 +30,7 @@ def test_every_room_and_every_guest_is_named() -> None:
     assert _folders(PACKAGE) | _folders(PACKAGE / "plugins") <= named
 
 
-def test_every_module_that_is_named_is_there() -> None:
+def test_named_modules_exist() -> None:
     modules = re.findall(r"`((?:\w+/)+\w+\.py)`", PAGE)
     assert len(modules) > 15
     assert [module for module in modules if not (PACKAGE / module).exists()] == []

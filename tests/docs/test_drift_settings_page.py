@@ -1,4 +1,4 @@
-"""The settings of estimators and trackers in the how-to are there, with those defaults."""
+"""The settings of estimators and trackers in the how-to exist, with the documented defaults."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def defaults(owner: str) -> dict[str, Any]:
     return {name: one.default for name, one in parameters.items()}
 
 
-def test_the_table_is_found() -> None:
+def test_table_is_found() -> None:
     assert {owner for owner, _, _ in ROWS} == {"paper", "bank", "brief", "orb", "sift", "correlation"}
 
 
 @pytest.mark.parametrize(("owner", "setting", "default"), ROWS)
-def test_a_setting_has_the_default_that_is_told(owner: str, setting: str, default: str) -> None:
+def test_setting_has_the_documented_default(owner: str, setting: str, default: str) -> None:
     assert defaults(owner)[setting] == tomllib.loads(f"value = {default}")["value"]

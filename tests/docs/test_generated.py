@@ -1,4 +1,4 @@
-"""The parts of the documentation that follow from the code are those of today's code."""
+"""The parts of the documentation that follow from the code are up to date."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("tool", ["tools/docs.py", "tools/drawings.py"])
-def test_nothing_in_the_docs_is_stale(tool: str) -> None:
+def test_generated_docs_are_current(tool: str) -> None:
     done = subprocess.run(
         [sys.executable, tool, "--check"], cwd=ROOT, capture_output=True, encoding="utf-8", check=False
     )

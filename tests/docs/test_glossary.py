@@ -16,14 +16,14 @@ GLOSSARY = ROOT / "docs" / "reference" / "glossary.md"
 ROW = re.compile(r"^\| (?!term|---)([^|]+) \| ([^|]+) \| `([\w.]+)` \|$", re.MULTILINE)
 
 
-def test_there_are_fifty_terms_and_none_twice() -> None:
+def test_terms_are_at_least_fifty_and_unique() -> None:
     terms = [row[0] for row in ROW.findall(GLOSSARY.read_text(encoding="utf-8"))]
     assert len(terms) >= 50
     assert len(terms) == len(set(terms))
 
 
 @pytest.mark.parametrize("module", sorted({row[2] for row in ROW.findall(GLOSSARY.read_text(encoding="utf-8"))}))
-def test_the_module_of_a_term_exists(module: str) -> None:
+def test_module_of_a_term_exists(module: str) -> None:
     assert find_spec(module) is not None
 
 

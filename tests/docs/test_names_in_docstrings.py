@@ -1,4 +1,4 @@
-"""Names in back-quotes in docstrings are names of something that is there."""
+"""Back-quoted names in docstrings exist."""
 
 from __future__ import annotations
 

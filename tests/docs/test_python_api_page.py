@@ -1,10 +1,12 @@
-"""The reference of the Python API has everything that users write with, and says something of each."""
+"""The reference of the Python API has an entry with a text for every public name."""
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import re
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -12,6 +14,7 @@ import afspm
 from afspm.record.run import Run
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "python-api.md").read_text(encoding="utf-8")
+ENTRY = re.compile(r"^- ((?:`[^`:]*`, )*`[^`:]*`): ", re.MULTILINE)
 LIBRARY_CALLS = {"run_process", "give_back_inherited"}
 
 
@@ -29,3 +32,43 @@ def test_every_method_has_an_entry(class_: type) -> None:
 
 def test_no_entry_is_empty() -> None:
     assert not re.findall(r"^####? (.+)\n\n```py\n[^`]*```\n\s*(?=#)", PAGE, re.MULTILINE)
+
+
+@pytest.fixture
+def generator(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "tools"))
+    return importlib.import_module("python_api")
+
+
+def test_a_continuation_line_with_a_colon_stays_in_its_entry(generator: ModuleType) -> None:
+    def documented() -> None:
+        """Return the axes.
+
+        Args:
+            first, second: ends of the range, which is cut at
+                the surface, to common values: evenly spaced.
+
+        Returns:
+            The axes. Their coordinates are in m, with ticks: text
+            goes on.
+        """
+
+    assert generator._markdown(documented).splitlines() == [
+        "Return the axes.",
+        "",
+        "**Args:**",
+        "",
+        "- `first`, `second`: ends of the range, which is cut at",
+        "  the surface, to common values: evenly spaced.",
+        "",
+        "**Returns:**",
+        "",
+        "The axes. Their coordinates are in m, with ticks: text",
+        "goes on.",
+    ]
+
+
+def test_every_documented_argument_is_a_name() -> None:
+    names = [name for entry in ENTRY.findall(PAGE) for name in entry.replace("`", "").split(", ")]
+    assert len(names) > 100
+    assert [name for name in names if " " in name] == []

@@ -7,7 +7,8 @@ On each page, in the order of the page and in one empty folder:
 - other ```python blocks are executed, sharing their names;
 - other ```toml blocks must be TOML;
 - ```console blocks: each line after `$ ` is run by the shell and must succeed; the lines below must come in its output,
-  in this order, where … stands for anything. What two processes say (`… tiles … tile 1`) is in no order. An error that
+  in this order, where … stands for anything. Lines of different processes (`… tiles … tile 1`) may come in any order.
+  An error that
   the page does not show fails the test.
 
 Blocks of other kinds (```text, ```sh …) are only shown.
@@ -34,7 +35,7 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\]\((?!https?:|#|mailto:)([^)#]+)")
 PROCESS = re.compile(r"… (\w+) …")
 TROUBLE = ("ERROR", "Traceback", "Logging error")
-"""A page whose snippet says one of these without showing it would startle its reader."""
+"""Words that may only appear in the output of a snippet if the page shows them."""
 FILE_NAME = re.compile(r"(?:#|//) ([\w./-]+\.(?:py|toml|proto))\n")
 
 
@@ -92,20 +93,20 @@ def run_console(text: str, folder: Path, where: str) -> None:
         ends: defaultdict[str, int] = defaultdict(int)
         for line in filter(None, map(str.strip, expected.splitlines())):
             pattern = ".*?".join(re.escape(piece) for piece in line.split("…"))
-            process = said[1] if (said := PROCESS.match(line)) else ""
+            process = named[1] if (named := PROCESS.match(line)) else ""
             found = re.compile(pattern).search(output, ends[process])
             assert found, f"{where}: {line!r} does not come in the output of {command}:\n{output}"
             ends[process] = found.end()
 
 
-def test_the_pages_are_found() -> None:
+def test_pages_are_found() -> None:
     assert len(PAGES) > 5
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_within_the_project_leads_somewhere(page: Path) -> None:
+def test_link_within_the_project_has_a_target(page: Path) -> None:
     for target in LINK.findall(page.read_text(encoding="utf-8")):
-        assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}, which is not there"
+        assert (page.parent / target).exists(), f"{page.relative_to(ROOT)} links to {target}, which does not exist"
 
 
 @pytest.mark.parametrize(
@@ -124,7 +125,7 @@ def test_every_page_is_listed(listing: str, pages: str) -> None:
     assert found <= linked
 
 
-def test_each_decision_has_a_number_of_its_own_and_is_titled_by_it() -> None:
+def test_decision_numbers_are_unique_and_in_titles() -> None:
     pages = [page for page in sorted((ROOT / "docs/explanation/decisions").glob("*.md")) if page.name != "README.md"]
     numbers = [page.name[:5] for page in pages]
     assert len(set(numbers)) == len(numbers)
