@@ -213,7 +213,7 @@ def _summary(folder: Path) -> RunSummary:
 
 def _read(run: Run) -> RunSummary:
     overview = run.overview((CONTROL_STATE.name, JOURNAL.name, DRIFT_RESCAN.name))
-    began = next(iter(overview.controls.spans), None)
+    began = next(iter(overview.timelines.control.spans), None)
     return RunSummary(
         folder="",
         name=run.name,

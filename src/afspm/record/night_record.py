@@ -15,7 +15,7 @@ from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
 from afspm.record.drawing.raster import indices, reduced, value_range
-from afspm.record.overview import SOON_NS
+from afspm.record.measurement_history import SOON_NS
 from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, replace
+from collections import defaultdict, deque
+from dataclasses import dataclass, field, replace
 
 MOST_SPANS = 20_000
 
@@ -73,3 +73,19 @@ class Timeline:
         for span in self.spans:
             total[span.label] = total.get(span.label, 0) + span.lasted_ns(now_ns)
         return total
+
+
+@dataclass(slots=True)
+class Timelines:
+    """The timelines of control and microscope.
+
+    Attributes:
+        control: the holders.
+        mode, scope_state: labels in lower case.
+        problems: of each problem, by number.
+    """
+
+    control: Timeline = field(default_factory=Timeline)
+    mode: Timeline = field(default_factory=Timeline)
+    scope_state: Timeline = field(default_factory=Timeline)
+    problems: defaultdict[int, Timeline] = field(default_factory=lambda: defaultdict(Timeline))

@@ -13,8 +13,7 @@ import pytest
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, TransportError
 from afspm.plugins.asylum.emulator import AsylumEmulator
-from afspm.simulation.emulation import registry
-from afspm.simulation.emulation.emulator import Emulator
+from afspm.simulation.emulation.emulator import Emulator, emulator_names, find_emulator
 
 from .tiny import Tiny, ask
 
@@ -127,16 +126,16 @@ def test_settings_without_sense_are_refused_before_it_runs() -> None:
 
 
 def test_an_emulator_has_a_name_or_is_one_of_the_users() -> None:
-    assert registry.emulator(f"{Tiny.__module__}.Tiny") is Tiny
+    assert find_emulator(f"{Tiny.__module__}.Tiny") is Tiny
     with pytest.raises(ConfigError, match="there is no emulator 'veeco'"):
-        registry.emulator("veeco")
+        find_emulator("veeco")
     with pytest.raises(ConfigError, match="is not an emulator"):
-        registry.emulator("pathlib.Path")
+        find_emulator("pathlib.Path")
 
 
-@pytest.mark.parametrize("name", registry.names())
+@pytest.mark.parametrize("name", emulator_names())
 def test_those_of_afspm_say_what_they_are(name: str) -> None:
-    found = registry.emulator(name)
+    found = find_emulator(name)
     assert issubclass(found, Emulator)
     assert found.vendor
     assert all(found.fault_kinds.values())

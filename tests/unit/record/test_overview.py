@@ -86,23 +86,23 @@ def test_newest_of_each_state_is_kept() -> None:
     night = seen(*NIGHT)
     assert night.status == status(ScopeState.FREE)
     assert night.control == control(None, mode=ControlMode.MANUAL)
-    assert night.scan_parameters == model.ScanParameters(REGION, (4, 4))
+    assert night.readings.scan_parameters == model.ScanParameters(REGION, (4, 4))
     assert night.newest_ns == 40 * S
 
 
 def test_control_lies_in_spans_with_its_holder() -> None:
-    spans = [(s.label, s.start_ns // S, s.end_ns and s.end_ns // S) for s in seen(*NIGHT).controls.spans]
+    spans = [(s.label, s.start_ns // S, s.end_ns and s.end_ns // S) for s in seen(*NIGHT).timelines.control.spans]
     assert spans == [("series", 2, 22), ("corrector", 26, 40)]
 
 
 def test_mode_is_a_lane_too_and_the_present_has_no_end() -> None:
-    now = seen(*NIGHT).modes.now
+    now = seen(*NIGHT).timelines.mode.now
     assert now is not None
     assert (now.label, now.start_ns, now.end_ns) == ("manual", 40 * S, None)
 
 
 def test_a_problem_is_told_with_who_flagged_it() -> None:
-    (span,) = seen(*NIGHT).problem_timelines[TIP].spans
+    (span,) = seen(*NIGHT).timelines.problems[TIP].spans
     assert (span.label, span.start_ns, span.end_ns) == ("tip-shape-changed", 22 * S, 35 * S)
     assert span.by == "classifier"
 
@@ -141,11 +141,11 @@ def test_what_was_taken_before_changes_nothing() -> None:
 
 def facts(night: Overview) -> list[object]:
     lanes = [
-        night.controls,
-        night.modes,
-        night.states,
-        *night.problem_timelines.values(),
-        *night.process_timelines.values(),
+        night.timelines.control,
+        night.timelines.mode,
+        night.timelines.scope_state,
+        *night.timelines.problems.values(),
+        *night.process_history.timelines.values(),
     ]
     told = [night.scans, night.spectra, night.drift, list(night.log), list(night.entries), list(night.refusals)]
     return [*told, night.control, night.status, night.processes, [list(lane.spans) for lane in lanes]]
@@ -170,7 +170,7 @@ def test_busy_is_alive_in_the_time_line_but_not_in_the_present() -> None:
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.ALIVE, 1),)), 1),
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.BUSY, 3),)), 3),
     )
-    assert [span.label for span in night.process_timelines["series"].spans] == ["alive"]
+    assert [span.label for span in night.process_history.timelines["series"].spans] == ["alive"]
     assert night.processes["series"].condition is ProcessCondition.BUSY
 
 
@@ -181,7 +181,9 @@ def test_a_restart_is_told_once_with_how_it_had_ended() -> None:
         ("ProcessStates", model.ProcessStates(5 * S, "lab", (again,)), 5),
         ("ProcessStates", model.ProcessStates(7 * S, "lab", (again,)), 7),
     )
-    assert [(one.name, one.starts, one.last_exit) for one in night.restarts] == [("series", 2, "killed")]
+    assert [(one.name, one.starts, one.last_exit) for one in night.process_history.restarts] == [
+        ("series", 2, "killed")
+    ]
 
 
 def test_a_running_scan_tells_how_far_it_is_by_its_lines() -> None:
@@ -304,12 +306,12 @@ STORY = [
 
 def test_who_comes_late_has_the_past_from_the_journal() -> None:
     late = seen(*STORY, ("ControlState", control(None, mode=ControlMode.MANUAL), 41))
-    assert [(s.label, s.start_ns // S) for s in late.controls.spans] == [("series", 2), ("corrector", 26)]
+    assert [(s.label, s.start_ns // S) for s in late.timelines.control.spans] == [("series", 2), ("corrector", 26)]
     assert (late.in_control, late.control_since_ns) == ("ada", 40 * S)
-    (flagged,) = late.problem_timelines[TIP].spans
+    (flagged,) = late.timelines.problems[TIP].spans
     assert (flagged.by, flagged.start_ns, flagged.end_ns) == ("classifier", 22 * S, 35 * S)
-    assert late.modes.now is not None
-    assert late.modes.now.start_ns == 40 * S
+    assert late.timelines.mode.now is not None
+    assert late.timelines.mode.now.start_ns == 40 * S
 
 
 def test_what_the_journal_says_of_what_was_seen_changes_nothing() -> None:
@@ -326,7 +328,7 @@ def test_what_the_journal_says_of_what_was_seen_changes_nothing() -> None:
             41,
         ),
     )  # type: ignore[attr-defined]
-    assert [list(seen(*states).controls.spans)] == [list(with_journal.controls.spans)]
+    assert [list(seen(*states).timelines.control.spans)] == [list(with_journal.timelines.control.spans)]
 
 
 def test_channels_of_a_scan_share_what_is_equal() -> None:

@@ -337,7 +337,7 @@ def test_a_problem_that_is_seen_after_the_end_is_told_and_is_no_refusal(run: Pat
 
 
 def test_time_is_shared_out(run: Path) -> None:
-    shares = dict(told(run).shares(told(run).overview.controls))
+    shares = dict(told(run).shares(told(run).overview.timelines.control))
     assert shares["corrector"] == 90 * S
     assert shares["series <b>"] == (1498 + 2001) * S
 
@@ -358,10 +358,10 @@ def fields_of(row: object) -> dict[str, object]:
 
 def test_what_can_not_be_told_apart_is_one_bar(run: Path) -> None:
     night = told(run)
-    night.overview.states.spans.clear()
+    night.overview.timelines.scope_state.spans.clear()
     for k in range(20_000):  # in an hour: several for each pixel
         begin = night.start_ns + k * 180_000_000
-        night.overview.states.spans.append(Span("scanning", begin, begin + 100_000_000))
+        night.overview.timelines.scope_state.spans.append(Span("scanning", begin, begin + 100_000_000))
     assert page._timeline(night).count("<span") < 1000
 
 

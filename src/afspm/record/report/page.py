@@ -74,7 +74,7 @@ def _what(story: RunStory) -> str:
 
 def _when(story: RunStory, clock: PageTimes) -> str:
     told = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
-    if story.speed != 1.0 and story.real_s is not None:
+    if story.real_s is not None:
         told += f" ({duration_text(story.real_s)} real)"
     end = story.end
     ended = story.ended
@@ -153,9 +153,9 @@ def _shares(story: RunStory) -> str:
     seen, styles = story.overview, colours(story)
     return '<div class="shares">' + "".join(
         [
-            _share_table(story, "in control", seen.controls, styles),
-            _share_table(story, "microscope", seen.states, {}),
-            _share_table(story, "mode", seen.modes, {"manual": "manual"}),
+            _share_table(story, "in control", seen.timelines.control, styles),
+            _share_table(story, "microscope", seen.timelines.scope_state, {}),
+            _share_table(story, "mode", seen.timelines.mode, {"manual": "manual"}),
         ]
     ) + "</div>"  # fmt: skip
 

@@ -67,7 +67,7 @@ def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) ->
 
 def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
     """Return the times of the scans that are bad."""
-    lanes = story.overview.problem_timelines.items()
+    lanes = story.overview.timelines.problems.items()
     flagged_ns = {number: [span.start_ns for span in lane.spans] for number, lane in lanes}
     interrupted_ns = [row.time_ns for row in story.scans if row.interrupted]
     return bad_scans([row.time_ns for row in story.scans], run.verdicts(), flagged_ns, interrupted_ns)

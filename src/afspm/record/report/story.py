@@ -49,8 +49,7 @@ class RunStory:
 
     Attributes:
         start_ns: the first that is known of it.
-        speed: experiment seconds in a real second.
-        real_s: how long it took in real time; None: that is not known.
+        real_s: the duration in real time; None if it is unknown, or the clock ran at real speed.
         ended: how it ended, in words; that it goes on, or was cut off.
         frame: of all places.
         problems: spans of all problems in the order of time, but for routine ones.
@@ -63,7 +62,6 @@ class RunStory:
     metadata: Mapping[str, str]
     simulated: bool
     start_ns: int
-    speed: float
     real_s: float | None
     ended: str
     frame: Frame
@@ -92,7 +90,7 @@ class RunStory:
 
     @property
     def restarts(self) -> list[ProcessRestart]:
-        return list(self.overview.restarts)
+        return list(self.overview.process_history.restarts)
 
     @property
     def given_up(self) -> list[str]:
@@ -140,7 +138,7 @@ class RunStory:
         end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
         during = [
             span.label
-            for span in self.overview.controls.spans
+            for span in self.overview.timelines.control.spans
             if span.start_ns < end_ns and (span.end_ns is None or span.end_ns > problem.start_ns)
         ]
         return list(dict.fromkeys(during))
@@ -159,8 +157,7 @@ def read(run: Run) -> RunStory:
         metadata=run.metadata,
         simulated=run.simulated,
         start_ns=start_ns,
-        speed=float(clock.get("speed", 1.0)),
-        real_s=run.facts.get(REAL_S),
+        real_s=None if float(clock.get("speed", 1.0)) == 1.0 else run.facts.get(REAL_S),
         ended=describe_state(run.folder),
         frame=run.frame,
         overview=overview,
@@ -217,7 +214,7 @@ def _times(count: int) -> str:
 
 
 def _first_ns(overview: Overview, scans: Sequence[ScanRow]) -> list[int]:
-    lanes = (overview.controls, overview.modes, overview.states)
+    lanes = (overview.timelines.control, overview.timelines.mode, overview.timelines.scope_state)
     times = [lane.spans[0].start_ns for lane in lanes if lane.spans]
     return times + [scan.began_ns or scan.time_ns for scan in scans[:1]]
 
@@ -236,7 +233,7 @@ def in_trouble(lane: Timeline) -> list[Span]:
 
 def colours(story: RunStory) -> dict[str, str]:
     """Return the class of each component that was in control."""
-    holders = dict.fromkeys(span.label for span in story.overview.controls.spans)
+    holders = dict.fromkeys(span.label for span in story.overview.timelines.control.spans)
     return {holder: f"c{number % COLOURS}" for number, holder in enumerate(holders)}
 
 
@@ -244,19 +241,23 @@ def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
     """Yield a row for each in control, mode, problem, state, and process that was not well."""
     seen = story.overview
     for holder, style in colours(story).items():
-        yield _row(holder, style, (span for span in seen.controls.spans if span.label == holder))
-    manual = [span for span in seen.modes.spans if span.label == "manual"]
+        yield _row(holder, style, (span for span in seen.timelines.control.spans if span.label == holder))
+    manual = [span for span in seen.timelines.mode.spans if span.label == "manual"]
     if manual:
         yield _row("MANUAL", "manual", manual)
     for name, spans in itertools.groupby(sorted(story.problems, key=lambda s: s.label), lambda span: span.label):
         yield _row(name, "problem", spans)
     if seen.routine_spans:
         yield _row("first scan both ways", "marked", seen.routine_spans)
-    for label in dict.fromkeys(span.label for span in seen.states.spans):
+    for label in dict.fromkeys(span.label for span in seen.timelines.scope_state.spans):
         if label not in ("free", "undefined"):
             style = "problem" if label == "interrupted" else "state"
-            yield _row(states_in_words(label), style, (span for span in seen.states.spans if span.label == label))
-    for name, lane in seen.process_timelines.items():
+            yield _row(
+                states_in_words(label),
+                style,
+                (span for span in seen.timelines.scope_state.spans if span.label == label),
+            )
+    for name, lane in seen.process_history.timelines.items():
         if trouble := in_trouble(lane):
             yield _row(f"{name} not well", "problem", trouble)
     again = [Span(f"{one.name} started again: {one.last_exit}", one.time_ns, one.time_ns) for one in story.restarts]

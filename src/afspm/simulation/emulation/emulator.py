@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import logging
 import math
 import sys
@@ -12,11 +13,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+from afspm.basics import entry_points
 from afspm.basics.addresses import Listens
 from afspm.basics.clock import Clock, ExperimentClock
-from afspm.basics.errors import AfspmError, ErrorCollector, TransportError
+from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, TransportError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.requirements import require
@@ -379,3 +382,42 @@ class Emulator(ABC):
                 button.pressed()
 
             self._survive(press, self.clock.now_s())
+
+
+def emulator_names() -> list[str]:
+    """Return the short names of all emulators that installed packages declare: "nanonis" for `NanonisEmulator`."""
+    return sorted(map(_short_name, entry_points.names(entry_points.EMULATORS)))
+
+
+def find_emulator(name: str) -> type[Emulator]:
+    """Return the emulator of a short name, or a user's own by "module.Class".
+
+    Raises:
+        ConfigError: there is none, or its module can't be imported.
+    """
+    module_name, _, class_name = name.rpartition(".")
+    if module_name:
+        found = getattr(_imported(module_name, name), class_name, None)
+    else:
+        declared = {_short_name(one): one for one in entry_points.names(entry_points.EMULATORS)}
+        if name not in declared:
+            raise ConfigError(f"there is no emulator {name!r}", hint=f"there are {', '.join(declared) or 'none'}")
+        found = entry_points.load(entry_points.EMULATORS, declared[name])
+    if not (isinstance(found, type) and issubclass(found, Emulator)):
+        raise ConfigError(
+            f"{name} is not an emulator", hint="a class derived from afspm.simulation.emulation.emulator.Emulator"
+        )
+    return found
+
+
+def _short_name(class_name: str) -> str:
+    return class_name.removesuffix("Emulator").lower()
+
+
+def _imported(module: str, name: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"the emulator {name} can't be imported: {error}", hint="is it installed, or on the path?"
+        ) from error
