@@ -104,7 +104,6 @@ def find_runs(
 
 
 def _read_word(word: str) -> tuple[str, str]:
-    """Return field ("" for any) and text of a word."""
     match = _WORD.fullmatch(word.strip())
     if match is None:
         raise InvalidValue("a word to look for is empty")
@@ -151,7 +150,7 @@ def _up_to_date(root: Path) -> list[RunSummary]:
 
 
 def _opened(root: Path) -> sqlite3.Connection:
-    """Return the index; one that is damaged, or of another version, is made anew; one that can't be is in memory."""
+    # a damaged index, or one of another version, is rebuilt; where the folder can't be written, the index is in memory
     file = root / INDEX_FILE
     for _ in range(2):
         try:
@@ -179,7 +178,7 @@ def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
 
 
 def _folders(root: Path) -> Iterator[Path]:
-    """Yield the folders of runs; links are not followed, such as that to the newest."""
+    # links are not followed: `latest` points to a run that is listed anyway
     for folder, inner, files in os.walk(root):
         if RUN_FILE in files:
             inner.clear()
@@ -187,7 +186,6 @@ def _folders(root: Path) -> Iterator[Path]:
 
 
 def _stamp(folder: Path) -> str:
-    """Return what changes when anything is recorded."""
     stamps = []
     for name in _WATCHED:
         with suppress(OSError):

@@ -61,7 +61,6 @@ def _card(root: Path, run: RunSummary) -> str:
 
 
 def _pictures(folder: Path) -> Iterator[str]:
-    """Yield pictures of some scans; none where the record can't be read any more."""
     with suppress(FileError), open_run(folder) as run:
         whole = [row for row in run.scans if not row.interrupted]
         for picture in pictures.of_scans(run, pictures.chosen(whole, _PICTURES)):
@@ -70,7 +69,6 @@ def _pictures(folder: Path) -> Iterator[str]:
 
 
 def _lines(run: RunSummary) -> list[str]:
-    """Return what a card says, as HTML."""
     if run.damage:
         return [f"<b>{escape(run.damage)}</b>"]
     about = " · ".join(

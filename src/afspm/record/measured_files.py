@@ -76,7 +76,7 @@ class MeasuredFiles:
         new: dict[str, Scan] = {}
         for _, scan in taken.channels:
             new.setdefault(scan.channel, scan)
-        known = self._known(new, measured_ns)
+        known = self._find_recorded(new, measured_ns)
         if known is None:
             stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
             number = self._add_scan(list(new.values()), measured_ns, stood, published_ns, interrupted=False)
@@ -85,8 +85,7 @@ class MeasuredFiles:
             self._add_channels(number, self._folder / known[1], new)
         self._insert_scan_packets(taken, number)
 
-    def _known(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
-        """Return number and file of the recorded scan that these are channels of; None if there is none."""
+    def _find_recorded(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
         rows = self._journal.execute(
             "SELECT number, file FROM scans WHERE time_ns = ? AND NOT interrupted ORDER BY number", (measured_ns,)
         )
@@ -97,7 +96,6 @@ class MeasuredFiles:
         return None
 
     def _channels(self, number: int) -> Iterator[tuple[str, str]]:
-        """Yield the channels of a recorded scan, with the controller's files that they came from."""
         rows = self._journal.execute("SELECT payload FROM packets WHERE scan = ? AND message = 'Scan2d'", (number,))
         for (payload,) in rows:
             message: Any = wire.message_type("Scan2d").FromString(payload)
@@ -134,7 +132,7 @@ class MeasuredFiles:
         return number
 
     def _add_channels(self, number: int, path: Path, new: Mapping[str, Scan]) -> None:
-        """Add channels that came after the file was written, since the recorder was killed in between."""
+        # the recorder was killed between writing the file and these channels
         from afspm.storage.formats import read
 
         self._batch.finish()  # it may be one of these
@@ -193,7 +191,6 @@ class MeasuredFiles:
     # --- both ---
 
     def _next(self, kind: str, time_ns: int) -> tuple[int, str]:
-        """Return the next number and its file, relative to the run folder."""
         number = int(self._journal.execute(f"SELECT coalesce(max(number), 0) + 1 FROM {kind}").fetchone()[0])
         name = f"{kind}/{_stamp(time_ns)}-{number:05d}{SUFFIX}"
         for orphan in (self._folder / kind).glob(f"{_stamp(time_ns)}-*{SUFFIX}"):
@@ -252,5 +249,5 @@ def write_synced(path: Path, data: bytes) -> None:
 
 
 def _stamp(time_ns: int) -> str:
-    """Return a time as it may stand in the name of a file; programs that cut names at a dot get the whole."""
+    # no dot: programs that cut a file name at its first dot still show the whole time
     return iso_utc(time_ns).replace("-", "").replace(":", "").replace(".", "_")

@@ -40,19 +40,19 @@ class KeyedTable(Table[R]):
     def __getitem__(self, index: slice) -> KeyedTable[R]: ...
     def __getitem__(self, index: int | str | slice) -> R | KeyedTable[R]:
         if isinstance(index, str):
-            return self._of_key(index)
+            return self._last_with_key(index)
         return self._with(self._rows[index]) if isinstance(index, slice) else self._rows[index]
 
     def where(self, wanted: Callable[[R], bool]) -> KeyedTable[R]:
         """The rows for which it is true."""
         return self._with(row for row in self._rows if wanted(row))
 
-    def _of_key(self, key: str) -> R:
-        """The last of this key: attempts before it were interrupted."""
+    def _last_with_key(self, key: str) -> R:
+        # the last one: earlier attempts of this key were interrupted
         found = [row for row in self._rows if row.key == key]
         if not found:
             known = dict.fromkeys(row.key for row in self._rows if row.key)
-            raise NoSuchItem(f"no key {key!r}; {_told(list(known))}")
+            raise NoSuchItem(f"no key {key!r}; {_describe_keys(list(known))}")
         return found[-1]
 
     def _with(self, rows: Iterable[R]) -> KeyedTable[R]:
@@ -149,7 +149,7 @@ def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> Spect
 
 
 def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[int, str]:
-    """Return the keys by the number of the row: each start belongs to the measurement that was published next."""
+    # the log has no link from a request to its measurement: each start belongs to the next published measurement
     starts = query(f"SELECT sent_ns, key FROM starts WHERE action = '{action}'") if query(_HAS_STARTS) else []
     if not any(key for _, key in starts):
         return {}
@@ -164,7 +164,7 @@ def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[in
 
 
 def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | None]]:
-    """Return how the position of each scan is known, by its number: the mapping that was published just before it."""
+    # the mapping of a scan is published just before the scan
     mappings = query("SELECT time_ns, payload FROM packets WHERE message = 'DriftMapping' ORDER BY time_ns DESC")
     if not mappings:
         return {}
@@ -183,7 +183,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
     return found
 
 
-def _told(keys: Sequence[str]) -> str:
+def _describe_keys(keys: Sequence[str]) -> str:
     if not keys:
         return "nothing was measured under a key"
     return f"there are {', '.join(keys[:20])}{' …' if len(keys) > 20 else ''}"

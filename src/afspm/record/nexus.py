@@ -134,7 +134,7 @@ def _encoded(
     circumstances: FileProvenance,
     fill: _Fill,
 ) -> bytes:
-    """Made in memory: whatever is wrong with the disk is then found in one place, where the bytes are written."""
+    # in memory: errors of the disk then occur in one place, where the bytes are written
     import h5py
 
     with h5py.File("aside", "w", driver="core", backing_store=False) as file:
@@ -190,7 +190,6 @@ def afspm_version() -> str:
 
 
 def _plain(value: object) -> object:
-    """Return a value of a vendor's header in JSON's types."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):

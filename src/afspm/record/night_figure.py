@@ -114,7 +114,7 @@ def _letter(figure: Figure, letter: str, x: float, y: float) -> None:
 
 
 def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mapping[str, str], rows: int) -> None:
-    """All pictures as one image, which is much faster than an image each; under each a bar of who took it."""
+    # one image for all pictures: drawing an image for each takes much longer
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
     bad_ns = record.bad_ns()
@@ -147,7 +147,6 @@ def _bands(
     *,
     names_too: bool,
 ) -> None:
-    """Draw a lane for each holder and each problem; time in ns."""
     labels: list[str] = []
     for lane, holder in enumerate(record.holders):
         _lane(ax, lane, record.control_spans(holder), limits, facecolor=colours[holder])
@@ -206,7 +205,6 @@ def _hours(ax: Axes, record: NightRecord) -> None:
 
 
 def _times(ax: Axes, begin_ns: int, end_ns: int, *, about: int) -> None:
-    """Label round times of day, as everywhere in the picture."""
     ticks_ns = [round(tick_s * NS_PER_S) for tick_s in time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S, about)]
     seconds = any(tick_ns % (60 * NS_PER_S) for tick_ns in ticks_ns)
     ax.set_xticks(ticks_ns, [time_of_day(tick_ns, UTC, seconds=seconds) for tick_ns in ticks_ns], size=6)
@@ -221,7 +219,6 @@ def _legend(ax: Axes) -> None:
 
 
 def _episodes(record: NightRecord) -> list[Span]:
-    """Return the spans from a problem flagged until none is."""
     spans = sorted((s for p in record.problems for s in record.problem_spans(p)), key=lambda s: s.start_ns)
     merged: list[Span] = []
     for span in spans:
@@ -241,7 +238,6 @@ def _around(span: Span, record: NightRecord) -> tuple[int, int]:
 
 
 def _chosen(record: NightRecord) -> list[Shot]:
-    """All scans, or if there are too many, those evenly through the night and every one that something happened to."""
     shots = sorted(record.shots, key=lambda shot: shot.time_ns)
     if len(shots) <= MOST_SHOTS:
         return shots
@@ -260,7 +256,6 @@ def _clipped(span: Span, limits: tuple[int, int]) -> tuple[float, float]:
 
 
 def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """On THUMB_PX by THUMB_PX, nearest pixel; narrow ones in the middle."""
     ny, nx = picture.shape
     scale = THUMB_PX / max(ny, nx)
     rows = np.minimum((np.arange(max(1, round(ny * scale))) / scale).astype(int), ny - 1)

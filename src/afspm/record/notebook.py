@@ -26,7 +26,7 @@ def scan_html(scan: Scan) -> str:
     angle = f", turned by {np.degrees(region.angle_rad):.4g}°" if region.angle_rad else ""
     caption = (
         f"<b>{escape(scan.channel)}</b> [{escape(scan.unit)}] {columns} × {rows} px, {typeset_area(region.size_m)} "
-        f"at {typeset_position(region.center_m)}{angle}<br/>{_when(scan.time_ns)}"
+        f"at {typeset_position(region.center_m)}{angle}<br/>{_time_text(scan.time_ns)}"
     )
     if scan.values.size == 0:
         return f"<figure>{_caption(f'{caption}, no values')}</figure>"
@@ -45,7 +45,7 @@ def _caption(text: str) -> str:
     return f'<figcaption style="max-width:320px">{text}</figcaption>'
 
 
-def _when(time_ns: int | None) -> str:
+def _time_text(time_ns: int | None) -> str:
     return "time unknown" if time_ns is None else day_and_time(time_ns, UTC)
 
 
@@ -58,5 +58,5 @@ def spectrum_html(spectrum: Spectrum) -> str:
         for name, unit, values in zip(spectrum.names[1:], spectrum.units[1:], spectrum.values.T[1:], strict=True)
     )
     place = "" if spectrum.position_m is None else f" at {typeset_position(spectrum.position_m)}"
-    head = f"<b>{escape(spectrum.kind)}</b>{place}, {_when(spectrum.time_ns)}"
+    head = f"<b>{escape(spectrum.kind)}</b>{place}, {_time_text(spectrum.time_ns)}"
     return f'<div>{head}<div style="display:flex;flex-wrap:wrap">{drawn}</div></div>'

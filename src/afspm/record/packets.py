@@ -104,7 +104,7 @@ def without_reading_files(
 
 
 def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterator[Row]:
-    """Read some rows at a time, so that a slow reader blocks no writer and sees what is written meanwhile."""
+    # in batches: a slow reader then blocks no writer, and sees rows written meanwhile
     wanted = "" if messages is None else f" AND message IN ({', '.join('?' * len(messages))})"
     sql = f"SELECT {_COLUMNS} FROM packets WHERE source = ? AND (time_ns, envelope) > (?, ?){wanted}"
     sql += f" ORDER BY time_ns, envelope LIMIT {_AT_ONCE}"

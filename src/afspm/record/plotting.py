@@ -54,7 +54,6 @@ def draw(
 
 
 def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, float]) -> object:
-    """Draw the values, times a factor, over the places of their pixels, in m."""
     x, y = scan.region.pixels_m(scan.shape)
     values = np.ma.masked_invalid(scan.values * factor)
     look = {"cmap": gold(), "vmin": ends[0] * factor, "vmax": ends[1] * factor}
@@ -68,7 +67,7 @@ def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, fl
 
 
 def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool) -> None:
-    """Add what the first scan in axes needs: units, a colour bar, a scale bar. Others lie over it as they are."""
+    # only for the first scan in these axes: later ones lie over it in the same units and frame
     factor, length_unit = scale(max(scan.region.size_m), "m")
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
         axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))

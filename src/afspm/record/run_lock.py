@@ -80,7 +80,6 @@ def quoted(path: PurePath) -> str:
 
 
 def _is_left(folder: Path) -> bool:
-    """Return whether the lock was held, and is not any more."""
     try:
         with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
             lock(file, shared=True)

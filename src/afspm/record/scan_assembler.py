@@ -133,11 +133,8 @@ class ScanAssembler:
 
 
 def _same(taken: AssembledScan, scan: Scan) -> bool:
-    """Return whether this is another channel of the scan, or one that comes again from a restarted translator.
-
-    Some controllers write a file for each channel: then it is the time that says so, and a channel that is there
-    already out of another file is that of another scan.
-    """
+    # a restarted translator publishes channels again: they count as the same scan. Some controllers write a file for
+    # each channel: their channels share the time, and a channel known from another file belongs to another scan.
     first = taken.channels[0][1]
     if (scan.region, scan.shape, scan.time_ns) != (first.region, first.shape, first.time_ns):
         return False

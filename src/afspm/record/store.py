@@ -185,7 +185,6 @@ class RecordStore:
             self._newest_ns = max(self._newest_ns, packet.time_ns or 0)
 
     def _add(self, packet: Packet, message: str, source: str, thing: object) -> None:
-        """Add a packet that is kept in the journal alone."""
         payload = without_values(message, packet.payload) if message else bytes(packet.payload)
         insert_packet(self._journal, packet, message, payload, source=source)
         match thing:
@@ -215,12 +214,12 @@ class RecordStore:
             self._journal.execute("RELEASE measured")
 
     def _keep(self, taken: Assembled) -> None:
-        """Insert packets whole, with their values, since no file has them."""
+        # whole packets with their values: no file contains this measurement
         for packet in taken.packets():
             insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))
 
     def _placed(self, image: Image) -> Image:
-        """Return it in its frame, which the wire does not say."""
+        # the wire format does not carry the frame
         frame = self._about.frame
         return image if frame is Frame.TIP else replace(image, region=replace(image.region, frame=frame))
 
@@ -250,13 +249,12 @@ class RecordStore:
 
 
 def _is_start(entry: JournalEntry) -> bool:
-    """Return whether a measurement began, or may have."""
+    # without a response the measurement may have started
     may_have_begun = entry.response in (ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE)
     return entry.sent_ns is not None and entry.what in (names.START_SCAN, names.START_SPEC) and may_have_begun
 
 
 def _read(packet: Packet) -> tuple[str, object]:
-    """Return the name of the message and its content; ("", None) if it can't be read."""
     try:
         message = wire.message_of(packet.envelope)
     except WireError:

@@ -208,7 +208,6 @@ def _names(kind: type) -> list[str]:
 
 
 def _apart(row: Any) -> dict[str, object]:
-    """Return a row as numbers and texts."""
     made: dict[str, object] = {}
     for field in fields(row):
         name, value = field.name, getattr(row, field.name)
@@ -260,7 +259,7 @@ def table_html(columns: Mapping[str, Sequence[object]], count: int) -> str:
     """Return columns of `count` rows each; those in which nothing stands are left out."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
     columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
-    told = [_column(name, values) for name, values in columns.items() if any(map(_says, values))]
+    told = [_column(name, values) for name, values in columns.items() if any(map(_has_content, values))]
     head = "".join(f"<th {_CELL}>{escape(name)}</th>" for name, _ in told)
     body = "".join(_row(told, number) for number in shown)
     rows = "1 row" if count == 1 else f"{count} rows"
@@ -286,7 +285,7 @@ def _column(name: str, values: Sequence[Any]) -> tuple[str, list[str]]:
     return f"{plain} / {prefixed}", [_text(None if v is None else v * factor) for v in values]
 
 
-def _says(value: object) -> bool:
+def _has_content(value: object) -> bool:
     return value is not None and value is not False and value != ""
 
 

@@ -193,7 +193,6 @@ class ScanActivity:
             self.stopped_s = now_s
 
     def _scanned_until_s(self, now_s: float) -> float:
-        """The time at which an undisturbed scan would have got as far."""
         until_s = now_s if self.stopped_s is None else min(now_s, self.stopped_s)
         if self.paused_since_s is not None:
             until_s = min(until_s, self.paused_since_s)

@@ -58,7 +58,6 @@ def _fraction(values: Hashes) -> NDArray[np.float64]:
 
 
 def _with(state: Hashes, key: ArrayLike) -> Hashes:
-    """The hashes of one more number."""
     whole = np.asarray(key).astype(np.int64).astype(np.uint64)
     return _mix((whole + np.uint64(1)) * _GOLDEN ^ state)
 

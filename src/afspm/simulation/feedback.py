@@ -248,20 +248,18 @@ class Loop:
 
     @property
     def _omega(self) -> float:
-        """Of the oscillation, in 1/s: a quarter of its period is no shorter than the loop's delay."""
+        # angular frequency in 1/s; a quarter of the period is not shorter than the delay of the loop
         linear = math.sqrt(max(self.integral_gain, 1.0) / max(self._inertia, 0.1 * self.settings.lag_s))
         return min(linear, math.pi / (2.0 * self.settings.delay_s))
 
     def _splits(self, step_s: float) -> int:
-        """Parts of a step: one is exact as long as nothing saturates, ringing is better seen with a few."""
+        # a step is exact unless the detector saturates; several parts resolve ringing better
         ringing = self._damping**2 < 2.0 * max(self._inertia, 0.1 * self.settings.lag_s) * self.integral_gain
         return min(4, max(1, math.ceil(step_s / self.settings.lag_s / 3.0))) if ringing else 1
 
     def _limited(self, z: Array, v: Array, h: Array) -> tuple[Array, Array]:
-        """An oscillation grows until the saturated detector gives no more gain than the loop can bear.
-
-        For a sine that saturates, the gain falls about as 4 / pi * limit / amplitude (its describing function).
-        """
+        # An oscillation grows until the saturated detector reduces the gain to the limit of stability. For a saturating
+        # sine the gain falls about as 4 / pi * limit / amplitude (its describing function).
         excess = self.integral_gain * self.settings.delay_s / (1.0 + self.proportional_gain)
         most_m = min(self.error_limits_m) * 4.0 / math.pi * max(excess, 1.0)
         y = z - h
@@ -269,7 +267,7 @@ class Loop:
         return h + share * y, share * v
 
     def _propagator(self, dt: float) -> NDArray[np.float64]:
-        """Exact over dt: rows give the change of z and the new v from (z - h, v, change of h during dt)."""
+        # exact over dt; rows give the change of z and the new v from (z - h, v, change of h during dt)
         inertia = self._inertia
         limit = 0.1 * self.settings.lag_s
         damping = self._damping if inertia > limit else min(self._damping, -0.5)  # a P gain alone may be too high
@@ -289,14 +287,14 @@ class Loop:
         return np.array([[e[0, 0] - 1.0, e[0, 1] * dt, e[0, 3]], [e[1, 0] / dt, e[1, 1], e[1, 3] / dt]])
 
     def _turned(self, dt: float, growth: float) -> NDArray[np.float64]:
-        """The same of an oscillation that soon saturates, whatever the surface: its phase goes on, and it grows."""
+        # the propagator of an oscillation that soon saturates: it grows, its phase advances, the surface has no effect
         omega, grown = self._omega, math.exp(growth)
         sine, cosine = grown * math.sin(omega * dt), grown * math.cos(omega * dt)
         return np.array([[cosine - 1.0, sine / omega, 0.0], [-omega * sine, cosine, 0.0]])
 
 
 def _exponential(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """exp(a) by scaling and squaring, rows beyond what a float holds cut off (an unstable loop saturates anyway)."""
+    # exp(a) by scaling and squaring; values beyond a float's range are clipped (an unstable loop saturates anyway)
     halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).max()), 1e-9))) + 3)
     small = a / 2.0**halvings
     term = total = np.eye(len(a))

@@ -86,7 +86,7 @@ def _at_points(seed: int, u: Array, v: Array) -> Array:
 
 
 def _on_grid(seed: int, u: Array, v: Array) -> Array:
-    """The same on the grid of v (rows) and u (columns), one axis after the other."""
+    # v gives the rows and u the columns; one axis after the other
     (row, v_weights), (column, u_weights) = _axis(v), _axis(u)
     rows = np.arange(row.min() - 1, row.max() + 3)
     columns = np.arange(column.min() - 1, column.max() + 3)
@@ -101,7 +101,7 @@ def _axis(positions: Array) -> tuple[NDArray[np.int64], tuple[Array, Array, Arra
 
 
 def _spline_axis(lattice: Array, first: NDArray[np.int64], weights: tuple[Array, ...]) -> Array:
-    """Spline along axis 0: sample i is made of lattice rows first[i] to first[i] + 3."""
+    # sample i is a weighted sum of the lattice rows first[i] to first[i] + 3
     if lattice.shape[0] <= _MATMUL_LATTICE:
         matrix = np.zeros((len(first), lattice.shape[0]))
         for k, weight in enumerate(weights):

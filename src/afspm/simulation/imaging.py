@@ -155,7 +155,7 @@ def _under_parabola(surface: Single, axis: int, step_m: float, radius_m: float, 
 
 
 def _under_cone(surface: Single, grid: SampleGrid, slope: float, reach_m: float) -> Single:
-    """An eight-sided pyramid: lines of that slope along both axes and both diagonals, by doubling the stride."""
+    # an eight-sided pyramid: lines of that slope along axes and diagonals, by doubling the stride
     directions = ((1, 0), (0, 1), (1, 1), (1, -1))
     for rows, columns in directions:
         length = math.hypot(rows * grid.dy_m, columns * grid.dx_m)
@@ -170,7 +170,7 @@ def _under_cone(surface: Single, grid: SampleGrid, slope: float, reach_m: float)
 
 
 def _raise_to(result: Single, other: Single, offset: tuple[int, int]) -> None:
-    """result[p] = max(result[p], other[p + offset]) where that exists."""
+    # result[p] = max(result[p], other[p + offset]) where that exists
     here, there = [], []
     for shift, size in zip(offset, result.shape, strict=True):
         here.append(slice(max(-shift, 0), size - max(shift, 0)))
@@ -180,7 +180,7 @@ def _raise_to(result: Single, other: Single, offset: tuple[int, int]) -> None:
 
 
 def _shifted(picture: Single, columns: float, rows: float) -> Single:
-    """picture at (row + rows, column + columns), linear between points; the border is repeated."""
+    # picture at (row + rows, column + columns), linear between points; the border is repeated
     for axis, shift in ((0, rows), (1, columns)):
         size = picture.shape[axis]
         position = np.clip(np.arange(size) + shift, 0, size - 1)
@@ -192,7 +192,7 @@ def _shifted(picture: Single, columns: float, rows: float) -> Single:
 
 
 def _blurred(picture: Single, sigma: float, axis: int) -> Single:
-    """Gaussian along one axis; the border is repeated."""
+    # Gaussian; the border is repeated
     if sigma < 0.1:
         return picture
     taps = math.ceil(3.0 * sigma)

@@ -452,7 +452,6 @@ class Instrument:
             self._note(time_s, event, {**facts, **truth})
 
     def _check_free(self, now_s: float) -> None:
-        """Raises InstrumentBusy; waits for the drawing of a scan that was stopped."""
         doing = self.doing(now_s)
         if doing:
             raise InstrumentBusy(f"the instrument is busy with a {doing}")
@@ -460,6 +459,5 @@ class Instrument:
 
 
 def _finite(what: str, *values: float) -> None:
-    """Raises InvalidValue unless all are."""
     if not all(map(math.isfinite, values)):
         raise InvalidValue(f"{what}: {', '.join(map(str, values))}", hint="must be finite")

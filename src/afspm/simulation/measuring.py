@@ -244,7 +244,7 @@ def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
 
 
 def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array, Array]:
-    """Where on the sample the tip is at each pixel, with the drift of its row."""
+    # the drift is constant within a row
     x, y = course.region.pixels_m(course.shape)
     times = course.row_times_s(part)
     away = setup.drift_m(times)[:, :2] + setup.offset_m(times)
@@ -255,7 +255,7 @@ def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array,
 
 
 def _pixel_times_s(course: Course) -> Array:
-    """When each pixel is taken, shape (2, ny, nx): trace and retrace."""
+    # shape (2, ny, nx): trace and retrace
     nx = course.shape[1]
     start = course.row_times_s(0.0)[:, None]
     along = (np.arange(nx) + 0.5) / nx * (course.line_s / 2)
@@ -263,7 +263,7 @@ def _pixel_times_s(course: Course) -> Array:
 
 
 def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> tuple[SampleGrid, tuple[float, float]]:
-    """A grid that is fine enough and not too large, and the blur (y, x) in its steps."""
+    # the blur (y, x) is in steps of the grid; accuracy asks for small steps, memory for few points
     turn = complex(setup.turn(course.start_s))
     pixel = (course.pixel_m[0] / abs(turn), course.pixel_m[1] / abs(turn))
     angle_rad = course.region.angle_rad - cmath.phase(turn)  # on the sample
@@ -288,21 +288,20 @@ def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> t
 
 
 def _rows_of_grid(grid: SampleGrid, y: Array, margin_m: float) -> tuple[SampleGrid, int, int]:
-    """The part of the grid that a tip touches while it is at those y."""
+    # only the rows in reach of the tip at these y
     start = max(0, math.floor((y.min() - margin_m - grid.y0_m) / grid.dy_m) - 7)
     stop = min(grid.shape[0], math.ceil((y.max() + margin_m - grid.y0_m) / grid.dy_m) + 8)
     return grid.rows(start, stop), start, stop
 
 
 def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipShape]:
-    """The tip at the start of each line, in the order of time."""
     starts = course.start_s + np.arange(course.shape[0]) * course.line_s
     index = np.searchsorted([since for since, _ in tips], starts, side="right") - 1
     return [tips[int(i)][1] for i in np.maximum(index, 0)]
 
 
 def _tilt(course: Course, slope: tuple[float, float]) -> Array | float:
-    """A plane through the origin of the tip's coordinates, at the pixels."""
+    # a plane through the origin of tip coordinates
     if slope == (0.0, 0.0):
         return 0.0
     x, y = course.region.pixels_m(course.shape)
@@ -310,7 +309,7 @@ def _tilt(course: Course, slope: tuple[float, float]) -> Array | float:
 
 
 def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) -> Array:
-    """z along the lines (in time, trace then retrace), led in by the end of the retrace before."""
+    # z along the lines in time, trace then retrace; each starts from the end of the previous retrace
     loop = setup.loop
     if not loop.on:
         return np.full(lines.shape, lines.max() if setup.held_z_m is None else setup.held_z_m)
@@ -328,7 +327,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
 def _signals(
     gap_m: Array, heights: Felt, tips: NDArray[np.object_], course: Course, setup: Setup, random: np.random.Generator
 ) -> Channels:
-    """Amplitude and phase (when tapping), frequency shift (of an oscillating sensor) and current, of the trace."""
+    # of the trace: amplitude and phase in tapping mode, frequency shift of an oscillating sensor, and current
     loop, noise, material = setup.loop, setup.noise, heights.material[0]
     ny, nx = course.shape
 

@@ -36,7 +36,6 @@ class SurfaceMark:
 
 
 def _draw(mark: SurfaceMark, relief: Relief, x_m: Array, y_m: Array) -> None:
-    """Changes the relief at positions (x, y) in place."""
     reach = 3.0 * mark.radius_m
     for index, dx, dy in around(x_m, y_m, *mark.sample_xy_m, reach):
         r = np.hypot(dx, dy) / mark.radius_m

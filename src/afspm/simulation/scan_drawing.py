@@ -90,7 +90,7 @@ class ScanDrawing:
 
 
 def _check_scannable(scan: ScanActivity) -> None:
-    """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
+    # no scanner has such a frame; simulating it would take minutes, or more memory than a computer has
     pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
     reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)
     if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):

@@ -137,7 +137,7 @@ def force_distance(settings: ForceSettings, tip: TipShape, material: float, rand
 
 
 def _sample_density(settings: IVSettings, energy: Array, material: float) -> Array:
-    """Between that of a semiconductor (0) and of a metal (1)."""
+    # `material` from 0 (semiconductor) to 1 (metal)
     gap = settings.gap_ev * (1.0 - 0.3 * material)
     outside = np.abs(energy - settings.band_offset_ev) - gap / 2
     bands = np.sqrt(np.log1p(np.exp(np.clip(outside / (2 * _KT_EV), -60, 60))) * 2 * _KT_EV)
@@ -147,7 +147,7 @@ def _sample_density(settings: IVSettings, energy: Array, material: float) -> Arr
 
 
 def _tip_density(tip: TipShape, energy: Array) -> Array:
-    """Flat for a clean metal; a state of its own where something sticks to it, a slope where it is deformed."""
+    # flat for a clean metal; debris adds a state of its own, a deformed tip a slope
     density = np.ones_like(energy)
     if tip.debris_m:
         density += 1.6 * np.exp(-(((energy - 0.62) / 0.09) ** 2))
@@ -170,7 +170,7 @@ def _mix(pair: tuple[float, float], material: float, *, logarithmic: bool = Fals
 
 
 def _force_n(distance: Array, radius: float, modulus: float, pull_off: float, hamaker: float) -> Array:
-    """Positive pushes the tip away. The attraction levels off at contact to what must be pulled."""
+    # positive repels; the attraction levels off at contact, at the pull-off force
     contact = math.sqrt(hamaker * radius / (6.0 * pull_off)) if pull_off else 0.3e-9
     attraction = -hamaker * radius / (6.0 * (np.maximum(distance, 0.0) + contact) ** 2)
     pressed = 4.0 / 3.0 * modulus * math.sqrt(radius) * np.maximum(-distance, 0.0) ** 1.5
@@ -178,7 +178,7 @@ def _force_n(distance: Array, radius: float, modulus: float, pull_off: float, ha
 
 
 def _followed(z: Array, distance: Array, force: Array, spring: float, *, approaching: bool) -> Array:
-    """Force at each z on the branch that the cantilever is on, coming from afar or from contact."""
+    # the branch depends on history: approaching from afar, or retracting from contact
     # In equilibrium z = distance - deflection; where that is not monotonic the branch ends.
     extension = distance - force / spring
     if approaching:

@@ -175,7 +175,7 @@ class TipMaker:
         return replace(worse, debris_m=s.debris_radii * radius * self._about(1.0, random))
 
     def _about(self, share: float, random: np.random.Generator) -> float:
-        """A factor near one, scattered by that share of the spread."""
+        # a random factor near 1; `share` is its part of the spread
         return math.exp(share * self._s.spread * float(random.normal()))
 
 
@@ -327,7 +327,6 @@ class SimulatedTip:
         return self._treat("crash", t_s, chances, random)
 
     def _treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
-        """Return what a treatment did: "cured", "worsened" or "unchanged"."""
         draw = random.random()
         if draw < chances.cures:
             self._change(t_s, cause, "sharp", random)

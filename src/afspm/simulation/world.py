@@ -386,7 +386,6 @@ class World:
     # -- inside
 
     def _begin(self, t_s: float, position_m: tuple[float, float]) -> int:
-        """Go to a time and a place; return the number of this call."""
         if not (math.isfinite(t_s) and t_s >= self.start_s - 1e-6):
             raise InvalidValue(f"the world starts at {self.start_s:g} s, nothing can be done at {t_s:g} s")
         self.sample.marks = [mark for mark in self.sample.marks if mark.t_s <= t_s]

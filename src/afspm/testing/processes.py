@@ -46,7 +46,7 @@ class Processes:
         self._starts |= {start.launch.name: start for start in starts}
         for start in starts:
             task = from_start(start)
-            self._running[task.name] = ChildProcess(task, self._tell)
+            self._running[task.name] = ChildProcess(task, self._handle_event)
 
     def kill(self, name: str) -> None:
         """Kill one, and wait until it has ended."""
@@ -89,8 +89,8 @@ class Processes:
             with contextlib.suppress(Empty):
                 self._exits.get(timeout=left_s)
 
-    def _tell(self, event: ChildEvent) -> None:
-        """Called in the threads of the processes."""
+    def _handle_event(self, event: ChildEvent) -> None:
+        # runs in the threads of the processes
         match event:
             case OutputLine():
                 level, text = self._readers[event.name].read(event.stream, event.line)

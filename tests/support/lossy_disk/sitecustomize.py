@@ -79,7 +79,7 @@ class Shadow:
         return ""
 
     def _named(self, number: int) -> str:
-        """Give the content of a file a name; where another thread or process is quicker, it is theirs."""
+        # another thread or process may be quicker: then its name counts
         name = str(uuid.uuid4())
         aside = self._files / f".{name}"
         aside.write_text(name)

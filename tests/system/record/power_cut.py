@@ -216,7 +216,6 @@ class Life:
 
 
 def _below(pid: int) -> Iterator[int]:
-    """All processes that this one has started, and those have."""
     with contextlib.suppress(OSError):
         for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split():
             yield int(child)
@@ -312,7 +311,7 @@ def _verdict(run: Path, witness: Witness, cuts_s: list[tuple[float, float]], *, 
 
 
 def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
-    """The packets that told of a problem first."""
+    # the first packets of each new problem
     before: set[int] = set()
     for key in sorted(key for key in witness.seen if key[1] == "ControlState"):
         problems = set(wire.decode("ControlState", witness.seen[key]).problems)
@@ -322,12 +321,7 @@ def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
 
 
 def _wrong(record: Any, witness: Witness, cuts_s: list[tuple[float, float]], most_lost: int) -> Iterator[str]:
-    """Yield what is wrong.
-
-    Args:
-        cuts_s: between which moments packets may be lost, for each cut.
-        most_lost: files of measurements that may be lost.
-    """
+    # cuts_s: intervals in which packets may be lost, one for each cut; most_lost: measured files that may be lost
     flags = set(_flags(witness))
 
     def may_be_lost(key: tuple[int, str]) -> bool:

@@ -347,7 +347,6 @@ def _kept(rig: Instrument) -> Any:
 
 
 def _killed(rig: Instrument) -> Instrument:
-    """Another instrument that goes on from what the first has on disk."""
     again = Instrument({}, 3, 1000.0)
     again.setup = rig.setup
     again.restore(_kept(rig))

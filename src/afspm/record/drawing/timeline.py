@@ -142,7 +142,6 @@ def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Str
 
 
 def _pictures(pictures: Iterable[tuple[int, str]], begin_ns: int, end_ns: int) -> str:
-    """Return a row of pictures, each ending at its time."""
     width = 100.0 / MOST_PICTURES
     last = {}
     for time_ns, html in pictures:

@@ -56,17 +56,17 @@ def export(
         folder.mkdir(parents=True, exist_ok=True)
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
-        yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
+        yield from _write_each(module.write, run, [*wanted, *spectra], folder, tell)
         for name, stack in grids(run, spectra) if hasattr(module, "grid_file") else ():
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
 
 
-def _one_by_one(
+def _write_each(
     write: Writer, run: Run, rows: Sequence[ScanRow | SpectrumRow], folder: Path, tell: Callable[[str], None] | None
 ) -> Iterator[Path]:
-    """A file that is damaged costs what is in it, and not all the others."""
+    # a damaged file costs its own measurement, not all others
     for row in rows:
         try:
             for end, content in write(run, row):

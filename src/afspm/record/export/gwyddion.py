@@ -93,7 +93,6 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
 
 
 def _bricks(stack: SpectrumStack) -> Iterator[tuple[str, str, NDArray[np.float64]]]:
-    """Yield title, unit and values, shape (y, x, z), of each variable and direction."""
     for name, curves in stack.curves.items():
         for number, direction in enumerate(stack.directions):
             yield f"{name}, {direction}", stack.units[name], mean_over_repeats(curves)[:, :, number]
@@ -184,7 +183,6 @@ def _typical(values: NDArray[np.float64]) -> float:
 
 
 def _meta(about: PlainMapping) -> dict[str, str]:
-    """Return what is known of a measurement as names and texts, as Gwyddion shows them."""
     said = {}
     for name, value in about.items():
         if name in ("channels", "variables", "content") or value is None:

@@ -51,7 +51,7 @@ def spectrum_file(spectrum: Spectrum, about: Mapping[str, object]) -> bytes:
 
 
 def _attributes(about: Mapping[str, object]) -> Attributes:
-    """Texts and numbers as they are; whole numbers as texts, since a float64 has no room for all of them."""
+    # whole numbers are written as texts: float64, the only number type here, can't hold all of them
     made: dict[str, str | float] = {}
     for name, value in about.items():
         if value is not None and name not in ("channels", "variables"):

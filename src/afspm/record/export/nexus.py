@@ -47,7 +47,7 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
 
 
 def _about_grid(stack: SpectrumStack, swept: str, fields: Mapping[str, str]) -> dict[str, object]:
-    """Return what `afspm.read` makes the spectra from; `ways`: the directions that a column is in."""
+    # `afspm.read` rebuilds the spectra from this; `ways` lists the directions present in a column
     columns = {
         column: {"name": column, "unit": stack.units[name], "field": fields[name], "ways": [direction]}
         for direction, one in zip(stack.directions, stack.columns, strict=False)

@@ -36,12 +36,11 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
     }
     for name, table in by_name.items():
         columns = table.columns()
-        rows = zip(*(_told(column, values) for column, values in columns.items()), strict=True)
+        rows = zip(*(_cells(column, values) for column, values in columns.items()), strict=True)
         yield f"{name}.csv", _csv([column.removesuffix("_ns") for column in columns], rows)
 
 
-def _told(column: str, values: list[Any]) -> list[object]:
-    """Times as ISO 8601 in UTC, what is not known as nothing."""
+def _cells(column: str, values: list[Any]) -> list[object]:
     if column.endswith("_ns"):
         return ["" if value is None else iso_utc(value) for value in values]
     return ["" if value is None else value for value in values]

@@ -123,7 +123,6 @@ def _group(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
 
 
 def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
-    """Return the curves of one variable, thin, and over them their mean, with a band of one standard deviation."""
     measured = group.measured
     if len(measured) < _LEAST_AVERAGED:
         return chart(x, y, [curve for one in measured for curve in _both_ways(one, name)])
@@ -140,14 +139,13 @@ def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
 
 
 def _both_ways(one: SpectrumCurves, name: str) -> Iterator[Curve]:
-    """Yield the curve of the way back, if there is one, and over it that of the way there."""
     if name in one.back:
         yield Curve(one.swept, one.back[name], BACKWARD)
     yield Curve(one.swept, one.curves[name])
 
 
 def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
-    """Return values that all were swept over; None if that is less than half of what any was."""
+    # None where the common range is less than half of the widest sweep
     try:
         common = common_sweep([one.swept for one in measured])
     except InvalidValue:
@@ -167,7 +165,6 @@ def _legend(group: SpectrumGroup) -> str:
 
 
 def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
-    """Return each spectrum small; those of a grid as they lie on the sample."""
     shown = group.measured[:MOST_SMALL]
     if len(shown) < 2:
         return ""
@@ -185,7 +182,6 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
 
 
 def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
-    """Return the place of each in a grid of the page, and its columns; none if they form no grid."""
     positions = [one.spectrum.position_m for one in shown]
     try:
         points = grid([position for position in positions if position is not None])

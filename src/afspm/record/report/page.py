@@ -34,7 +34,7 @@ def html(
     badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
     places = [position for group in spectra for position in group.positions]
     body = [
-        f"<header><h1>{escape(story.name)}{badge}</h1>{_what(story)}{_when(story, clock)}</header>",
+        f"<header><h1>{escape(story.name)}{badge}</h1>{_sample_line(story)}{_duration_line(story, clock)}</header>",
         section("", _cards(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
@@ -66,13 +66,12 @@ def _zones(clock: PageTimes) -> str:
     return f'<p class="note">Times in UTC, as the experiment had them.{local if clock.is_local else ""}</p>'
 
 
-def _what(story: RunStory) -> str:
-    """The sample, by whom it was measured, and for what, as far as that is known."""
+def _sample_line(story: RunStory) -> str:
     told = [text for name in ("sample", "person", "project") if (text := story.metadata.get(name))]
     return f"<p>{escape(' · '.join(told))}</p>" if told else ""
 
 
-def _when(story: RunStory, clock: PageTimes) -> str:
+def _duration_line(story: RunStory, clock: PageTimes) -> str:
     told = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
     if story.real_s is not None:
         told += f" ({duration_text(story.real_s)} real)"
@@ -85,7 +84,6 @@ def _when(story: RunStory, clock: PageTimes) -> str:
 
 
 def _figures(figures: Sequence[FigurePicture]) -> str:
-    """The figures that components have drawn."""
     names = ["", *(f"figure-{number}" for number in range(len(figures))), ""]
     made = [
         markup.figure(
@@ -125,7 +123,6 @@ def _registered(story: RunStory) -> list[tuple[str, int, str]]:
 
 
 def _drift(story: RunStory, clock: PageTimes) -> str:
-    """The scans whose position is not known well, with its uncertainty and the reason."""
     if not story.overview.drift:
         return ""
     rows = [

@@ -155,7 +155,7 @@ def of_figures(folder: Path) -> list[FigurePicture]:
 
 
 def _reduced(path: Path) -> FigurePicture | None:
-    """A figure with as many pixels as a page shows, and a tenth of the bytes; None if it is no picture."""
+    # at the resolution that a page shows, a figure takes a tenth of the bytes
     from PIL import Image
 
     try:

@@ -111,7 +111,6 @@ class _View:
 
 
 def _topmost(shown: Sequence[TopographyPicture]) -> list[TopographyPicture]:
-    """Return the newest picture of each place, in the order of time."""
     newest = {one.row.region: one for one in shown if one.image is not None and one.row.region is not None}
     return sorted(newest.values(), key=lambda one: one.row.number)[-_HIDDEN_BEHIND:]
 

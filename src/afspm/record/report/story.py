@@ -171,14 +171,12 @@ def read(run: Run) -> RunStory:
 
 
 def _without_routine(scan: ScanRow, overview: Overview) -> ScanRow:
-    """Leave out the problem of a scan that is taken in the normal course of a run; see `Overview.is_routine`."""
     began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
     routine = {s.label for s in overview.routine_spans if s.start_ns <= began_ns <= (s.end_ns or began_ns)}
     return replace(scan, problems=tuple(name for name in scan.problems if name not in routine))
 
 
 def _late_flags(journal: Iterable[JournalEntry]) -> list[JournalEntry]:
-    """Return the requests to flag a problem that came after the end."""
     after_the_end = itertools.dropwhile(lambda entry: entry.event is not ControlEvent.EXPERIMENT_ENDED, journal)
     return [entry for entry in after_the_end if entry.request == ControlRequest.ADD_EXP_PRBLM and entry.refused]
 

@@ -240,7 +240,7 @@ class Emulator(ABC):
         try:
             listening(self._open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
-                self._survive(self.serve, self._wait_s())
+                self._call_guarded(self.serve, self._wait_s())
                 self.woken.take()
         finally:
             self.close()
@@ -310,7 +310,7 @@ class Emulator(ABC):
     def run_process(self, context: ProcessContext) -> int:
         """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
         context.when_stopping(self.stop)
-        threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
+        threading.Thread(target=self._await_experiment_end, args=(context,), name="experiment", daemon=True).start()
 
         with ExitStack() as stack:
             launch, notice = context.launch, None
@@ -334,8 +334,8 @@ class Emulator(ABC):
             return ExitCode.CRASHED
         return ExitCode.ORPHAN if self._stop.is_set() else ExitCode.ENDED
 
-    def _until_the_end_of(self, context: ProcessContext) -> None:
-        """Hears of the end of the experiment; in a thread of its own, since `serve` waits for the vendor's clients."""
+    def _await_experiment_end(self, context: ProcessContext) -> None:
+        # in a thread of its own: `serve` waits for the maker's clients, not for the experiment
         port = open_port(context.launch, context.clock)
         while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):
             pass
@@ -343,12 +343,7 @@ class Emulator(ABC):
         self._wake()
         port.close()
 
-    def _survive(self, do: Callable[[float], float | None], argument: float) -> float | None:
-        """Call it; an error that nobody foresaw ends what goes on, not the emulator: nothing that a client sends may.
-
-        Raises:
-            Crashed: as it was told to.
-        """
+    def _call_guarded(self, do: Callable[[float], float | None], argument: float) -> float | None:
         try:
             return do(argument)
         except Crashed:
@@ -359,14 +354,13 @@ class Emulator(ABC):
             return self.clock.now_s() + _AGAIN_S
 
     def _wait_s(self) -> float:
-        """Real seconds until something happens by itself."""
         self._look_for_button()
         hang = self.faults.strikes("hang", self.clock.now_s())
         if hang is not None:
             self.log.warning("an emulated fault: %s", hang)
             self._stop.wait(hang.duration_s)
         now_s = self.clock.now_s()
-        times = (self._survive(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
+        times = (self._call_guarded(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
         due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
         leave_in_s = self._leave_at_s - self.clock.monotonic_s()
         longest_s = LONGEST_WAIT_S if self._button is None else _LOOKS_S
@@ -381,7 +375,7 @@ class Emulator(ABC):
             def press(now_s: float) -> None:
                 button.pressed()
 
-            self._survive(press, self.clock.now_s())
+            self._call_guarded(press, self.clock.now_s())
 
 
 def emulator_names() -> list[str]:

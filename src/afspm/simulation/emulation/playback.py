@@ -89,7 +89,7 @@ class Playback:
         cursor = self._cursors[connection]
         found = self._match(cursor, content)
         if found is None:
-            if self._may_go_on(cursor, content):
+            if self._may_continue(cursor, content):
                 return None
             raise Deviation(self._difference(cursor, content))
         index, (line, exchange) = found
@@ -112,19 +112,18 @@ class Playback:
         return [file for _, file in due]
 
     def _last_before(self, line: int, file: TracedFile) -> int:
-        """Return the line of the last exchange before a file was written."""
         said = [entry for exchanges in self._recorded for entry in exchanges]
         return max((number for number, one in said if number < line and one.at_s + one.took_s <= file.at_s), default=0)
 
     def _has_passed(self, connection: int, after: int, line: int) -> bool:
-        """Return True if what was said on other connections between two lines has been said again."""
+        # the order between connections is part of the recording
         others = [cursor for number, cursor in enumerate(self._cursors) if number != connection]
         meanwhile = [one for cursor in others for one, _ in cursor.exchanges if after < one < line]
         return not meanwhile or self._reached >= max(meanwhile)
 
     def _match(self, cursor: _Cursor, content: bytes) -> tuple[int, tuple[int, TracedExchange]] | None:
-        """Return the recorded exchange that answers: the next, past others that only look; else one of the same look
-        before."""
+        # the next recorded exchange, skipping reads; otherwise an earlier answer to the same read: a client may read
+        # more or less often than it did in the recording
         exchanges, wanted = cursor.exchanges, _compared(content)
         for index in range(cursor.next, len(exchanges)):
             exchange = exchanges[index][1]
@@ -140,8 +139,7 @@ class Playback:
                     return min(index, cursor.next - 1), exchanges[index]
         return None
 
-    def _may_go_on(self, cursor: _Cursor, content: bytes) -> bool:
-        """Return True if more bytes may make this a question that was recorded."""
+    def _may_continue(self, cursor: _Cursor, content: bytes) -> bool:
         rest = cursor.exchanges[cursor.next :]
         questions = {one.asked for _, one in cursor.exchanges if one.asked is not None and not one.command}
         questions |= {one.asked for _, one in rest if one.asked is not None}
@@ -158,12 +156,12 @@ class Playback:
 
 
 def _line_before(cursor: _Cursor, index: int) -> int:
-    """Return the line of the exchange before one. The client is past it, though it may have looked less often."""
+    # the client is past it, though it may have read less often
     return cursor.exchanges[index - 1][0] if index else 0
 
 
 def _compared(asked: bytes | None) -> bytes:
-    """Return a question without the ids by which its client counts."""
+    # without the ids by which a client numbers its requests
     found = _json(asked or b"")
     if found is None or not any(key in found for key in _IDS):
         return asked or b""
@@ -171,7 +169,6 @@ def _compared(asked: bytes | None) -> bytes:
 
 
 def _with_ids_of(asked: bytes, answer: bytes) -> bytes:
-    """Return an answer with the ids of the question that it is now given to."""
     question, found = _json(asked), _json(answer)
     if question is None or found is None:
         return answer

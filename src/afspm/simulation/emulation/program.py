@@ -177,7 +177,7 @@ class MakerProgram(ABC):
             raise InstrumentBusy(f"the instrument is busy with a {doing or 'approach'}")
 
     def _begin_scan(self, now_s: float) -> None:
-        """Begin the scan; with values that no scan can be taken with, it ends as if stopped at the panel."""
+        # with values that can't be scanned, the scan ends as if stopped at the panel
         try:
             self.prepare_scan()
             self._scan = self.rig.start_scan(now_s)

@@ -137,7 +137,6 @@ class TraceReplay(Emulator):
         client.received[:] = frames[-1]
 
     def _answer(self, client: ReplayClient) -> bool:
-        """Answer what a client has asked, or end its connection; False: there is nothing to answer yet."""
         is_stranger = client.introduction is not None and not client.introduction.is_over
         if not client.received or is_stranger:
             return False
@@ -161,15 +160,14 @@ class TraceReplay(Emulator):
         return True
 
     def _drop(self, client: ReplayClient) -> None:
-        """End a connection. Of ZeroMQ there is none to end: the client gets no answer."""
+        # ZeroMQ has no connection to end: its client gets no answer
         client.received.clear()
         if client.tcp is not None:
             self._selector.unregister(client.tcp)
             client.tcp.close()
             client.tcp = None
 
-    def _tell(self) -> None:
-        """Say how it went, for people and in `replay.json`."""
+    def _write_result(self) -> None:
         left = len(self.playback.missing)
         if not self.deviation:
             state = f"{left} exchanges of requests were not asked again" if left else "all was asked again"
@@ -186,7 +184,7 @@ class TraceReplay(Emulator):
     def close(self) -> None:
         if not hasattr(self, "playback"):
             return
-        self._tell()
+        self._write_result()
         if self.playback.transport == ZEROMQ:
             self._context.destroy(linger=0)
             return

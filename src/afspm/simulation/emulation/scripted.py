@@ -155,7 +155,7 @@ class ScriptedEmulator(Emulator):
         if not self._has_dialog():
             waiting, self._waiting = self._waiting, []
             for one in waiting:
-                self._go_on(one, now_s)
+                self._send_if_due(one, now_s)
         if self._queue and not self._has_dialog():
             return now_s
         times = [again_s, self._open_again_at_s, *(one.at_s for one in self._waiting)]
@@ -203,10 +203,9 @@ class ScriptedEmulator(Emulator):
             reply = self._answered(request, lambda: self.answer(client, request))
         if not isinstance(reply, Unfinished) and self.faults.strikes("nan", now_s):
             reply = self.not_a_number(request)
-        self._go_on(Waiting(client, self._guarded(request, reply)), now_s)
+        self._send_if_due(Waiting(client, self._guarded(request, reply)), now_s)
 
     def _answered(self, request: bytes, answer: Callable[[], Any]) -> Any:
-        """Answer; an error is a reply, too."""
         try:
             return answer()
         except Crashed:
@@ -222,8 +221,7 @@ class ScriptedEmulator(Emulator):
         resume = reply.resume
         return Unfinished(lambda: self._guarded(request, self._answered(request, resume)))
 
-    def _go_on(self, one: Waiting, now_s: float) -> None:
-        """Send a reply that is there and due; keep what is not."""
+    def _send_if_due(self, one: Waiting, now_s: float) -> None:
         if isinstance(one.reply, Unfinished):
             one.reply = one.reply.resume()
         if isinstance(one.reply, Unfinished) or one.at_s > now_s:
@@ -236,7 +234,6 @@ class ScriptedEmulator(Emulator):
         self._send(one.client, one.reply, now_s)
 
     def _send(self, client: Client, reply: bytes, now_s: float) -> None:
-        """Send a reply, or what goes wrong with it."""
         if self._wire is None or self.faults.strikes("no-reply", now_s):
             return
         if self.faults.strikes("half-reply", now_s):

@@ -80,15 +80,13 @@ _AT_FIRST: Table = {
 }
 
 
-def _told(
+def _controller_action(
     name: str,
     do: Callable[[SimulatedController, float], None],
     *,
     state: ScopeState | None = None,
     refuses: bool = True,
 ) -> Callable[[Simulator], None]:
-    """Return the action that has the controller do something now, unless a simulated fault refuses."""
-
     @action(name, state=state)
     def act(self: Simulator) -> None:
         do(self._reached(refuses=refuses), self.clock.now_s())
@@ -191,7 +189,7 @@ class Simulator(Driver):
         errors.raise_all()
 
     def _check_values(self, loop: FeedbackSettings, initial: PlainMapping, errors: ErrorCollector) -> None:
-        """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
+        # `initial` and the panel set parameters without a request, so nothing else would check these values
         in_force = {
             FEEDBACK_ON: loop.on,
             names.ZCTRL_PGAIN: loop.proportional_gain,
@@ -247,7 +245,6 @@ class Simulator(Driver):
         )
 
     def _reached(self, *, refuses: bool) -> SimulatedController:
-        """Return the controller, unless a fault is in the way."""
         now_s, faults, controller = self.clock.now_s(), self.faults, self._controller
         if controller is None or faults is None or faults.lasts("restart", now_s):
             raise ControllerLost("the simulated controller can't be reached")
@@ -286,14 +283,16 @@ class Simulator(Driver):
     def lines(self, start: int) -> Sequence[ScanLines]:
         return self._reached(refuses=False).lines(start, self.clock.now_s())
 
-    start_scan = _told(names.START_SCAN, SimulatedController.start_scan)
-    stop_scan = _told(names.STOP_SCAN, SimulatedController.stop)
-    start_spec = _told(names.START_SPEC, SimulatedController.start_spectrum)
-    stop_spec = _told(names.STOP_SPEC, SimulatedController.stop)
-    pulse = _told(names.PULSE, SimulatedController.pulse, state=ScopeState.BUSY_PARAM)
-    crash = _told(names.CRASH, SimulatedController.crash, state=ScopeState.MOVING)
-    engage = _told(names.ENGAGE, SimulatedController.engage, state=ScopeState.COARSE_MOTOR)
-    retract = _told(names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False)
+    start_scan = _controller_action(names.START_SCAN, SimulatedController.start_scan)
+    stop_scan = _controller_action(names.STOP_SCAN, SimulatedController.stop)
+    start_spec = _controller_action(names.START_SPEC, SimulatedController.start_spectrum)
+    stop_spec = _controller_action(names.STOP_SPEC, SimulatedController.stop)
+    pulse = _controller_action(names.PULSE, SimulatedController.pulse, state=ScopeState.BUSY_PARAM)
+    crash = _controller_action(names.CRASH, SimulatedController.crash, state=ScopeState.MOVING)
+    engage = _controller_action(names.ENGAGE, SimulatedController.engage, state=ScopeState.COARSE_MOTOR)
+    retract = _controller_action(
+        names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False
+    )
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:
@@ -321,7 +320,6 @@ _SETPOINTS: Final[Rows] = {
 
 
 def _rows_for(mode: str) -> Rows:
-    """Return the rows that depend on the operating mode: what its setpoint is."""
     return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
 
 
@@ -335,7 +333,7 @@ def _merged(*tables: Mapping[str, Mapping[str, object]]) -> Rows:
 
 
 def _loop_of(settings: Mapping[str, object]) -> FeedbackSettings | None:
-    """The feedback at the start, whatever is wrong with the rest of the world; None: it is itself."""
+    # None if the feedback itself is invalid; errors elsewhere in the world don't matter here
     of_it = {name: settings[name] for name in ("surface", "feedback") if settings.get(name) is not None}
     try:
         return read_settings(of_it)[1].feedback

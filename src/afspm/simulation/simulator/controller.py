@@ -250,7 +250,6 @@ class SimulatedController:
         self._keep()
 
     def _prepare(self, now_s: float) -> None:
-        """Raises Refused if the tip can't be used now."""
         self._advance(now_s)
         doing = self._instrument.doing(now_s)
         if doing:
@@ -306,7 +305,6 @@ class SimulatedController:
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """Turn what the instrument refuses into the refusal of a request."""
     try:
         yield
     except InstrumentBusy as busy:

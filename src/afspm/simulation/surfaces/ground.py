@@ -138,7 +138,7 @@ def _rest(
     height_m: Array, material: Array, ground: Array, x_m: Array, y_m: Array,
     sphere: tuple[float, float, float], resolution_m: float,
 ) -> None:  # fmt: skip
-    """Puts a sphere (x, y, radius) on the ground; one that is too small to be resolved is spread, its volume kept."""
+    # a sphere is (x, y, radius); one below the resolution is spread at constant volume
     x0, y0, radius = sphere
     seen = max(radius, 0.75 * resolution_m)
     for index, dx, dy in around(x_m, y_m, x0, y0, seen):
@@ -151,7 +151,7 @@ def _rest(
 
 
 def _strew(relief: Relief, x_m: Array, y_m: Array, sites: Sites, radii_m: Array, resolution_m: float) -> None:
-    """All particles smaller than a step of the grid at once: each adds its volume to the point next to it."""
+    # for particles smaller than a step of the grid: each adds its volume to the nearest point
     column, row = np.searchsorted(x_m[0], sites.x_m), np.searchsorted(y_m[:, 0], sites.y_m)
     inside = (radii_m > 0) & (column < x_m.size) & (row < y_m.size) & (column > 0) & (row > 0)
     radii_m = radii_m[inside]

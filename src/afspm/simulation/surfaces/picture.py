@@ -122,7 +122,7 @@ class Picture:
 
 @lru_cache(maxsize=4)
 def _load(picture: Picture) -> tuple[tuple[Array, ...], tuple[float, float]]:
-    """The picture and its halvings, and its size (x, y) in m."""
+    # the picture with its successive halvings, and its size (x, y) in m
     found = read(Path(picture.path))
     heights, size_m = found.height_m, found.size_m
     pixels_y, pixels_x = heights.shape
@@ -149,7 +149,7 @@ def _mirrored(index: Array, count: int) -> Array:
 
 
 def _taps(position: Array, count: int) -> list[tuple[Array, Array]]:
-    """Indices and weights of the four neighbours (Catmull and Rom's cubic, which meets the pixels)."""
+    # indices and weights of the four neighbours (cubic of Catmull and Rom, which passes through the pixels)
     whole = np.floor(position)
     t = position - whole
     weights = (

@@ -90,7 +90,7 @@ class CuttingProxy:
                     threading.Thread(target=self._pass_on, args=pair, daemon=True).start()
 
     def _pass_on(self, source: socket.socket, sink: socket.socket, chunks: float) -> None:
-        """Pass on until so many chunks with frames have come; the last of them is lost."""
+        # the chunk with number `chunks` is lost together with the connection
         counter = FrameCounter()
         with contextlib.suppress(OSError):
             for chunk in iter(lambda: source.recv(_CHUNK), b""):

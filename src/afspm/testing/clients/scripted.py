@@ -72,7 +72,7 @@ class ScriptedScheduler:
         self.markers: list[Marker] = []
         self.cached: list[list[bytes]] = []
         self.reply: Reply = success
-        self.greeting: Reply = self._what_time_it_is
+        self.greeting: Reply = self._answer_clock_request
         self.open()
 
     def open(self) -> None:
@@ -152,7 +152,7 @@ class ScriptedScheduler:
         for frames in reply(request):
             self.send(request.peer, frames)
 
-    def _what_time_it_is(self, request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
+    def _answer_clock_request(self, request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
         now_s = self._clock.now_s()
         told = {"now_ns": round(now_s * 1e9), "origin_s": now_s, "start_s": now_s, "speed": 1.0, "simulated": True}
         return [request.answered(payload=json.dumps(told).encode())]

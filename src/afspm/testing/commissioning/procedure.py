@@ -136,7 +136,6 @@ class _Walk:
 
 
 def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:
-    """Return the options with a trace of all that is said to the controller."""
     overlay = trace_overlay(prepare(options).resolved, Path(stack.enter_context(tempfile.TemporaryDirectory())))
     return options if overlay is None else replace(options, files=[*options.files, overlay])
 

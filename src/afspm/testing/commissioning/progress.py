@@ -112,7 +112,7 @@ class CommissioningProgress:
         return not gate or any(user.name not in self.results for user in users)
 
     def _before(self, step: CommissioningStep) -> list[str]:
-        """Return all steps that come before a step, also those before these: a gate is asked again when resumed."""
+        # all ancestors: a gate is asked again after a resume
         known = {one.name: one for one in self.steps}
         found = dict.fromkeys(step.after)
         for name in step.after:

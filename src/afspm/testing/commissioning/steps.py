@@ -89,7 +89,6 @@ def _panel(guide: Guide) -> str:
 
 
 def _compare_frame(guide: Guide, frame: FrameSetting) -> int:
-    """Compare a frame with the panel. Return how many of its values are shown there."""
     region, (rows, columns) = frame.region, frame.shape
     slack_nm = 0.01 * max(region.size_m) * 1e9
     x_nm, y_nm = (value * 1e9 for value in region.center_m)
@@ -210,13 +209,12 @@ def _scan(guide: Guide) -> str:
 
 
 def _lasted(guide: Guide, lasted_s: float) -> str:
-    """Return a duration in words; with the real one, where the experiment's time goes faster."""
+    # the real duration is added where experiment time runs faster
     real_s = guide.kit.client.clock.real_s(lasted_s)
     return f"{lasted_s:.3g} s" if real_s == lasted_s else f"{lasted_s:.3g} s ({real_s:.2g} s of real time)"
 
 
 def _watched(guide: Guide) -> tuple[Taken, float | None]:
-    """Take the scan; and the experiment time at which the person saw it end."""
     kit, client = guide.kit, guide.kit.client
     frame = kit.frames.plain
     expected_s = kit.prepare(frame, SCAN_S)

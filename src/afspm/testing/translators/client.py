@@ -103,7 +103,7 @@ def _is_always_published(message: wire.MessageDeclaration) -> bool:
     return message.source is Role.TRANSLATOR and message.always
 
 
-def told(heard: Iterable[Observation]) -> str:
+def describe_all(heard: Iterable[Observation]) -> str:
     """Return the observations as text."""
     return ", ".join(map(str, heard)) or "nothing"
 
@@ -186,7 +186,7 @@ class CheckClient:
             self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a connection to the controller")
         except Failed as failure:
             raise Lost(str(failure)) from failure
-        response = self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)
+        response = self._request_over(self._link, ControlRequest.REQUEST_CTRL, 0)
         if not response.ok:
             raise Lost(f"control was refused: {answer_in_words(response)}")
         self.quiet()
@@ -199,7 +199,7 @@ class CheckClient:
             Lost: it is not granted within so many real seconds.
         """
         until_s = self.clock.monotonic_s() + within_s
-        while not (response := self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)).ok:
+        while not (response := self._request_over(self._link, ControlRequest.REQUEST_CTRL, 0)).ok:
             if self.clock.monotonic_s() >= until_s:
                 raise Lost(f"control was refused: {answer_in_words(response)}")
             self.quiet()
@@ -228,16 +228,16 @@ class CheckClient:
             Failed: there is none.
             Lost: a process has ended, or control was taken away.
         """
-        response = self._asked_by(self._link, kind, subject)
+        response = self._request_over(self._link, kind, subject)
         if response.code == ControlResponse.NOT_IN_CONTROL:
             raise Lost(f"control was lost: {response.reason}")
         return response
 
     def ask_directly(self, kind: ControlRequest, subject: object) -> Response:
         """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
-        return self._asked_by(self._direct, kind, subject)
+        return self._request_over(self._direct, kind, subject)
 
-    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
+    def _request_over(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
         self._heed()
         try:
             with self._alive():
@@ -284,7 +284,7 @@ class CheckClient:
 
     def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
         came = self._awaited(done, within_s)
-        expect(came, f"{expected} within {within_s:.3g} s", told(self.observations.since(mark)))
+        expect(came, f"{expected} within {within_s:.3g} s", describe_all(self.observations.since(mark)))
 
     def _awaited(self, done: Callable[[], bool], within_s: float) -> bool:
         def done_or_interrupted() -> bool:
@@ -326,7 +326,7 @@ class CheckClient:
                 self.wait(lambda: self.state is ScopeState.FREE, self.real_s(MOVED_S), "SS_FREE")
             except Failed as failure:
                 raise Lost(
-                    f"the microscope does not become free: {failure} ({told(self.observations.since(mark))})"
+                    f"the microscope does not become free: {failure} ({describe_all(self.observations.since(mark))})"
                 ) from failure
         if self._stirred:
             self.quiet()

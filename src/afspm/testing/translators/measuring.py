@@ -24,7 +24,7 @@ from afspm.model import (
     names,
 )
 from afspm.testing.conformance import Check, Failed, Skipped, expect
-from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, scans, spectra, told
+from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, describe_all, scans, spectra
 from afspm.testing.translators.support import Support
 
 NEAR = 1e-3
@@ -79,7 +79,7 @@ class FrameSettings:
     def _part(
         self, offset: tuple[float, float], size: tuple[float, float], shape: tuple[int, int], turn_rad: float = 0.0
     ) -> FrameSetting:
-        """`offset` of the middle and `size` in units of the whole, in its own directions."""
+        # `offset` of the centre and `size` are fractions of the whole frame, along its own axes
         width, height = self.whole.size_m
         side = min(width, height)
         cos, sin = math.cos(self.whole.angle_rad), math.sin(self.whole.angle_rad)
@@ -152,7 +152,7 @@ class Taken:
             Failed: never.
         """
         times = [one.time_ns for one in self.heard if one.state is state and one.time_ns is not None]
-        expect(times, f"SS_{state.name} with a time", told(self.heard))
+        expect(times, f"SS_{state.name} with a time", describe_all(self.heard))
         return times[0] / 1e9
 
 
@@ -228,7 +228,7 @@ class CheckMeasurements:
         expected_s = self.prepare(frame, max(SCAN_S, LINE_S * frame.shape[0]))
         heard = self._measure(names.START_SCAN, ScopeState.SCANNING, expected_s)
         if not scans(heard):
-            raise Failed("a Scan2d between SS_SCANNING and SS_FREE", told(heard))
+            raise Failed("a Scan2d between SS_SCANNING and SS_FREE", describe_all(heard))
         return Taken(frame, heard, expected_s)
 
     def begin_long_scan(self, frame: FrameSetting) -> int:
@@ -268,7 +268,7 @@ class CheckMeasurements:
             self.move_probe(self.frames.other.region.center_m)
         heard = self._measure(names.START_SPEC, ScopeState.SPEC, None)
         if not spectra(heard):
-            raise Failed("a Spec1d between SS_SPEC and SS_FREE", told(heard))
+            raise Failed("a Spec1d between SS_SPEC and SS_FREE", describe_all(heard))
         return Taken(None, heard, None)
 
     def move_probe(self, xy_m: tuple[float, float]) -> list[Observation]:
@@ -280,10 +280,7 @@ class CheckMeasurements:
         return self.client.settled(mark)
 
     def _set_whole(self) -> None:
-        """Set the first frame, unless it is in force: a scan that failed leaves its own.
-
-        Some controllers move the probe within the scan frame only.
-        """
+        # a failed scan may have left another frame; some controllers move the probe within the scan frame only
         newest, whole = self.client.observations.newest(ScanParameters), self.frames.whole
         if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
             return

@@ -59,7 +59,7 @@ class SettingsBefore:
         return wrong
 
     def _put_back_together(self, client: CheckClient, wrong: list[str]) -> None:
-        """Set together what is published together, or it would pass through states that can't be."""
+        # settings of one packet are restored in one request: one by one, they would pass through invalid combinations
         observations = client.observations
         settings = (
             (ControlRequest.SET_SCAN_PARAMS, observations.newest(ScanParameters), self.frame, self._frame()),
@@ -80,7 +80,6 @@ class SettingsBefore:
                 client.settled(mark)
 
     def _frame(self) -> ScanParameters | None:
-        """Return the request for the first frame, without the angle where there is none."""
         before = self.frame
         if before is not None and isinstance(before.region, Region) and isinstance(before.shape, tuple):
             return FrameSetting(before.region, before.shape).request(self.support)
@@ -99,7 +98,7 @@ class SettingsBefore:
 
 
 def _changed(before: Feedback | None, now: Feedback | None) -> Feedback:
-    """Return the fields to put back: some may only be read."""
+    # only changed fields: some are read-only
     fields = {} if before is None else vars(before)
     return Feedback(**{name: value for name, value in fields.items() if now is None or value != getattr(now, name)})
 

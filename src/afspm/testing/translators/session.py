@@ -155,7 +155,7 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
 
 @contextmanager
 def _interrupting(client: CheckClient) -> Iterator[None]:
-    """Ctrl-C interrupts the client, where signals come to this thread at all."""
+    # only the main thread receives signals
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -169,11 +169,10 @@ def _interrupting(client: CheckClient) -> Iterator[None]:
 def _client(
     experiment: Experiment, options: CheckOptions, stack: ExitStack, complaints: list[str]
 ) -> tuple[CheckClient, Path, bool]:
-    """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
-    common = _common(experiment, options)
+    common = _run_identity(experiment, options)
     clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
-    own, starts = _starts(experiment, options, common, folder)
+    own, starts = _planned_starts(experiment, options, common, folder)
     require_free(addresses_of(starts))
     log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
     stack.callback(log.close)
@@ -205,10 +204,9 @@ def _client(
 _NOTHING = logging.CRITICAL + 1
 
 
-def _starts(
+def _planned_starts(
     experiment: Experiment, options: CheckOptions, common: RunIdentity, folder: Path
 ) -> tuple[Launch, list[ProcessStart]]:
-    """The tester's own launch line, and what is to be started."""
     starts = experiment.launches(
         take_address=FreePorts().address,
         without=_left_out(experiment, options),
@@ -224,7 +222,6 @@ def _starts(
 
 
 def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
-    """Return the parts not to start: all but translator, scheduler and emulated controller, and what runs already."""
     resolved = experiment.resolved
     wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
     wanted |= {*resolved.emulators, NAME}
@@ -232,7 +229,6 @@ def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
 
 
 def _translator_address(experiment: Experiment, starts: Sequence[ProcessStart]) -> str | None:
-    """Where the scheduler asks the translator; None: nobody says."""
     for start in starts:
         if start.role is Role.SCHEDULER:
             return start.launch.sockets.control
@@ -264,8 +260,8 @@ def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
     return experiment.simulated(without=_left_out(experiment, options))
 
 
-def _common(experiment: Experiment, options: CheckOptions) -> RunIdentity:
-    """The scheduler's, where that runs already; else our own."""
+def _run_identity(experiment: Experiment, options: CheckOptions) -> RunIdentity:
+    # a scheduler that runs already determines clock and run
     simulated = is_simulated(experiment, options)
     schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}
     launch = experiment.asking([NAME]) if schedulers <= set(options.without) else None
@@ -281,7 +277,6 @@ def _now() -> datetime:
 
 
 def _logger(log: RunLog) -> logging.Logger:
-    """Return a logger that writes what the connection says into the run's log."""
     logger = logging.Logger("afspm.translator_test")
 
     class Writing(logging.Handler):

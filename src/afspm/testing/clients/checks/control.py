@@ -19,7 +19,6 @@ _LONG = (256, 64)
 
 
 def _require_state(experiment: JudgedExperiment, program: ClientProgram, **right: object) -> None:
-    """Raise Failed unless the client soon holds this to be true."""
     told: Answer = Answer()
 
     def is_known() -> bool:
@@ -90,7 +89,6 @@ def problem(bench: ClientBench) -> None:
 
 
 def _interrupted(bench: ClientBench, disturb: Callable[[JudgedExperiment, ClientProgram], None]) -> Answer:
-    """Have the client take a scan that is disturbed in the middle; return the answer."""
     experiment = bench.experiment
     asked = scan_step(_LONG)
     with bench.client(experiment) as client:

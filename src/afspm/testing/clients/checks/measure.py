@@ -48,7 +48,7 @@ def require_scans(experiment: JudgedExperiment, answer: Answer, asked: Plain) ->
 
 
 def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, object]) -> None:
-    """Raise Failed unless exactly this was published. A client need not tell which packet its own measurement was."""
+    # a client need not report which packet was its own measurement, so the fields are compared
     told = {"message": message, **told}
     wrong: list[Failed] = []
 

@@ -25,7 +25,6 @@ def _notes(*numbers: int) -> list[list[bytes]]:
 
 
 def _times(run: ScriptedRun, count: int) -> list[int]:
-    """Return the number, of `_notes`, of each note that the client has."""
     answers = [run.client.succeed("wait", prefix="Note", timeout_s=_PACKET_S) for _ in range(count)]
     return [(int(answer.get("timestamp_ns") or 0) - _FIRST_NS) // 1_000_000 for answer in answers]
 
@@ -75,7 +74,6 @@ def late_joiner(bench: ClientBench) -> None:
 
 
 def _in_an_experiment(bench: ClientBench, experiment: JudgedExperiment) -> None:
-    """A real scheduler replays its notes, and a plain subscriber hears none of it again."""
     for number in range(3):
         experiment.scope.note(f"late joining {number}")
     network = Network.from_launch("judge", dict(experiment.launch.keys or {}) or None)

@@ -71,7 +71,6 @@ def other_answers(bench: ClientBench) -> None:
 
 
 def _note(experiment: JudgedExperiment, text: str) -> str:
-    """Return the object of the request that publishes a note, which shows that it was executed."""
     now_ns = experiment.clock.now_ns()
     note = Note(now_ns, "client", text, None, now_ns)
     return in_base64(encode_subject(RelayedMessage(*encode(note))))
@@ -95,8 +94,6 @@ def published(experiment: JudgedExperiment) -> Counter[str]:
 
 
 def _executed(experiment: JudgedExperiment) -> int:
-    """Return how many reads of a parameter the scheduler has executed for the client, by its log of requests."""
-
     def logged(who: str) -> int:
         logs = [decode("JournalEntries", packet.payload) for packet in experiment.packets("JournalEntries")]
         return sum((entry.who, entry.request) == (who, ControlRequest.PARAM) for log in logs for entry in log.entries)

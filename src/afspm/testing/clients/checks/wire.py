@@ -45,12 +45,12 @@ def decode(bench: ClientBench) -> None:
         for entry in golden()["messages"]:
             payload = bytes.fromhex(entry["hex"])
             answer = run.client.succeed("decode", message=entry["type"], bytes=in_base64(payload))
-            _says(entry, answer)
+            _require_fields(entry, answer)
             again = bytes_in(answer, "bytes")
             expect(again == payload, f"{entry['name']} encoded again as {payload.hex()}", again.hex())
 
 
-def _says(entry: Plain, answer: Answer) -> None:
+def _require_fields(entry: Plain, answer: Answer) -> None:
     kind = message_type(entry["type"])
     right = kind.FromString(bytes.fromhex(entry["hex"]))
     try:

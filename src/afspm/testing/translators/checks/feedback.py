@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from afspm.model import ControlRequest, ControlResponse, Feedback, names
 from afspm.testing.conformance import Failed, Skipped, expect, near
-from afspm.testing.translators.client import answer_in_words, told
+from afspm.testing.translators.client import answer_in_words, describe_all
 from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.translator_suite import check
 
@@ -26,7 +26,7 @@ def in_force(kit: CheckMeasurements) -> Feedback:
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
         raise Skipped("the microscope reports no feedback")
     if feedback is None:
-        raise Failed("ZCtrlParameters at the start", told(kit.client.observations.all[:10]))
+        raise Failed("ZCtrlParameters at the start", describe_all(kit.client.observations.all[:10]))
     return feedback
 
 
@@ -43,7 +43,7 @@ def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
     expect(response.ok, f"REP_SUCCESS to setting {', '.join(given)} of the feedback", answer_in_words(response))
     after = in_force(kit)
     count = sum(isinstance(one.thing, Feedback) for one in heard)
-    expect(count == 1, "the new ZCtrlParameters once", told(heard))
+    expect(count == 1, "the new ZCtrlParameters once", describe_all(heard))
     require_same(replace(before, **given), after)
 
 

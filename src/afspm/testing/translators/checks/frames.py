@@ -16,7 +16,7 @@ from afspm.model import (
     names,
 )
 from afspm.testing.conformance import Failed, Skipped, expect, near
-from afspm.testing.translators.client import Observation, states, told
+from afspm.testing.translators.client import Observation, describe_all, states
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, difference, number
 from afspm.testing.translators.translator_suite import check
 
@@ -33,15 +33,15 @@ def published_in_force(kit: CheckMeasurements) -> None:
     for kind, needs in wanted:
         at = max((i for i, one in enumerate(heard) if isinstance(one.thing, kind)), default=None)
         if kit.support.has(*needs):
-            expect(at is not None, f"a {kind.__name__} at the start", told(heard))
+            expect(at is not None, f"a {kind.__name__} at the start", describe_all(heard))
         if at is not None:
-            expect(at < state_at, f"ScopeStateMsg after {kind.__name__}", told(heard))
+            expect(at < state_at, f"ScopeStateMsg after {kind.__name__}", describe_all(heard))
 
 
 @check("published/free", "the microscope is free before anything is asked of it")
 def free(kit: CheckMeasurements) -> None:
     states = [one.state for one in kit.client.at_start if one.state is not None]
-    expect(states[-1] is ScopeState.FREE, "SS_FREE", told(kit.client.at_start))
+    expect(states[-1] is ScopeState.FREE, "SS_FREE", describe_all(kit.client.at_start))
 
 
 @check("published/frame", "the ScanParameters2d agree with the parameters", needs=(names.SCAN_SIZE_X,))
@@ -50,7 +50,7 @@ def frame(kit: CheckMeasurements) -> None:
         (one.thing for one in reversed(kit.client.at_start) if isinstance(one.thing, ScanParameters)), None
     )
     if parameters is None or not isinstance(parameters.region, Region):
-        raise Failed("ScanParameters2d with a region", told(kit.client.at_start))
+        raise Failed("ScanParameters2d with a region", describe_all(kit.client.at_start))
     (left, low), (width, height) = parameters.region.top_left_m, parameters.region.size_m
     told_m = {
         names.SCAN_TOP_LEFT_X: left,
@@ -96,10 +96,10 @@ def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
 def require_told_once(heard: list[Observation], kind: type, named: str) -> None:
     """SS_MOVING, the new setting once, SS_FREE."""
     right = f"SS_MOVING, {named} once, SS_FREE"
-    expect(states(heard) == ["SS_MOVING", "SS_FREE"], right, told(heard))
+    expect(states(heard) == ["SS_MOVING", "SS_FREE"], right, describe_all(heard))
     at = [i for i, one in enumerate(heard) if isinstance(one.thing, kind)]
     free_at = max(i for i, one in enumerate(heard) if one.state is ScopeState.FREE)
-    expect(len(at) == 1 and at[0] < free_at, right, told(heard))
+    expect(len(at) == 1 and at[0] < free_at, right, describe_all(heard))
 
 
 @check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)

@@ -47,8 +47,7 @@ _STEPS = {
 _PLACES = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
-def _of(name: str) -> None:
-    """Marks the checks of one parameter."""
+def _declare_checks(name: str) -> None:
     what = name.replace("-", " ")
 
     @check(f"parameter/{name}", f"{what}: set, and reported as it was set, also in another unit", needs=(name,))
@@ -61,7 +60,7 @@ def _of(name: str) -> None:
 
 
 for _name in names.BASE_PARAMETERS:
-    _of(_name)
+    _declare_checks(_name)
 
 
 def _require_set(kit: CheckMeasurements, name: str) -> None:
@@ -84,11 +83,6 @@ def _require_set(kit: CheckMeasurements, name: str) -> None:
 
 
 def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep, unit: str) -> tuple[float, Response]:
-    """A value near the one in force, and the success of setting it.
-
-    Raises:
-        Skipped: the microscope lets none be set.
-    """
     if step.from_(now, 1) == now:
         raise Skipped(f"{name} is {now:g} and can't be changed by a fraction")
     response = Response(ControlResponse.FAILURE)
@@ -105,7 +99,6 @@ def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep
 
 
 def _require_other_unit(kit: CheckMeasurements, name: str, value: float, unit: str) -> None:
-    """Back to the first value, given in another unit."""
     other = _SMALLER[unit]
     text = f"{convert(value, unit, other):.12g}"
     response = kit.client.set(name, text, other)
@@ -122,7 +115,7 @@ def _require_told(name: str, told: Parameter, wanted: float, unit: str, where: s
 
 
 def _written(value: float, name: str) -> str:
-    """As a person would write it; pixels are whole numbers."""
+    # as a person would write it; pixels are whole numbers
     return str(round(value)) if name in (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y) else f"{value:.6g}"
 
 

@@ -108,7 +108,7 @@ def _correlation(larger: ScanPicture, detail: Array, x_m: Array, y_m: Array) -> 
 
 
 def _at(picture: ScanPicture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The picture at these places, bilinear, and where they lie inside of it."""
+    # bilinear
     region, (rows, columns) = picture.region, picture.values.shape
     cos, sin = np.cos(region.angle_rad), np.sin(region.angle_rad)
     right, up = x_m - region.center_m[0], y_m - region.center_m[1]
@@ -126,7 +126,7 @@ def _at(picture: ScanPicture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np
 
 
 def _level(inside: NDArray[np.bool_], *pictures: Array) -> Array:
-    """Return what of them is inside, each without its plane: no sample lies quite flat."""
+    # without its plane: no sample is level
     rows, columns = np.nonzero(inside)
     plane = np.stack([rows, columns, np.ones(len(rows))], axis=1).astype(float)
     found = np.stack([values[inside] for values in pictures], axis=1)

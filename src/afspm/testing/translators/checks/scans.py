@@ -6,21 +6,21 @@ import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.testing.conformance import Failed, Skipped, expect
-from afspm.testing.translators.client import Observation, scans, states, told
+from afspm.testing.translators.client import Observation, describe_all, scans, states
 from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
 from afspm.testing.translators.translator_suite import check
 
 
 def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
     """Stop what runs; what is published from its beginning on, once its states have been found right."""
-    asked_to_stop(kit, mark, stop, begun)
+    stop_by_request(kit, mark, stop, begun)
     return require_broken_off(kit, mark, stop, begun)
 
 
-def asked_to_stop(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
+def stop_by_request(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
     """Stop what runs; when that was answered, experiment time in s."""
     client = kit.client
-    expect(client.state is begun, f"SS_{begun.name} until it is stopped", told(client.observations.since(mark)))
+    expect(client.state is begun, f"SS_{begun.name} until it is stopped", describe_all(client.observations.since(mark)))
     kit.act(stop)
     return client.clock.now_s()
 
@@ -34,7 +34,7 @@ def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: Scop
     expect(
         states(heard) == [f"SS_{begun.name}", "SS_INTERRUPTED", "SS_FREE"],
         f"SS_{begun.name}, SS_INTERRUPTED, SS_FREE after {stop}",
-        told(heard),
+        describe_all(heard),
     )
     return heard
 
@@ -46,7 +46,7 @@ def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: Scop
 )
 def cancel(kit: CheckMeasurements) -> None:
     heard = broken_off(kit, kit.begin_long_scan(kit.frames.other), names.STOP_SCAN, ScopeState.SCANNING)
-    expect(not scans(heard), "no Scan2d of a scan that was stopped", told(heard))
+    expect(not scans(heard), "no Scan2d of a scan that was stopped", describe_all(heard))
 
 
 @check("scan/stop-nothing", "stop-scan while nothing runs succeeds, and changes nothing", needs=(names.STOP_SCAN,))
@@ -55,7 +55,7 @@ def stop_nothing(kit: CheckMeasurements) -> None:
     mark = kit.client.observations.mark()
     kit.act(names.STOP_SCAN)
     heard = kit.client.settled(mark)
-    expect(not states(heard), "no state after stopping nothing", told(heard))
+    expect(not states(heard), "no state after stopping nothing", describe_all(heard))
 
 
 _NEEDS = (names.START_SCAN,)
@@ -75,12 +75,12 @@ def require_order(heard: list, begun: ScopeState, kind: type) -> None:  # type: 
     results = [i for i, one in enumerate(heard) if isinstance(one.thing, kind)]
     named = "Scan2d" if kind is Scan else "Spec1d"
     right = f"SS_{begun.name}, {named} …, SS_FREE"
-    expect(states(heard) == [f"SS_{begun.name}", "SS_FREE"], right, told(heard))
+    expect(states(heard) == [f"SS_{begun.name}", "SS_FREE"], right, describe_all(heard))
     first = next(i for i, one in enumerate(heard) if one.state is begun)
     last = next(i for i, one in enumerate(heard) if one.state is ScopeState.FREE)
-    expect(all(first < i < last for i in results), right, told(heard))
+    expect(all(first < i < last for i in results), right, describe_all(heard))
     again = [i for i, one in enumerate(heard) if isinstance(one.thing, ScopeStatus)]
-    expect(len(again) == 2, f"each state once: {right}", told(heard))
+    expect(len(again) == 2, f"each state once: {right}", describe_all(heard))
 
 
 @check("scan/channels", "every channel has a name of its own, and values everywhere", needs=_NEEDS)

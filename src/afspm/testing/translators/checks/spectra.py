@@ -8,8 +8,8 @@ import numpy as np
 
 from afspm.model import ProbePosition, ScopeState, Spectrum, names
 from afspm.testing.conformance import Failed, Skipped, expect
-from afspm.testing.translators.checks.scans import CLOCK_S, asked_to_stop, require_broken_off, require_order
-from afspm.testing.translators.client import spectra, states, told
+from afspm.testing.translators.checks.scans import CLOCK_S, require_broken_off, require_order, stop_by_request
+from afspm.testing.translators.client import describe_all, spectra, states
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words
 from afspm.testing.translators.translator_suite import check
 
@@ -24,17 +24,17 @@ _NEEDS = (names.START_SPEC,)
 def cancel(kit: CheckMeasurements) -> None:
     mark, answered_s = kit.begin_spectrum(), math.inf
     try:
-        answered_s = asked_to_stop(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
+        answered_s = stop_by_request(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
         heard = require_broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
     except Failed:
         if _was_over(kit, mark, answered_s):
             raise Skipped("a spectrum ends before it can be stopped") from None
         raise
-    expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
+    expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", describe_all(heard))
 
 
 def _was_over(kit: CheckMeasurements, mark: int, answered_s: float) -> bool:
-    """True if a spectrum came to its end by itself, all in order, before anybody had stopped it."""
+    # a spectrum that ended by itself before the stop was answered could not be stopped
     client = kit.client
     heard = client.settled(mark)
     ended_s = client.observations.at_s(ScopeState.FREE, mark)
@@ -50,7 +50,7 @@ def stop_nothing(kit: CheckMeasurements) -> None:
     mark = kit.client.observations.mark()
     kit.act(names.STOP_SPEC)
     heard = kit.client.settled(mark)
-    expect(not states(heard), "no state after stopping nothing", told(heard))
+    expect(not states(heard), "no state after stopping nothing", describe_all(heard))
 
 
 @check("spectrum/order", "start-spec: SS_SPEC, the Spec1d, and only then SS_FREE", needs=_NEEDS)
