@@ -1,4 +1,4 @@
-"""All runs under a folder, with what one looks for them by: an index beside them that can be made anew at any time."""
+"""The catalogue of all runs under a folder, with an SQLite index beside them that can be rebuilt at any time."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class RunSummary:
     Attributes:
         folder: relative to the folder of all runs, with "/".
         name: of the experiment.
-        began_ns, ended_ns: when it began and ended, in experiment time (or was published last); None: nothing was.
-        state: how it ended, in words.
-        metadata: sample, person, project, technique … as far as they are known.
-        scans: the whole ones; spectra: their number.
-        problems: the names of those that were flagged.
+        began_ns, ended_ns: start and end (or last publication) in experiment time; None if nothing was published.
+        state: running, ended or cut off, in words.
+        metadata: sample, person, project, technique … where known.
+        scans: the number of complete scans; spectra: their number.
+        problems: the names of all flagged problems.
         notes: the texts of all notes.
-        damage: why its record can't be read; empty: it can.
+        damage: why the record can't be read; empty if it can.
     """
 
     folder: str
@@ -61,12 +61,11 @@ class RunSummary:
 
     @property
     def measured(self) -> str:
-        """Return the numbers of scans and spectra, in words."""
         scans, spectra = counted(self.scans, "scan"), counted(self.spectra, "spectrum", "spectra")
         return f"{scans}, {spectra}" if self.spectra else scans
 
     def texts(self) -> dict[str, str]:
-        """Return the fields that are looked through, by name."""
+        """Return the searched fields, by name."""
         lists = {"problem": self.problems, "note": self.notes}
         texts = {"folder": self.folder, "name": self.name, "state": self.state, "microscope": self.microscope}
         texts |= {name: self.metadata.get(name, "") for name in ("sample", "person", "project", "technique")}
@@ -74,7 +73,6 @@ class RunSummary:
 
     @property
     def microscope(self) -> str:
-        """Vendor and model, as far as they are known."""
         return " ".join(filter(None, (self.metadata.get("vendor"), self.metadata.get("microscope"))))
 
 
@@ -85,16 +83,16 @@ FIELDS: Final = tuple(RunSummary("", "").texts())
 def find_runs(
     root: Path, words: Sequence[str] = (), since: date | None = None, until: date | None = None
 ) -> list[RunSummary]:
-    """Return the runs under a folder that have all words in them, the newest first.
+    """Return the runs under a folder that contain all words, the newest first.
 
     Args:
-        root: searched with all folders in it; the index `runs.sqlite` is kept there, where that can be written.
-        words: each in any field, or as "sample:gold" in that field; upper and lower case are the same.
-        since, until: the first and last day (UTC) of which something was published.
+        root: searched with all its subfolders; keeps the index `runs.sqlite` where it can be written.
+        words: each in any field, or as "sample:gold" in that field; case is ignored.
+        since, until: the first and last day (UTC) with publications.
 
     Raises:
         FileError: there is no such folder.
-        InvalidValue: a word names a field that there is not.
+        InvalidValue: a word names an unknown field.
     """
     wanted = [_read_word(word) for word in words]
     if not root.is_dir():
@@ -171,7 +169,7 @@ def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
             raise ValueError("not made by afspm")
         index.execute("CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT NOT NULL, about TEXT)")
         index.execute(f"PRAGMA user_version = {_FORMAT}")
-    except BaseException:
+    except BaseException:  # only to close: every error is raised again
         index.close()
         raise
     return index

@@ -36,7 +36,7 @@ _CSS: Final = """
 
 
 def write_page(root: Path, runs: Sequence[RunSummary]) -> Path:
-    """Write `index.html` into the folder of all runs, and return it. Reports stay where they are."""
+    """Write `index.html` into the folder of all runs, and return its path; reports are linked, not copied."""
     cards = "".join(_card(root, run) for run in runs)
     body = f"<header><h1>{escape(root.resolve().name)}</h1><p>{counted(len(runs), 'run')}</p></header>"
     body += section("", f'<div class="runs">{cards}</div>')

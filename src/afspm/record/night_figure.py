@@ -1,4 +1,4 @@
-"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close look at each repair."""
+"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close-up of each repair."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.2  # two columns of a journal
+WIDTH_IN = 7.2  # the width of two columns in a journal
 LANE_IN = 0.2
 THUMB_PX = 64
 GAP_PX = 6
@@ -38,7 +38,7 @@ PAPER = (255, 255, 255)
 
 
 def prepare() -> None:
-    """Load what takes long to load: modules, fonts, colours."""
+    """Load slow modules, fonts and colours in advance."""
     figure = _figure(1.0)
     figure.add_axes((0.0, 0.0, 1.0, 1.0)).text(0.5, 0.5, "a", weight="bold")
     figure.savefig(io.BytesIO(), dpi=50)
@@ -51,7 +51,7 @@ def draw(
 
     Args:
         problems: number -> name.
-        simulated: written on it, so that nobody takes it for a measurement.
+        simulated: printed on the picture, so that it can't pass as a measurement.
     """
     shots = _chosen(record)
     repairs = _episodes(record)[:MOST_LOOKS]
@@ -118,7 +118,7 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
     bad_ns = record.bad_ns()
-    palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last: not measured
+    palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last colour marks unmeasured pixels
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
         picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
@@ -171,17 +171,17 @@ def _bands(
 
 
 def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], **style: Any) -> None:
-    least = (limits[1] - limits[0]) / 600  # what is too short to be seen is drawn so wide that it is
+    least = (limits[1] - limits[0]) / 600  # shorter spans would be invisible
     bars = []
     for span in spans:
         start, end = _clipped(span, limits)
-        if end >= start:  # else it lies outside
+        if end >= start:  # otherwise it is outside the limits
             bars.append((start, max(end - start, least)))
     ax.broken_barh(bars, (lane - 0.36, 0.72), linewidth=0, **style)
 
 
 def flagged_by(record: NightRecord, span: Span) -> str:
-    """Return the component that judged a scan bad when a problem was flagged; empty if none did."""
+    """Return the component whose verdict on a scan caused a flag; empty if there is none."""
     near = [m for m in record.marks if m.score == BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
     return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
 

@@ -21,7 +21,7 @@ _LARGEST_PX = 256
 
 
 def scan_html(scan: Scan) -> str:
-    """Return the scan as an image with y upwards, scale bar and colour bar, and a line that says what it is."""
+    """Return the scan as an image with y upwards, scale bar, colour bar and a caption."""
     region, (rows, columns) = scan.region, scan.shape
     angle = f", turned by {np.degrees(region.angle_rad):.4g}°" if region.angle_rad else ""
     caption = (
@@ -37,7 +37,7 @@ def scan_html(scan: Scan) -> str:
 
 
 def scans_html(scans: Iterable[Scan]) -> str:
-    """Return channels in a row, which wraps where there is no room."""
+    """Return channels side by side; the row wraps."""
     return f'<div style="display:flex;flex-wrap:wrap;gap:12px">{"".join(map(scan_html, scans))}</div>'
 
 
@@ -50,7 +50,7 @@ def _time_text(time_ns: int | None) -> str:
 
 
 def spectrum_html(spectrum: Spectrum) -> str:
-    """Return every variable against the first one, each way of it, as small charts in a row."""
+    """Return small charts of every variable over the first, side by side."""
     swept = spectrum.values[:, 0]
     x = Axis.over(spectrum.names[0], spectrum.units[0], swept)
     drawn = "".join(

@@ -162,7 +162,6 @@ class Overview:
 
     @property
     def targets(self) -> Sequence[FoundPlace]:
-        """The newest list of places of each channel, joined."""
         return self._measured.places
 
     @property
@@ -171,7 +170,7 @@ class Overview:
 
     @property
     def registration(self) -> str:
-        """Return how many scans were registered, as text; empty without drift correction."""
+        """The number of registered scans, as text; empty without drift correction."""
         return registration_summary(point.outcome for point in self.drift) if self.drift else ""
 
     def is_routine(self, span: Span | None) -> bool:

@@ -1,4 +1,4 @@
-"""run.json: what a run says of itself, to whoever joins it, resumes it or looks at it afterwards."""
+"""run.json: the facts about a run for processes that join it, resume it or read it afterwards."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ LATEST_FILE: Final = "latest.txt"
 
 
 def read_run_json(folder: Path) -> Plain:
-    """Return what run.json in the folder of a run says.
+    """Return the content of run.json in the folder of a run.
 
     Raises:
-        FileError: it is not there, can't be read, or is something else.
+        FileError: it is missing, unreadable, or another kind of file.
     """
     file = folder / RUN_FILE
     try:
@@ -47,7 +47,7 @@ def read_run_json(folder: Path) -> Plain:
 
 
 def run_json_or_empty(folder: Path) -> Plain:
-    """Return the same; empty where nothing can be read."""
+    """Return the content of run.json; empty if it can't be read."""
     try:
         return read_run_json(folder)
     except FileError:
@@ -55,7 +55,7 @@ def run_json_or_empty(folder: Path) -> Plain:
 
 
 def latest_run(runs: Path) -> Path | None:
-    """Return the newest run in the folder of all runs; None: there is none."""
+    """Return the newest run in the folder of all runs; None if there is none."""
     link, file = runs / LATEST_LINK, runs / LATEST_FILE
     if link.is_dir():
         return runs / link.resolve().name
@@ -63,5 +63,5 @@ def latest_run(runs: Path) -> Path | None:
 
 
 def experiment_name(folder: Path, otherwise: str = "") -> str:
-    """Return the name of the experiment that left a folder; `otherwise` if it is not known."""
+    """Return the name of the experiment of a run folder; `otherwise` if it is unknown."""
     return str(run_json_or_empty(folder).get("name") or otherwise)

@@ -46,9 +46,9 @@ class SignalSettings:
 
 
 def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material: Array, slope: Array) -> Array:
-    """Phase of the cantilever behind its drive: sin(phase) = A / A0 * (1 + dissipation) (Cleveland et al. 1998).
+    """Return the phase lag of the cantilever: sin(phase) = A / A0 * (1 + dissipation) (Cleveland et al. 1998).
 
-    Free it lags by 90 degrees; on a slope the flank of the tip touches more of the sample and dissipates more.
+    The free cantilever lags by 90 degrees; on a slope the tip's flank touches more of the sample and dissipates more.
     """
     share = amplitude_v / loop.settings.free_amplitude_v
     lost = settings.dissipation + settings.dissipation_contrast * (material - 0.5)
@@ -57,7 +57,7 @@ def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material
 
 
 def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Array, bias_v: float) -> Array:
-    """Exponential in the gap; tunnelling at the setpoint's current, tapping at the conductance of the contact."""
+    """Return the current, exponential in the gap; tunnelling at the setpoint, tapping at the contact's conductance."""
     contrast = settings.conductance_contrast * (material - 0.5)
     if loop.settings.mode == "current":
         # The feedback holds the current, so a better conductor shows in the height; what is left is the error.
@@ -71,11 +71,11 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
 
 
 def attraction_hz(loop: Loop, tip: TipShape, sharp_m: float, gap_m: Array, bias_v: float) -> Array:
-    """Return the frequency shift of an oscillating sensor whose tip tunnels; a blunt or double tip is attracted more.
+    """Return the frequency shift of an oscillating, tunnelling tip; a blunt or double tip is attracted more.
 
     Args:
-        sharp_m: radius of the sharp tip, for which the sensor has its `radius_m`.
-        gap_m: z less the height at which the setpoint is met.
+        sharp_m: radius of the sharp tip, which corresponds to the sensor's `radius_m`.
+        gap_m: z minus the height at which the setpoint is reached.
     """
     sensor, distance_m = loop.settings.sensor, loop.tunnelling_distance_m(bias_v) + gap_m
     of_radius = sensor.radius_m / sharp_m
@@ -98,18 +98,18 @@ _MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches furt
 
 @dataclass(frozen=True)
 class Setup:
-    """The conditions that stay the same during a scan.
+    """The constant conditions of a scan.
 
     Attributes:
-        sample: relief of the sample as it is now, from (x, y, resolution_m).
+        sample: returns the relief of the sample at present, from (x, y, resolution_m).
         drift_m: (x, y, z) at times.
         turn: rotation and scale of the sample at times, as complex factors.
-        unturned: (x, y) with those undone, from (x, y, times).
-        held_z_m: where z stands if the feedback is off.
+        unturned: (x, y) without rotation and scale, from (x, y, times).
+        held_z_m: z while the feedback is off.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         sharp_m: radius of the sharp tip.
-        origin_m: (x, y) about which tilt and slope turn.
-        offset_m: (x, y) by which the scanner is not yet where it should be (creep), at times.
+        origin_m: the fixed point (x, y) of tilt and slope.
+        offset_m: (x, y) remaining distance of the scanner to its target (creep), at times.
     """
 
     sample: Callable[[Array, Array, float], Relief]
@@ -129,7 +129,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Felt:
-    """The surface as the tip feels it along the lines, by row index, x ascending.
+    """The surface under the tip along the lines, by row index, x ascending.
 
     Attributes:
         height_m: (trace, retrace), each [y, x].
@@ -142,14 +142,14 @@ class Felt:
 
 @dataclass(frozen=True)
 class Measured:
-    """The channels, and what the scan did: z at its end, and the mean depth the tip was pressed in by errors."""
+    """The channels of a scan, z at its end, and the mean indentation by errors of the feedback."""
 
     channels: Channels
     last_z_m: float
     pressed_m: float
 
     def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return it with these rows of another one, which ends it."""
+        """Return the measurement with these rows of a later one, which continues it."""
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()
@@ -160,7 +160,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A change during a scan: when, and what is set from then on."""
+    """A change during a scan: its time, and the settings from then on."""
 
     t_s: float
     feedback: Feedback | None
@@ -168,7 +168,7 @@ class Adjustment:
 
 
 def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Generator) -> Measured:
-    """Scans."""
+    """Compute the channels of a scan."""
     heights = feel(course, tips, setup)
     tilt = _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
     order = course.order
@@ -198,7 +198,7 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
 
 
 def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: np.random.Generator) -> dict[str, float]:
-    """Measure at the single pixel of a course, where the tip stands and the feedback has settled.
+    """Measure at the single pixel of a course: the tip stands still and the feedback has settled.
 
     Debris on a contaminated tip never settles: the tunnelling current flickers.
     """
@@ -217,7 +217,7 @@ def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: n
 
 
 def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
-    """The surface as the tips of the scan feel it at every pixel, without feedback and noise."""
+    """Return the surface under the tip at every pixel, without feedback and noise."""
     trace, retrace = (_sample_positions(course, setup, part) for part in (0.25, 0.75))
     x = np.stack([trace[0], retrace[0]])
     y = np.stack([trace[1], retrace[1]])

@@ -25,8 +25,8 @@ class IVSettings:
 
     Attributes:
         range_v: from -range to +range.
-        set_bias_v, set_current_a: the current that flows at this bias before the feedback is opened (tunnelling:
-            the setpoint at the bias in force).
+        set_bias_v, set_current_a: the current at this bias before the feedback is opened (tunnelling: the setpoint at
+            the bias in force).
         gap_ev: band gap of material 0; material 1 is a metal.
         band_offset_ev: of the gap's middle against the Fermi level (doping).
         noise_a: white; `relative_noise` adds a share of the current.
@@ -81,7 +81,7 @@ class ForceSettings:
 def current_voltage(
     settings: IVSettings, tip: TipShape, material: float, bias_v: float, loop: Loop, random: np.random.Generator
 ) -> Curves:
-    """I(V), forth and back, and dI/dV as a lock-in shows it.
+    """Return I(V), forward and backward, and dI/dV as a lock-in amplifier shows it.
 
     The current is the integral of the sample's density of states times the tip's times the barrier's transmission,
     scaled to the current that the feedback had held.
@@ -109,10 +109,10 @@ def current_voltage(
 
 
 def force_distance(settings: ForceSettings, tip: TipShape, material: float, random: np.random.Generator) -> Curves:
-    """Deflection and force against the piezo's extension, approach and retract, zero where the tip first touches.
+    """Return deflection and force against the piezo's extension, approach and retract, zero at the first contact.
 
     Contact after Derjaguin, Muller and Toporov, van der Waals attraction before it. Quasi-static: the cantilever
-    follows the branch it is on until that ends, then jumps (snap-in, pull-off), so both ways differ.
+    follows its branch until that ends, then jumps (snap-in, pull-off), so both directions differ.
     """
     modulus = _mix(settings.modulus_pa, material, logarithmic=True)
     adhesion = _mix(settings.adhesion_j_per_m2, material) * (1.4 if tip.debris_m else 1.0)

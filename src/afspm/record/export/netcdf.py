@@ -1,4 +1,4 @@
-"""NetCDF (.nc, classic format): xarray, MATLAB, ncdump … read it. A file for each scan and each spectrum."""
+"""NetCDF (.nc, classic format), for xarray, MATLAB, ncdump …: a file for each scan and each spectrum."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _RENAMED = {"mode": "control_mode", "filename": "controller_file"}
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield the file of a scan or spectrum, with the end of its name."""
+    """Yield (suffix, content) of the file of a scan or spectrum."""
     about = run.about(row)
     if isinstance(row, ScanRow):
         yield ".nc", scan_file(run.scan(row), about)
@@ -27,7 +27,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
-    """All channels over (y, x), which are those of the frame before it was turned."""
+    """Return all channels over (y, x), the axes of the unrotated frame."""
     (left, low), (width, height), (rows, columns) = scans.region.top_left_m, scans.region.size_m, scans.first.shape
     variables = {
         "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
@@ -40,7 +40,7 @@ def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
 
 
 def spectrum_file(spectrum: Spectrum, about: Mapping[str, object]) -> bytes:
-    """Every variable over (point)."""
+    """Return every variable over (point)."""
     variables = {
         name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit})
         for number, (name, long_name, unit) in enumerate(

@@ -1,4 +1,4 @@
-"""The morning report: `report.html`, one file that needs no other, and figures beside it, of a recorded run."""
+"""The morning report of a recorded run: `report.html`, one self-contained file, and figures beside it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ REPORT_FILE = "report.html"
 
 
 def write(folder: str | Path) -> Path:
-    """Write `report.html` and the figures that are not there yet; returns the file.
+    """Write `report.html` and missing figures; return the path of the report.
 
     Needs the extra `record`; the figures need `plot`.
 
     Args:
-        folder: of a run, which may still go on; or of all runs: its newest is meant.
+        folder: of a run, which may still go on; or of all runs: then the newest run.
 
     Raises:
         FileError: there is no record, or the report can't be written.

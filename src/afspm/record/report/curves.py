@@ -1,4 +1,4 @@
-"""The spectra of a report: for each kind all curves with their mean and spread, and small ones that enlarge."""
+"""The spectra of a report: for each kind all curves with mean and spread, and small charts that enlarge."""
 
 from __future__ import annotations
 
@@ -32,24 +32,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SpectrumCurves:
-    """A spectrum, and its row."""
+    """A spectrum with its row."""
 
     row: SpectrumRow
     spectrum: Spectrum
 
     @property
     def curves(self) -> dict[str, Array]:
-        """The variables on the way there, by name."""
+        """The variables of the forward sweep, by name."""
         return ways(self.spectrum)[1][0]
 
     @property
     def back(self) -> dict[str, Array]:
-        """Those that were measured on the way back, too."""
+        """The variables measured on the backward sweep too."""
         directions = ways(self.spectrum)[1]
         return directions[1] if len(directions) > 1 else {}
 
     def values(self, name: str) -> Array:
-        """Return all values of a variable, of both ways."""
         return np.concatenate([way[name] for way in (self.curves, self.back) if name in way])
 
     @property
@@ -59,7 +58,7 @@ class SpectrumCurves:
 
 @dataclass(frozen=True)
 class SpectrumGroup:
-    """Spectra of one kind and of the same variables; `count`: with those that were not read."""
+    """Spectra of one kind with the same variables; `count` includes unread ones."""
 
     measured: Sequence[SpectrumCurves]
     count: int
@@ -74,7 +73,7 @@ class SpectrumGroup:
 
     @property
     def axes(self) -> tuple[Axis, dict[str, Axis]]:
-        """The axis of what was swept, and that of each variable, with room for all curves."""
+        """Return the axis of the sweep and an axis for each variable, in range of all curves."""
         first = self.first
         units = dict(zip(first.names, first.units, strict=True))
         swept = np.concatenate([one.swept for one in self.measured])
@@ -86,7 +85,7 @@ class SpectrumGroup:
 
 
 def read(run: Run) -> list[SpectrumGroup]:
-    """Read the spectra of a run, of too many some evenly among them."""
+    """Read the spectra of a run; beyond the limit, an even selection."""
     rows: dict[tuple[object, ...], list[SpectrumRow]] = {}
     for row in run.spectra:
         if len(row.names) > 1:
@@ -100,7 +99,7 @@ def read(run: Run) -> list[SpectrumGroup]:
 
 
 def html(groups: Sequence[SpectrumGroup], clock: PageTimes) -> str:
-    """Return all spectra; nothing if there are none."""
+    """Return all spectra; empty if there are none."""
     return "".join(_group(group, number, clock) for number, group in enumerate(groups, 1))
 
 

@@ -1,4 +1,4 @@
-"""The report as one HTML page: no script, nothing from elsewhere, light and dark, and fit to be printed."""
+"""The report as one HTML page: without scripts and external files, light and dark, and printable."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ def html(
     spectra: Sequence[SpectrumGroup],
     figures: Sequence[FigurePicture],
 ) -> str:
-    """The whole page."""
     clock = PageTimes(story.start_ns, story.end_ns)
     title = f"{escape(story.name)}, {day(story.start_ns, UTC)}"
     badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
@@ -77,7 +76,7 @@ def _duration_line(story: RunStory, clock: PageTimes) -> str:
         told += f" ({duration_text(story.real_s)} real)"
     end = story.end
     ended = story.ended
-    if end is not None and component_of(end.who) != SUPERVISOR:  # else nothing was left to run, as `ended` says
+    if end is not None and component_of(end.who) != SUPERVISOR:  # otherwise `ended` states why: nothing was left to run
         reason = f": {end.reason}" if end.reason else ""
         ended = f"{end.who} ended the experiment at {clock.whole(end.time_ns)}{reason}"
     return f"<p>{escape(told)}; {escape(ended)}</p>"

@@ -49,7 +49,7 @@ FAREWELL_S = 0.5
 
 
 class Crashed(AfspmError):
-    """The emulated controller is to vanish without another word, as one that crashes does."""
+    """Raised to end the emulated controller without any further answer, like a crash."""
 
     code = "emulator-crashed"
 
@@ -80,19 +80,18 @@ class Emulator(ABC):
 
     Args:
         port: to listen on; 0: any free one.
-        seed: everything that is left to chance follows from it.
+        seed: of all random numbers.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
         world: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
 
     Attributes:
-        clock, log: of the experiment; given before `open`, as is all of the following.
+        clock, log: of the experiment; set before `open`, like all following attributes.
         folder: where the controller saves its files.
         rig: the instrument.
-        faults: to ask at each point where something can go wrong.
-        woken: register its `fileno` with whatever `serve` waits by; it becomes readable when `serve` is to return.
-        listening: to be told of a new address, and of none ("") before the old one is let go of, if it does not listen
-            at one address all along.
+        faults: queried at each point where something can go wrong.
+        woken: becomes readable when `serve` must return; include its `fileno` in the wait of `serve`.
+        listening: call it with each new address, and with "" before the old one is closed, if the address changes.
     """
 
     vendor: ClassVar[str]
@@ -137,7 +136,7 @@ class Emulator(ABC):
         """Check the settings.
 
         Raises:
-            ConfigError: of the world or the faults, or a package is missing. FileError: a sample that can't be read.
+            ConfigError: invalid world or faults, or a missing package. FileError: a sample that can't be read.
         """
         from afspm.simulation import World
         from afspm.simulation.settings import one_of
@@ -154,54 +153,54 @@ class Emulator(ABC):
 
     @classmethod
     def all_faults(cls) -> dict[str, str]:
-        """Return every fault that there is, with its effect: those of the class, and those of all emulators."""
+        """Return every fault with its effect: those of the class, and those common to all emulators."""
         return {**cls.fault_kinds, "hang": "the whole program hangs for the duration (real time)"}
 
     # -- what one writes
 
     @abstractmethod
     def open(self) -> str:
-        """Begin to listen. Returns where: what a client is given as the address."""
+        """Start to listen; return the address for clients."""
 
     @abstractmethod
     def serve(self, timeout_s: float) -> None:
-        """Wait up to so many real seconds for clients or `woken`, and answer what has come.
+        """Wait up to `timeout_s` real seconds for clients or `woken`, and answer received requests.
 
-        Answer each request on its own, with an error of the vendor's where anything is raised: what gets as far as the
-        base is logged, and that client goes without an answer.
+        Answer each request on its own, and catch its errors with the vendor's own error: an exception that reaches the
+        base class is logged, and that client gets no answer.
 
         Raises:
-            Crashed: to vanish without an answer.
+            Crashed: to end without an answer.
         """
 
     def tick(self, now_s: float) -> float | None:
         """Advance to now, in experiment time: end scans, write files.
 
-        Called before every `serve`, so also right after whatever was served.
+        Called before every `serve`, so also right after each request.
 
         Returns:
-            when something else will, besides what the rig and the faults know of themselves.
+            the time of the next event, except events of the rig and the faults.
         """
         return None
 
     @abstractmethod
     def close(self) -> None:
-        """Listen no more. Also called if `open` failed."""
+        """Stop listening. Also called if `open` failed."""
 
     def abandon(self) -> None:
-        """Give up what goes on, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
+        """Drop the present activity, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
         self.rig.abandon(self.clock.now_s())
 
     # -- what is there for it
 
     def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
-        """Show a button until it is pressed or taken away; there is one at a time.
+        """Show a button until it is pressed or removed; there is one at a time.
 
-        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so it can be pressed from
-        any program and any computer that sees the folder, alone as well as in an experiment.
+        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so any program on any
+        computer with access to the folder can press it, alone as well as in an experiment.
 
         Args:
-            why: it has to be pressed, for the log and the file.
+            why: the reason to press it, for the log and the file.
         """
         self.take_button_away()
         file = self.folder / f"delete-to-{name}.txt"
@@ -214,20 +213,20 @@ class Emulator(ABC):
         self.log.warning("%s: delete %s to press the button", why, file)
 
     def take_button_away(self) -> None:
-        """Show no button any more."""
+        """Remove the button."""
         button, self._button = self._button, None
         if button is not None:
             with suppress(OSError):  # a file that can't be deleted presses nothing any more
                 button.file.unlink()
 
     def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
-        """Be the controller until `stop`.
+        """Run the controller until `stop`.
 
         Args:
-            listening: told the address, once there is one; empty: none for now.
+            listening: called with the address, once there is one; empty: none for now.
 
         Raises:
-            Crashed: it was told to.
+            Crashed: an emulated crash.
             TransportError: another program listens at its port.
         """
         self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
@@ -250,7 +249,7 @@ class Emulator(ABC):
     def _open(self) -> str:
         try:
             return self.open()
-        except Exception as error:
+        except Exception as error:  # servers raise OSError or zmq.ZMQError: the error number decides
             if _TAKEN.isdisjoint((getattr(error, "errno", None), getattr(error, "winerror", None))):
                 raise
             hint = "end that program or choose another port; without --port and --usual a free port is chosen"
@@ -259,7 +258,7 @@ class Emulator(ABC):
             ) from error
 
     def stop(self) -> None:
-        """End `run` soon. From any thread, also before it began."""
+        """End `run` soon. Thread-safe, also before its start."""
         self._stop.set()
         self._wake()
 
@@ -269,10 +268,10 @@ class Emulator(ABC):
 
     @contextmanager
     def running(self, folder: Path, clock: Clock | None = None) -> Iterator[str]:
-        """Run in a thread while in the block, for tests and scripts; gives the address.
+        """Run in a thread while in the block, for tests and scripts; yields the address.
 
         Raises:
-            whatever `run` raised before it listened, or by the end of the block; an emulated crash is none.
+            any exception of `run` before it listened, or up to the end of the block, except an emulated crash.
         """
         opened: list[str] = []
         failed: list[BaseException] = []
@@ -289,7 +288,7 @@ class Emulator(ABC):
                 )
             except Crashed:
                 pass
-            except BaseException as error:
+            except BaseException as error:  # raised again by the thread that waits for the start
                 failed.append(error)
             finally:
                 settled.set()
@@ -308,7 +307,7 @@ class Emulator(ABC):
             raise failed[0]
 
     def run_process(self, context: ProcessContext) -> int:
-        """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
+        """Run as a process of an experiment (called by the host): with its clock, and files in its run folder."""
         context.when_stopping(self.stop)
         threading.Thread(target=self._await_experiment_end, args=(context,), name="experiment", daemon=True).start()
 
@@ -348,7 +347,7 @@ class Emulator(ABC):
             return do(argument)
         except Crashed:
             raise
-        except Exception:
+        except Exception:  # no request of a client may end the emulator: any error ends its activity only
             self.log.exception("the emulated %s failed and dropped its current activity", self.vendor)
             self.abandon()
             return self.clock.now_s() + _AGAIN_S

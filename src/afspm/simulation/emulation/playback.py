@@ -1,8 +1,9 @@
-"""Playback of a trace: what to answer to what is asked, and where that first differs from the recording. Pure.
+"""Playback of a trace: the answer to each question, and the first difference from the recording. Pure.
 
-What carries out a request (`TracedExchange.command`) has to be asked as it was recorded, in the same order. What only
-looks at the controller may be asked more or less often and in another order: how often depends on the time that things
-take. The ids that a client counts its questions by are not compared, and secrets are left out: they differ each time.
+A request (`TracedExchange.command`) must be repeated as it was recorded, in the same order. A read of the controller
+may be repeated more or less often and in another order: its frequency depends on timing. Request ids of the client are
+not
+compared, and secrets are left out: they differ each time.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _SHOWN: Final = 200
 
 
 class Deviation(Exception):
-    """The client asks something else than what was recorded; the text says where, and both."""
+    """The client differs from the recording; the text gives the place, and both questions."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class PlayedAnswer:
 
 @dataclass
 class _Cursor:
-    """How far one connection has got: the index of its next exchange among its own."""
+    """The progress of one connection: the index of its next exchange among its own."""
 
     exchanges: Sequence[tuple[int, TracedExchange]]
     next: int = 0
@@ -64,27 +65,27 @@ class Playback:
 
     @property
     def transport(self) -> str:
-        """The transport of the recorded controller; empty: nothing was said."""
+        """The transport of the recorded controller; empty without exchanges."""
         return next((one[1].transport for exchanges in self._recorded for one in exchanges), "")
 
     @property
     def missing(self) -> list[tuple[int, TracedExchange]]:
-        """The recorded exchanges of requests that have not been asked, with their lines."""
+        """The recorded exchanges of requests that have not been repeated, with their lines."""
         begun = [entry for cursor in self._cursors for entry in cursor.exchanges[cursor.next :]]
         unopened = [entry for exchanges in self._recorded[len(self._cursors) :] for entry in exchanges]
         return [entry for entry in begun + unopened if entry[1].command]
 
     def connect(self) -> int:
-        """Return the number of a connection that a client has just made."""
+        """Register a new connection; return its number."""
         number = len(self._cursors)
         self._cursors.append(_Cursor(self._recorded[number] if number < len(self._recorded) else []))
         return number
 
     def ask(self, connection: int, content: bytes) -> PlayedAnswer | None:
-        """Return what to answer; None: the answer is to come later, or the question is not whole yet.
+        """Return the answer to a question; None if it is due later, or the question is incomplete.
 
         Raises:
-            Deviation: it was recorded otherwise.
+            Deviation: the recording differs.
         """
         cursor = self._cursors[connection]
         found = self._match(cursor, content)
@@ -106,7 +107,7 @@ class Playback:
         return PlayedAnswer(line, _with_ids_of(content, exchange.answered))
 
     def files(self) -> list[TracedFile]:
-        """Return the files that the controller has written since the last call, by how far the playback has got."""
+        """Return the files that the controller has written since the last call, at this point of the recording."""
         due = [file for file in self._files if self._last_before(*file) <= self._reached]
         self._files = [file for file in self._files if file not in due]
         return [file for _, file in due]

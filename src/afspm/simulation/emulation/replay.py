@@ -1,4 +1,4 @@
-"""A controller that says what a recorded one said: a trace played back, for a bug report that becomes a test."""
+"""`TraceReplay`: an emulated controller that plays back a recorded trace, so that a bug report becomes a test."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ReplayClient:
     """A client: of TCP by its socket, of ZeroMQ by its identity.
 
     Attributes:
-        introduction: that has to be over before its questions are answered; None: there is none.
+        introduction: the greeting that precedes its questions; None without one.
     """
 
     number: int
@@ -42,16 +42,16 @@ class ReplayClient:
 
 
 class TraceReplay(Emulator):
-    """Plays a trace back: it answers what was answered, and tells where the questions first differ.
+    """Plays a trace back: gives the recorded answers, and reports the first different question.
 
     Args:
         trace: the file (`afspm trace`).
-        files: the folder for the controller's files; left out: that of the emulator. The translator has to look there:
+        files: the folder for the controller's files; by default the emulator's. The translator must look there:
             session_dir, folders or scan_dir in its section.
         common: as of every emulator.
 
     Attributes:
-        deviation: the first difference; empty: none so far.
+        deviation: the first difference; empty if there is none so far.
     """
 
     vendor: ClassVar[str] = "replayed"

@@ -1,7 +1,7 @@
 """A simulated microscope: the physics of `afspm.simulation` behind a controller with all the base actions.
 
-It runs on the experiment clock, so that a night passes in a minute, and keeps its state over a kill: it is the same
-instrument afterwards, with the same tip, and what it was measuring has gone on meanwhile.
+It runs on the experiment clock, so that a night passes in a minute. Its state survives a kill: the same tip continues,
+and a measurement has gone on meanwhile.
 """
 
 from __future__ import annotations
@@ -98,19 +98,19 @@ class Simulator(Driver):
     """The simulated microscope.
 
     Args:
-        seed: the seed of every random number.
+        seed: of all random numbers.
         surface: a kind, or a table of `kind` and its settings.
         tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: a table of its own settings.
         initial: values of parameters at the start, by their generic names.
-        approach_s: how long engaging and retracting take.
+        approach_s: duration of engaging and retracting.
         faults: faults and their times, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
-        fault_action: whether the action "x-fault" makes faults on demand.
-        panel: what a person does at the controller's panel, each a table of `at_s` with `set` or `action`.
+        fault_action: enable the action "x-fault", which triggers faults on demand.
+        panel: actions of a person at the controller's panel, each a table of `at_s` with `set` or `action`.
         parameters: rows added to the table of parameters, or changed in it.
         actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
-        poll_period_s: how often its state is read, in real seconds, while nothing is due.
-        result_timeout_s: how long after a scan or spectrum its file may take to appear.
-        live_lines_s: how often lines of a running scan are published, 0: not at all; by default twice a real second.
+        poll_period_s: interval between reads of its state, in real seconds, while nothing is due.
+        result_timeout_s: longest delay of the file after the end of a scan or spectrum.
+        live_lines_s: interval between publications of lines of a running scan, 0: none; by default twice a real second.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -219,7 +219,7 @@ class Simulator(Driver):
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
     def connect(self) -> None:
-        """Switch the instrument on, or find it as it was."""
+        """Switch the instrument on, or restore its state."""
         if self._controller is None:
             self._controller = self._switch_on()
         self._reached(refuses=False)
@@ -268,7 +268,7 @@ class Simulator(Driver):
         return value
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set values; the frame and the probe are moved at the move speed."""
+        """Set values; frame and probe move at the move speed."""
         for vendor in values:
             self.get(vendor)
         controller = self._reached(refuses=not set(values) <= set(_FAULT_PARAMETERS))
@@ -296,7 +296,7 @@ class Simulator(Driver):
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:
-        """Make the fault that the parameters "x-fault-…" describe."""
+        """Trigger the fault of the parameters "x-fault-…"."""
         kind, count, duration_s = (self.memory["values"][name] for name in _FAULT_PARAMETERS)
         self.demanded = Fault(str(kind), 0.0, int(count), float(duration_s))
 
@@ -305,7 +305,7 @@ class Simulator(Driver):
         return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
 
     def run_process(self, context: ProcessContext) -> int:
-        """Be the translator, with the faults that are not the controller's."""
+        """Run the translator, with faults that are not the controller's."""
         from afspm.simulation.simulator.faulty import FaultyTranslator
         from afspm.translator.translator import run_translator
 

@@ -1,4 +1,4 @@
-"""A translator with the faults that are not the controller's: late and missing answers, hanging, dying."""
+"""A translator with faults that are not the controller's: late and missing answers, hangs, crashes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class FaultyTranslator(Translator):
-    """`Translator` with the faults that its simulated microscope is to have."""
+    """`Translator` with the faults of its simulated microscope."""
 
     _late: tuple[float, Response] | None = None
 

@@ -1,4 +1,4 @@
-"""Irregular surfaces: terraces between meandering steps, rough and flat ground, strewn nanoparticles."""
+"""Irregular surfaces: terraces between meandering steps, rough and flat ground, scattered nanoparticles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Steps:
 
     Attributes:
         angle_deg: direction of the rise, counter-clockwise from x.
-        meander: how far the edges wander, in terrace widths.
+        meander: amplitude of the edges' meandering, in terrace widths.
         edge_m: width of an edge.
     """
 
@@ -75,7 +75,7 @@ class Rough:
 
 @dataclass(frozen=True)
 class Flat:
-    """A flat surface, to measure noise."""
+    """A flat surface, for noise measurements."""
 
     roughness_rms_m: float = 0.0
 

@@ -1,4 +1,4 @@
-"""Regular surfaces: a hexagonal lattice with defects, and the stamper that compact discs are pressed with."""
+"""Regular surfaces: a hexagonal lattice with defects, and the stamper for pressing compact discs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The facts of a packet, as a client must tell them."""
+"""The facts of a packet, as a client must report them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Facts = Plain
 
 
 def facts_of(packet: Packet) -> Facts:
-    """Return the facts of a packet that can be compared."""
+    """Return the comparable facts of a packet."""
     message = wire.message_of(packet.envelope)
     facts: Facts = {"envelope": packet.envelope, "message": message, "timestamp_ns": packet.time_ns}
     if wire.declaration(message).has_values:
@@ -63,7 +63,7 @@ def _values(values: NDArray[np.float64]) -> Facts:
 
 
 def compare(told: Facts, packet: Packet) -> None:
-    """Compare what a client tells of a packet with the packet. Raises Failed."""
+    """Compare a client's report of a packet with the packet. Raises Failed."""
     for name, right in facts_of(packet).items():
         came = told.get(name)
         if name == "values":

@@ -1,6 +1,6 @@
-"""The steps of a commissioning, in their order.
+"""The steps of a commissioning, in order.
 
-Each returns a line that says what was seen, or raises Failed, Skipped or Declined.
+Each returns a line with its observation, or raises Failed, Skipped or Declined.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ _FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
 def all_steps() -> tuple[CommissioningStep, ...]:
-    """Return all steps, in their order."""
     return tuple(_STEPS)
 
 
@@ -188,7 +187,7 @@ def _angle(guide: Guide) -> str:
 )
 def _scan(guide: Guide) -> str:
     taken, panel_s = _watched(guide)
-    scans.require_order(taken.heard, ScopeState.SCANNING, Scan)
+    scans.require_order(taken.observed, ScopeState.SCANNING, Scan)
     scans.require_frame(taken)
     begin_s, free_s = taken.time_s(ScopeState.SCANNING), taken.time_s(ScopeState.FREE)
     for one in taken.scans:

@@ -21,7 +21,7 @@ class CheckReport(SuiteReport):
 
     Attributes:
         translator: its class or command.
-        unrestored: what could not be put back, a line each.
+        unrestored: settings that could not be restored, a line each.
     """
 
     translator: str = ""
@@ -30,7 +30,7 @@ class CheckReport(SuiteReport):
     unrestored: list[str] = field(default_factory=list)
 
     def describe(self, session: CheckSession) -> None:
-        """Note down the translator under test."""
+        """Record the facts about the translator under test."""
         self.translator, self.simulated = session.translator, session.simulated
         self.support, self.folder = session.support, str(session.folder)
 
@@ -61,14 +61,14 @@ class CheckReport(SuiteReport):
 
 
 def show_beginning(report: CheckReport, console: Console) -> None:
-    """Print what will be checked."""
+    """Print the translator under test."""
     told = report.support.controller or "its controller does not report its version"
     simulated = " SIMULATED" if report.simulated else ""
     console.print(Text.assemble((report.translator, "bold"), f": {told}", (simulated, "bold yellow")), soft_wrap=True)
 
 
 def show_end(report: CheckReport, console: Console) -> None:
-    """The tables, and what came of it all."""
+    """Print the tables and the verdict."""
     console.print(_actions(report))
     console.print(_parameters(report))
     for failure in report.failed:

@@ -1,4 +1,4 @@
-"""The run of all checks: one after the other, and then every setting is put back."""
+"""Runs all checks in order, then restores every setting."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
 
 @dataclass(frozen=True)
 class SettingsBefore:
-    """The settings that were in force before the checks."""
+    """The settings in force before the checks."""
 
     frame: ScanParameters | None
     feedback: Feedback | None
@@ -31,7 +31,7 @@ class SettingsBefore:
 
     @classmethod
     def of(cls, client: CheckClient, support: Support) -> SettingsBefore:
-        """As it was told when the checks began."""
+        """Return the settings published when the checks began."""
         return cls(
             client.observations.newest(ScanParameters),
             client.observations.newest(Feedback),
@@ -41,10 +41,10 @@ class SettingsBefore:
         )
 
     def restore(self, client: CheckClient) -> list[str]:
-        """Stop what runs, and put everything back.
+        """Stop any activity, and restore all settings.
 
         Returns:
-            what could not be, a line each.
+            the failures, a line each.
         """
         wrong: list[str] = []
         try:
@@ -114,7 +114,7 @@ def _same(before: Parameter, now: Parameter) -> bool:
 
 @contextmanager
 def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
-    """Put back at the end of the block, however it ends, the settings of its beginning."""
+    """Restore the settings at the end of the block, however it ends."""
     kit = CheckMeasurements(
         session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )
@@ -130,14 +130,14 @@ def run(
     begun: Callable[[CheckReport], None] = lambda report: None,
     done: Callable[[CheckResult], None] = lambda result: None,
 ) -> CheckReport:
-    """Do all checks that are chosen, restore, and write `report.json` into the run's folder.
+    """Run the selected checks, restore the settings, and write `report.json` into the run's folder.
 
     Args:
-        begun: gets the report before the first check, `done` each result.
+        begun: called with the report before the first check, `done` with each result.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
-        KeyboardInterrupt: after everything was put back, and the report of what was done was written.
+        KeyboardInterrupt: after all settings were restored and the report of finished checks was written.
     """
     checks = TRANSLATOR_SUITE.checks(options.only)
     report = CheckReport()

@@ -52,7 +52,7 @@ class = "Scheduler"
 
 
 class Tester(Component):
-    """Whom the checks are in the experiment. It is wired like any other component, and not started as one."""
+    """The component of the checks in the experiment: wired like any other, but not started as a process."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,12 @@ class CheckOptions:
     """The options of a pass.
 
     Attributes:
-        files: the experiment file, and those laid over it.
-        without: processes that run already, at the addresses that the file gives, and are joined.
+        files: the experiment file, and its overlays.
+        without: processes that run already, at the addresses in the file, and are joined.
         runs: the folder of run folders.
         speed: of the clock of a simulated microscope; experiment seconds in a real second.
-        only: parts of the names of the checks to do; empty: all.
-        frame_m: the side of the square, about the centre of the frame that is set, that nothing is done outside of;
-            None: the frame that is set.
+        only: parts of the names of the checks; empty: all.
+        frame_m: the side of a square about the centre of the set frame, never left by checks; None: the set frame.
     """
 
     files: Sequence[Path]
@@ -79,14 +78,14 @@ class CheckOptions:
 
 @dataclass
 class CheckSession:
-    """The translator to check, and the connection to it.
+    """The translator under test, and the connection to it.
 
     Attributes:
-        support: what the microscope has.
-        translator: its class or command; maker: of its controller, if the driver says.
+        support: the supported actions and parameters.
+        translator: its class or command; maker: of its controller, if the driver names it.
         folder: of this run.
         excused: checks that this controller can't pass, with the reason.
-        complaints: the warnings and errors that were logged; it grows.
+        complaints: the logged warnings and errors; it grows.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
     """
 
@@ -103,7 +102,7 @@ class CheckSession:
 
 
 def prepare(options: CheckOptions) -> Experiment:
-    """The experiment with the tester in it, and a scheduler if it had none.
+    """Return the experiment with the tester in it, and with a scheduler if it had none.
 
     Raises:
         ConfigError: it can't be run, or is in sample coordinates.
@@ -127,7 +126,7 @@ def prepare(options: CheckOptions) -> Experiment:
 
 @contextmanager
 def opened(options: CheckOptions) -> Iterator[CheckSession]:
-    """Start, or join, what is to be checked; in control of the microscope while in the block.
+    """Start, or join, the program under test; hold control of the microscope in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
@@ -256,7 +255,7 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
 
 
 def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
-    """True if what is started here is simulated for certain."""
+    """Return whether the started microscope is certainly simulated."""
     return experiment.simulated(without=_left_out(experiment, options))
 
 

@@ -1,4 +1,4 @@
-"""Losing control, to a person and to a problem, and processes that are killed on the way."""
+"""Loss of control to a person or a problem, and processes killed meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encryption: what has not the right key is not spoken to, and does not get in."""
+"""Encryption: a peer without the right key gets no answer and no access."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def _require_silence(run: ScriptedRun, which: str) -> None:
     has_come = run.scheduler.pump(lambda: run.scheduler.connections > 0, ANSWER_S)
     expect(has_come, "a connection to the scheduler's address", f"none in {ANSWER_S:g} s{run.client.last_words}")
     run.scheduler.serve(_LISTENED_S)
-    heard = [*run.scheduler.requests, *run.scheduler.greetings, *run.scheduler.prefixes, *run.scheduler.markers]
-    expect(not heard, f"silence towards a scheduler with {which}", f"{len(heard)} messages")
+    received = [*run.scheduler.requests, *run.scheduler.greetings, *run.scheduler.prefixes, *run.scheduler.markers]
+    expect(not received, f"silence towards a scheduler with {which}", f"{len(received)} messages")
 
 
 @client_check(

@@ -1,4 +1,4 @@
-"""Checks of how the program begins, shows that it is alive, and ends."""
+"""Checks of the program's start, heartbeats and end."""
 
 from __future__ import annotations
 
@@ -19,18 +19,17 @@ _MOST_BEATS_APART = 4.0
 
 
 def await_beat(beats: BeatRecorder, pump: Pump) -> None:
-    """Wait for the first beat: only then it is sure that the last one would be heard, too."""
+    """Wait for the first beat; from then on the last one can't be missed."""
     pump(lambda: bool(beats.beats), _MOST_BEATS_APART * BEAT_S)
 
 
 def require_beats(beats: BeatRecorder, since_s: float) -> None:
-    """Raise Failed if the heartbeats have not been regular since then."""
+    """Raise Failed if heartbeats have been irregular since `since_s`."""
     pause_s = beats.longest_pause_s(since_s)
     expect(pause_s <= _MOST_BEATS_APART * BEAT_S, f"a beat every {BEAT_S} s", f"a pause of {pause_s:.1f} s")
 
 
 def require_exit(program: ClientProgram, codes: tuple[int, ...]) -> None:
-    """Raise Failed unless the program ends in time, with one of these exit codes."""
     ended = program.wait_ended(ENDED_S)
     wanted = " or ".join(str(int(code)) for code in codes)
     expect(ended, f"the end of the program within {ENDED_S:.0f} s", f"a program that goes on{program.last_words}")

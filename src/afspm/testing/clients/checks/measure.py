@@ -31,7 +31,7 @@ def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s
 
 
 def require_scans(experiment: JudgedExperiment, answer: Answer, asked: Plain) -> None:
-    """Raise Failed unless an answer has what was published of the scan that was asked for."""
+    """Raise Failed unless an answer contains the published channels of the requested scan."""
     expect(answer.ok, "the scan to be taken", str(answer))
     scans = answer.get("scans")
     if not isinstance(scans, list):
@@ -95,7 +95,7 @@ def _require_value(answer: Answer, name: str, right: str) -> None:
     dimension = right.split()[1].removeprefix("m") if "/" not in right else "m/s"
     try:
         came = si(text, dimension)
-    except Exception as error:
+    except Exception as error:  # the answer is a client's and may be anything: any error means a wrong answer
         raise Failed(f"{name} = {right}", f"{answer} ({error})") from error
     expect(near(came, si(right, dimension)), f"{name} = {right}", str(answer))
 

@@ -1,4 +1,4 @@
-"""Late joining: what was published before is asked for and arrives once."""
+"""Late joining: earlier packets are requested and arrive once."""
 
 from __future__ import annotations
 

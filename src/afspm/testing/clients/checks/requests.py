@@ -1,4 +1,4 @@
-"""Requests: ids, repetition, answers that get lost, and refusals."""
+"""Requests: ids, repetition, lost answers, and refusals."""
 
 from __future__ import annotations
 
@@ -77,18 +77,18 @@ def _note(experiment: JudgedExperiment, text: str) -> str:
 
 
 def begin_read(client: ClientProgram) -> int:
-    """Have the client ask for a parameter; return the step's id."""
+    """Start the client's request for a parameter; return the step's id."""
     asked = encode_subject(Parameter(_PARAMETER))
     return client.begin("request", number=ControlRequest.PARAM, object=in_base64(asked))
 
 
 def begin_note(experiment: JudgedExperiment, client: ClientProgram, text: str) -> int:
-    """Have the client publish a note; return the step's id."""
+    """Start the client's publication of a note; return the step's id."""
     return client.begin("request", number=RELAY_REQUEST, object=_note(experiment, text))
 
 
 def published(experiment: JudgedExperiment) -> Counter[str]:
-    """Return how often each note has been published."""
+    """Count the publications of each note."""
     notes = [decode("Note", packet.payload) for packet in experiment.packets("Note")]
     return Counter(note.text for note in notes)
 

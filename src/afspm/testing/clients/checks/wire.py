@@ -23,7 +23,6 @@ _FIRST_NS = 1_767_225_600_123_456_000
 
 
 def in_base64(data: bytes) -> str:
-    """Return bytes as a step has them."""
     return base64.b64encode(data).decode()
 
 
@@ -96,7 +95,7 @@ def requests(bench: ClientBench) -> None:
 
 
 def ask(run: ScriptedRun, number: int, payload: bytes = b"") -> Answer:
-    """Have the client send a request, and return its answer."""
+    """Make the client send a request, and return its answer."""
     given = {"object": in_base64(payload)} if payload else {}
     return run.client.do("request", number=number, **given)
 
@@ -143,7 +142,7 @@ def _answered(run: ScriptedRun, code: int, payload: bytes, reason: str, detail: 
 
 
 def response_name(code: int) -> str | int:
-    """Return a response as an answer has it."""
+    """Return the name of a response code as in the client's answers, or an unknown code itself."""
     known = code in ControlResponse._value2member_map_
     return f"REP_{ControlResponse(code).name}" if known else code
 

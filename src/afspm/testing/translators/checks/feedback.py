@@ -31,24 +31,24 @@ def in_force(kit: CheckMeasurements) -> Feedback:
 
 
 def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
-    """Set what is given of it; the rest must stay as it is."""
+    """Set the given fields; all others must keep their values."""
     kit.client.come_to_rest()
     before, mark = in_force(kit), kit.client.observations.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}
     response = kit.client.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted)
-    heard = kit.client.settled(mark)
+    observed = kit.client.settled(mark)
     if response.code in (ControlResponse.PARAM_ERROR, ControlResponse.PARAM_NOT_SUPPORTED):
         require_same(before, in_force(kit))
         raise Skipped(f"it can't be set here: {answer_in_words(response)}")
     expect(response.ok, f"REP_SUCCESS to setting {', '.join(given)} of the feedback", answer_in_words(response))
     after = in_force(kit)
-    count = sum(isinstance(one.thing, Feedback) for one in heard)
-    expect(count == 1, "the new ZCtrlParameters once", describe_all(heard))
+    count = sum(isinstance(one.thing, Feedback) for one in observed)
+    expect(count == 1, "the new ZCtrlParameters once", describe_all(observed))
     require_same(replace(before, **given), after)
 
 
 def require_same(wanted: Feedback, came: Feedback) -> None:
-    """That both are the same, to a float32."""
+    """Raise Failed unless both agree to the precision of a float32."""
     for name, value in vars(wanted).items():
         other = getattr(came, name)
         if value is None or other is None or isinstance(value, bool):

@@ -1,7 +1,7 @@
-"""Where scans say they were taken is where they were: details fit into a larger scan, if there is a sample to see.
+"""Geometry of scans: details must fit into a larger scan at their reported regions, if the sample shows structure.
 
-A larger scan is compared with details of it. Both are made from the same wrong idea of the axes, if there is one: so
-each idea is tried on both.
+A larger scan is compared with details of it. A wrong idea of the axes affects both alike, so each idea is tried on
+both.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Idea = Callable[[ScanPicture], ScanPicture]
 
 
 def ideas(angle_rad: float) -> dict[str, Idea]:
-    """Return what may be wrong with the axes of a translator, in words; `angle_rad` is that of the larger scan."""
+    """Return possible errors in the axes of a translator, by description; `angle_rad` is the larger scan's."""
 
     def turned_back(picture: ScanPicture) -> ScanPicture:
         return replace(picture, region=replace(picture.region, angle_rad=2 * angle_rad - picture.region.angle_rad))
@@ -72,7 +72,7 @@ def _moved(across: float, up: float) -> Idea:
 
 
 def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str, float]:
-    """For each idea, how well the details fit into the larger scan: the mean correlation, -1 to 1."""
+    """Return for each idea the mean correlation (-1 to 1) of the details with the larger scan."""
     return {
         name: float(np.mean([_best(idea(larger), idea(detail)) for detail in details]))
         for name, idea in ideas(larger.region.angle_rad).items()
@@ -80,9 +80,9 @@ def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str,
 
 
 def best_of(found: dict[str, float]) -> tuple[str, float]:
-    """The idea of `likenesses` that explains the scans, and how well: of those that do as well, the first and simplest.
+    """Return the idea that explains the scans best, with its likeness; of equal ones the first and simplest.
 
-    With few details two may be the same: one that is square fits swapped as well as half a frame away.
+    With few details two may be equal: a square detail fits swapped as well as shifted by half a frame.
     """
     most = max(found.values())
     return next((name, likeness) for name, likeness in found.items() if likeness >= most - _EQUAL)

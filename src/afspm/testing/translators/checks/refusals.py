@@ -1,4 +1,4 @@
-"""Refusals: unknown names, impossible values, places out of reach, and all that would disturb a scan."""
+"""Refusals: unknown names, impossible values, positions out of reach, and requests that would disturb a scan."""
 
 from __future__ import annotations
 
@@ -107,8 +107,8 @@ def _require_unchanged(
     before, mark = client.observations.newest(published), client.observations.mark()
     response = client.ask_directly(kind, subject)
     expect(response.code == ControlResponse.PARAM_ERROR, f"REP_PARAM_ERROR to {what}", answer_in_words(response))
-    heard = client.settled(mark)
-    expect(client.observations.newest(published) == before, f"nothing changed by {what}", describe_all(heard))
+    observed = client.settled(mark)
+    expect(client.observations.newest(published) == before, f"nothing changed by {what}", describe_all(observed))
 
 
 _NEEDS = (names.START_SCAN, names.STOP_SCAN)
@@ -137,8 +137,8 @@ def refused(kit: CheckMeasurements) -> None:
                 answer_in_words(response),
             )  # fmt: skip
     _require_running(kit, mark)
-    heard = [one for one in kit.client.observations.since(mark) if one.state is None]
-    expect(not heard, "nothing but SS_SCANNING while requests were refused", describe_all(heard))
+    observed = [one for one in kit.client.observations.since(mark) if one.state is None]
+    expect(not observed, "nothing but SS_SCANNING while requests were refused", describe_all(observed))
 
 
 @check("busy/answered", "during a scan, questions for parameters and supported actions are answered", needs=_NEEDS)
