@@ -1,4 +1,4 @@
-"""A controller that says back what it is told, for one client at a time."""
+"""A controller that echoes lines, for one client at a time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Echo(Emulator):
 
 
 class Late(Echo):
-    """Begins when the experiment is over."""
+    """Starts only after the end of the experiment."""
 
     def run(self, *arguments: Any) -> None:
         for thread in threading.enumerate():
