@@ -96,7 +96,9 @@ def find_runs(
     """
     wanted = [_read_word(word) for word in words]
     if not root.is_dir():
-        raise FileError("there is no such folder", where=str(root), hint="runs are in runs/, or where --runs said")
+        raise FileError(
+            "there is no such folder", where=str(root), hint="runs are in runs/, or in the folder of --runs"
+        )
     found = [run for run in _up_to_date(root) if _was_within(run, since, until) and _has(run.texts(), wanted)]
     return sorted(found, key=lambda run: (run.began_ns or 0, run.folder), reverse=True)
 
@@ -188,7 +190,7 @@ def _stamp(folder: Path) -> str:
     for name in _WATCHED:
         with suppress(OSError):
             stat = (folder / name).stat()
-            if stat.st_size:  # one that is empty is left by whoever reads
+            if stat.st_size:  # SQLite's readers leave empty files
                 stamps.append(f"{name} {stat.st_mtime_ns}/{stat.st_size}")
     return " ".join(stamps)
 

@@ -45,7 +45,7 @@ CREATE TABLE IF NOT EXISTS entries (
 CREATE INDEX IF NOT EXISTS entries_by_time ON entries (time_ns);
 -- When scans and spectra were asked for, and under which keys; the answer may have come after what was measured.
 CREATE TABLE IF NOT EXISTS starts (sent_ns INTEGER NOT NULL, action TEXT NOT NULL, key TEXT NOT NULL);
--- A row for each change of a process, not for each time that it was told.
+-- A row for each change of a process, not for each report.
 CREATE TABLE IF NOT EXISTS processes (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, role TEXT NOT NULL, condition INTEGER NOT NULL,
   since_ns INTEGER NOT NULL, starts INTEGER NOT NULL, pid INTEGER NOT NULL, last_exit TEXT NOT NULL);
@@ -71,7 +71,9 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         format_row = f"INSERT OR IGNORE INTO about VALUES ('format', '{FORMAT}');"
-        connection.executescript(f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;")  # whoever reads finds all or none
+        connection.executescript(
+            f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;"
+        )  # a reader finds all tables or none
         check_format(connection, path)
     except sqlite3.OperationalError:
         connection.close()
@@ -144,8 +146,8 @@ def check_format(connection: sqlite3.Connection, path: Path) -> None:
     """Raise FileError if the file is not a journal, or of a later version."""
     found = connection.execute("SELECT value FROM about WHERE name = 'format'").fetchone()
     if found is None or found[0] != FORMAT:
-        said = found[0] if found else "something else"
-        raise FileError(f"is not a journal of this version: {said}", where=str(path), hint="a newer afspm may read it")
+        name = found[0] if found else "unknown format"
+        raise FileError(f"is not a journal of this version: {name}", where=str(path), hint="a newer afspm may read it")
 
 
 class _OfCopy(sqlite3.Connection):

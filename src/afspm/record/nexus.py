@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SHOWN = ("in_control", "mode", "interrupted", "number", "run", "frame")
-"""Facts that are attributes, too, for whoever looks into a file with a viewer."""
+"""Facts that are also attributes, so that a viewer of HDF5 files shows them."""
 
 
 @dataclass(frozen=True)

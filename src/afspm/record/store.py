@@ -46,7 +46,7 @@ _log = logging.getLogger("afspm.record")
 NOTE = "note"
 """The kind of a journal entry that is a note."""
 _ALL_OF_THEM = (OSError, sqlite3.OperationalError)
-"""What is wrong with the disk, and so with whatever is written next."""
+"""Errors of the disk, which the next write would meet, too."""
 _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM processes WHERE name = ? ORDER BY rowid DESC"
 
 

@@ -259,9 +259,9 @@ def table_html(columns: Mapping[str, Sequence[object]], count: int) -> str:
     """Return columns of `count` rows each, without empty columns."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
     columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
-    told = [_column(name, values) for name, values in columns.items() if any(map(_has_content, values))]
-    head = "".join(f"<th {_CELL}>{escape(name)}</th>" for name, _ in told)
-    body = "".join(_row(told, number) for number in shown)
+    filled = [_column(name, values) for name, values in columns.items() if any(map(_has_content, values))]
+    head = "".join(f"<th {_CELL}>{escape(name)}</th>" for name, _ in filled)
+    body = "".join(_row(filled, number) for number in shown)
     rows = "1 row" if count == 1 else f"{count} rows"
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table><p>{rows}</p>"
 

@@ -22,7 +22,7 @@ def subseed(seed: int, name: str) -> int:
 
 def hashes(seed: int, *keys: ArrayLike) -> Hashes:
     """Return 64 mixed bits for each combination (broadcast) of whole numbers."""
-    with np.errstate(over="ignore"):  # arithmetic modulo 2**64 is what is meant
+    with np.errstate(over="ignore"):  # overflow is intended: arithmetic modulo 2**64
         state = _mix(np.asarray(seed % 2**64, dtype=np.uint64))
         for key in keys:
             state = _with(state, key)

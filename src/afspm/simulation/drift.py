@@ -20,10 +20,10 @@ from afspm.simulation import chance
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
 
-_LONGEST_S = 2.0**20  # twelve days: the random walk's coarsest interval
-_LEVELS = 22  # halvings of it; finer than a quarter of a second the walk is a straight line
-_FASTEST_M_PER_S = 1e-6  # a thousand times what a bad evening has: a slip of the unit, 60 um/s for 60 nm/min
-_FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and twelve days of it are still a number
+_LONGEST_S = 2.0**20  # twelve days: the coarsest interval of the random walk
+_LEVELS = 22  # halvings of it: below a quarter of a second the walk is linear
+_FASTEST_M_PER_S = 1e-6  # a thousand times a bad evening's drift: finds slips of the unit, 60 um/s for 60 nm/min
+_FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and still finite after twelve days
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class Drift:
     def _about(self, x_m: Array, y_m: Array, factor: NDArray[np.complex128]) -> tuple[Array, Array]:
         s = self._settings
         if s.rotation_rad_per_s == s.expansion_per_s == 0.0:
-            return x_m, y_m  # to the last digit
+            return x_m, y_m  # exactly, without rounding
         pivot = complex(*s.about_m)
         moved = pivot + factor * (x_m + 1j * y_m - pivot)
         return moved.real, moved.imag
@@ -133,7 +133,7 @@ class ScannerCompensation:
     """The displacement of a scanner that follows the sample by itself, at velocities set from time to time."""
 
     def __init__(self, turns: Iterable[tuple[float, float, float, float, float]] = ()) -> None:
-        self.turns = list(turns)  # time, (x, y) by then, velocity from then on
+        self.turns = list(turns)  # (time, x, y at that time, velocity from then on)
 
     def set(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
         """Set the velocity of the scanner from a time on.
@@ -151,7 +151,7 @@ class ScannerCompensation:
         """Return (x, y, z) in m at experiment times, shape t.shape + (3,); z is not followed."""
         t = np.asarray(t_s, dtype=np.float64)
         followed = np.zeros((*t.shape, 3))
-        # in a long night there are thousands, and asked for is what was last
+        # a long night has thousands of velocities, and mostly the last is needed
         first = bisect_right(self.turns, t.min(initial=math.inf), key=lambda turn: turn[0]) - 1
         for since_s, x, y, velocity_x, velocity_y in self.turns[max(first, 0) :]:
             later = t >= since_s

@@ -72,9 +72,9 @@ class SensorSettings:
 
 MODES = ("amplitude", "current", "frequency-shift")
 _ONE_ATOM_S = 77.48e-6  # conductance of a contact of one atom, 2 e^2 / h
-_GENTLE = 0.3  # share of the free amplitude that a gentle setpoint takes away
-_GENTLE_M = 1e-9  # distance of a sensor that a gentle frequency shift is met at
-_GROWN = 10.0  # e-foldings in one step, after which nothing is left but the saturated oscillation
+_GENTLE = 0.3  # reduction of the free amplitude at a gentle setpoint
+_GENTLE_M = 1e-9  # distance of a sensor at a gentle frequency shift
+_GROWN = 10.0  # e-foldings in one step, after which the saturated oscillation dominates
 
 
 @dataclass(frozen=True)
@@ -205,7 +205,7 @@ class Loop:
         rate = self.integral_gain + self.proportional_gain / self.settings.lag_s
         down, up = np.float64(rate * too_high), np.float64(rate * too_low)
         v = start_v.copy()
-        # The swing of an oscillating loop begins anywhere: half of what it has, besides its speed, is in z.
+        # An oscillation starts at any phase: besides the speed, half of its amplitude is in z.
         z = height_m[0] + (np.roll(start_v, 1) / self._omega if self.oscillates else 0.0)
         result = np.empty_like(height_m)
         result[0] = z
@@ -274,7 +274,7 @@ class Loop:
         inertia = max(inertia, limit)
         ki, drive = self.integral_gain, self.proportional_gain - self.integral_gain * self.settings.delay_s
         growth = -damping * dt / (2.0 * inertia)
-        # Past the second bound the equation runs away without turning, which no loop with a delay does.
+        # Beyond the second bound the equation diverges without oscillating, unlike any loop with a delay.
         if growth > _GROWN or (growth > 0.0 and damping**2 >= 4.0 * inertia * ki):
             return self._turned(dt, min(growth, _GROWN))
         # state (z - h0, v, h - h0, h'), with time in units of dt

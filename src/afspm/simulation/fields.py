@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from afspm.simulation import chance
 
 Array = NDArray[np.float64]
-_MATMUL_LATTICE = 48  # up to here a dense product beats gathering
+_MATMUL_LATTICE = 48  # up to this size a dense product is faster than gathering
 # The rms of a B-spline field of unit coefficients, averaged over positions: (sum of w^2)^(1/2) each axis.
 _SPLINE_RMS = 151.0 / 315.0
 
@@ -43,7 +43,7 @@ def smooth_field(seed: int, x_m: Array, y_m: Array, spacing_m: float) -> Array:
         x_m, y_m: positions, broadcast against each other; one row and one column are fastest.
         spacing_m: of the lattice.
     """
-    # A shift of its own keeps the lattices of the octaves from lining up at the origin.
+    # A random shift, so that the lattices of the octaves don't align at the origin.
     shift = chance.uniform(seed, np.arange(2)) * 64.0
     u, v = x_m / spacing_m + shift[0], y_m / spacing_m + shift[1]
     field = _on_grid(seed, u[0], v[:, 0]) if is_separable(x_m, y_m) else _at_points(seed, u, v)

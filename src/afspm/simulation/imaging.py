@@ -39,7 +39,7 @@ class SampleGrid:
     @classmethod
     def covering(cls, x_m: Array, y_m: Array, step_m: tuple[float, float], margin_m: float) -> SampleGrid:
         """Return a grid around all positions, with a margin for the reach of the tip."""
-        # On multiples of the step, so that the same place is drawn alike by every scan of that resolution.
+        # On multiples of the step, so that every scan of that resolution computes a position alike.
         first = [math.floor((a.min() - margin_m) / d) - 8 for a, d in zip((x_m, y_m), step_m, strict=True)]
         last = [math.ceil((a.max() + margin_m) / d) + 8 for a, d in zip((x_m, y_m), step_m, strict=True)]
         shape = (last[1] - first[1] + 1, last[0] - first[0] + 1)
@@ -98,7 +98,7 @@ class Sampler:
 
 def across_m(tip: TipShape, height_range_m: float) -> float:
     """Return the lateral reach of the round part of a tip on a surface with this range of heights."""
-    corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, it is the cone that touches
+    corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, the cone touches
     return min(math.sqrt(2.0 * tip.imaging_radius_m * height_range_m), corner)
 
 

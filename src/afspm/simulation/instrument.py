@@ -39,9 +39,9 @@ from afspm.simulation.world import World
 Doing = ScanActivity | SpectrumActivity | Occupied
 Note = Callable[[float, str, Mapping[str, object]], None]
 """Takes the time of an event, its name, and facts of it."""
-_MOST_AVERAGED = 32  # of more sweeps the noise is no less
+_MOST_AVERAGED = 32  # more sweeps reduce the noise no further
 _FASTEST_DRIFT_M_S = 1e-6
-_FEW = (2, 2)  # pixels: enough to see which channels there are
+_FEW = (2, 2)  # pixels: enough to find the channels
 _STATE_VERSION = 1
 
 
@@ -183,7 +183,7 @@ class Instrument:
         if not self.engaged:
             return self._noise_alone()
         if scan is not None and scan.drawing and self._signals:
-            return self._signals  # the world is one thread's at a time
+            return self._signals  # the world belongs to one thread at a time
         self.drawing.wait()
         if scan is not None and scan is self._doing and scan.running(now_s):
             self._signals = scan.signals(now_s)
@@ -192,7 +192,7 @@ class Instrument:
                 self._signals = self.world.at_rest(
                     place, now_s, self.setup.feedback, self.setup.bias_v, slope=self.setup.slope, random=self._noise
                 )
-            except InvalidValue:  # nothing is met with such a feedback
+            except InvalidValue:  # with an invalid feedback the tip meets no surface
                 self._signals = self._noise_alone()
         return self._signals
 
@@ -275,7 +275,7 @@ class Instrument:
         self._counts["spectrum"] = number = self._counts["spectrum"] + 1
         if not self.engaged:
             random = np.random.default_rng((self.seed, 2, number))
-            for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
+            for column, unit in list(enumerate(units))[1:]:  # the first column is the sweep
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)

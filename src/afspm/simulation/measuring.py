@@ -60,7 +60,7 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
     """Return the current, exponential in the gap; tunnelling at the setpoint, tapping at the contact's conductance."""
     contrast = settings.conductance_contrast * (material - 0.5)
     if loop.settings.mode == "current":
-        # The feedback holds the current, so a better conductor shows in the height; what is left is the error.
+        # The feedback keeps the current constant, so conductance shows in the height; the current shows the error.
         mean = np.copysign(loop.setpoint, bias_v)
         exponent = -gap_m / loop.settings.decay_m
     else:
@@ -90,10 +90,11 @@ Channels = dict[str, tuple[str, Array]]
 TipTimes = Sequence[tuple[float, TipShape]]
 """(since when, tip), the first not later than the scan's start."""
 
-_POINTS = 1_400_000  # of the grid, if oversampling is left to us
+_POINTS = 1_400_000  # of the grid, with automatic oversampling
 _MOST_POINTS = 4_000_000  # of the grid in any case
 _FLICKER_M = 0.02e-9  # of debris at rest: a third of the current, up or down
-_MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches further sees no finer detail
+# lateral reach of a tip in grid steps: beyond, the grid gets coarser, since a blunt tip resolves no detail
+_MOST_TAPS = 160
 
 
 @dataclass(frozen=True)
@@ -268,10 +269,10 @@ def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> t
     pixel = (course.pixel_m[0] / abs(turn), course.pixel_m[1] / abs(turn))
     angle_rad = course.region.angle_rad - cmath.phase(turn)  # on the sample
     if angle_rad % (math.pi / 2) > 1e-9:
-        pixel = (min(pixel), min(pixel))  # the grid does not turn with the scan
+        pixel = (min(pixel), min(pixel))  # the grid is along the sample's axes, not the scan's
     elif angle_rad % math.pi > 1e-9:
         pixel = (pixel[1], pixel[0])
-    # A first look at coarse steps tells how high the sample is, thus how far the tip can touch beside its apex.
+    # A coarse grid gives the range of heights, and with it the lateral reach of the tip.
     extent = (float(np.ptp(x)) or pixel[0], float(np.ptp(y)) or pixel[1])
     look = SampleGrid.covering(x, y, (max(extent[0] / 48, pixel[0]), max(extent[1] / 48, pixel[1])), 0.0)
     rise = 1.2 * float(np.ptp(setup.sample(*look.axes_m(), max(look.dx_m, look.dy_m)).height_m))
@@ -318,7 +319,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
     nx = course.shape[1]
     lead = min(nx, 6 + nx // 16)
     path: Array = np.concatenate([lines[:, lead:0:-1] if nx > 1 else lines[:, :1], lines], axis=1).T
-    # An oscillation grows out of whatever there is; a quiet loop starts at rest.
+    # An oscillation grows from any disturbance; a stable loop starts at rest.
     start_v: Array = (1e-6 if loop.oscillates else 0.0) * random.standard_normal((path.shape[1],))
     z: Array = loop.follow(np.ascontiguousarray(path), course.line_s / (2 * nx), start_v)
     return z[-2 * nx :].T

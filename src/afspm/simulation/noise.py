@@ -95,7 +95,7 @@ def one_over_f(count: int, random: np.random.Generator) -> Array:
     parts = random.standard_normal(shape, dtype=np.float32) * amplitude
     spectrum = np.concatenate([np.zeros(1, np.complex64), parts[0] + 1j * parts[1]])
     series = np.fft.irfft(spectrum, size)[:count]
-    # Each frequency brings a variance of (2 amplitude / size)^2.
+    # Each frequency contributes a variance of (2 amplitude / size)^2.
     return np.asarray(series * (size / (2.0 * np.sqrt(np.sum(amplitude.astype(np.float64) ** 2)))), dtype=np.float64)
 
 

@@ -43,7 +43,7 @@ def build(cls: type[T], settings: object, where: str) -> T:
         made = cls(**values)
     except ConfigError as error:
         for one in individual_errors(error):
-            if known or one.where in values:  # else it may be about what was left out above
+            if known or one.where in values:  # an error about a field omitted above is a consequence, not a cause
                 errors.add(ConfigError(one.what, where=f"{where}.{one.where}" if one.where else where, hint=one.hint))
     except TypeError:
         if known:
@@ -103,7 +103,7 @@ def _convert(hint: Any, value: object, where: str) -> object:
             return None
         return _convert(next(a for a in arguments if a is not type(None)), value, where)
     if origin is dict:
-        hint = dict  # of anything
+        hint = dict  # a table of any values
     if origin is tuple:
         return _sequence(arguments, value, where)
     if dataclasses.is_dataclass(hint):

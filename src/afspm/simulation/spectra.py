@@ -90,7 +90,7 @@ def current_voltage(
     energy = np.linspace(-settings.range_v - 0.5, settings.range_v + 0.5, 1201)
     density = _sample_density(settings, energy, material) * _tip_density(tip, energy)
     # Transmission rises with the energy above the mean barrier; the bias tilts it: currents at positive and
-    # negative bias differ, more for a tip that is not what it should be.
+    # negative bias differ, more for a flawed tip.
     tilt = 0.25 + (0.35 if tip.debris_m else 0.0)
     density = density * np.exp(tilt * energy / math.sqrt(settings.barrier_ev))
     step = energy[1] - energy[0]

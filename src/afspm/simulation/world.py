@@ -36,9 +36,9 @@ from afspm.simulation.tip import (
     indented_m,
 )
 
-# What suits a sample better than the general defaults; the user's settings go on top.
+# Defaults for a kind of sample; the user's settings override them.
 _FITTING: dict[str, dict[str, dict[str, object]]] = {
-    # Atoms are seen by the foremost atom of the tip, not by its apex as a whole.
+    # Atoms are imaged by the foremost atom of the tip, not by its whole apex.
     "lattice": {
         "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
         "noise": {"white_m": 3e-12, "one_over_f_m": 3e-12, "line_offset_m": 3e-12, "scar_m": 0.05e-9},
@@ -46,7 +46,7 @@ _FITTING: dict[str, dict[str, dict[str, object]]] = {
     },
     "steps": {"tip": {"second_below_radii": 0.015, "debris_radii": 1.0, "length_jump_radii": 0.1}},
     "stamper": {
-        # Bumps this large only show what is wrong with a tip when that is large as well.
+        # Only a large flaw of the tip is visible on bumps of this size.
         "tip": {"blunt_radii": 18.0, "second_distance_radii": 30.0, "second_below_radii": 2.0, "debris_radii": 4.0},
         "noise": {"white_m": 0.3e-9, "one_over_f_m": 0.5e-9, "line_offset_m": 0.5e-9, "scar_m": 8e-9},
     },
@@ -89,7 +89,7 @@ def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings
     with errors:
         built = build(WorldSettings, tables, "simulation")
     if errors.errors:
-        with errors:  # else it is made later
+        with errors:  # built here only to report its errors together with the others
             surface_from(surface)
     errors.raise_all()
     return surface, built
@@ -179,7 +179,8 @@ class World:
         tips += [(change.t_s, change.tip) for change in self._tip.between(start_s, course.end_s)]
         setup = self._setup(loop, bias_v, slope, start_s)
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
-        for one in adjusted:  # each line as if the whole scan had been taken so, with the same noise
+        # the whole scan is computed with each adjustment and the same noise; then its lines are taken over
+        for one in adjusted:
             setup = self._setup(Loop.of(self.settings.feedback, one.feedback), one.bias_v, slope, start_s)
             anew = measure(course, tips, setup, chance.generator(self.seed, 2, call))
             measured = measured.continued(anew, course.row_times_s(0.0) >= one.t_s)

@@ -173,7 +173,7 @@ class Suite(Generic[K]):
         """
         for module in self._modules:
             import_module(module)
-        # any module may have been imported first, by a test or by its neighbour
+        # modules may have been imported in any order, by a test or by each other
         ordered = sorted(self._checks, key=lambda one: self._modules.index(one.do.__module__))
         found = tuple(one for one in ordered if not only or any(part in one.name for part in only))
         if not found:

@@ -66,8 +66,8 @@ class Processes:
     @property
     def errors(self) -> str:
         """The last logged error of each process."""
-        said = {name: reader.last_error for name, reader in self._readers.items()}
-        return "; ".join(f"{name} said: {error}" for name, error in said.items() if error)
+        errors = {name: reader.last_error for name, reader in self._readers.items()}
+        return "; ".join(f"{name}: {error}" for name, error in errors.items() if error)
 
     def close(self) -> None:
         """Ask all running processes to end, and kill the remaining ones."""
@@ -96,10 +96,10 @@ class Processes:
                 level, text = self._readers[event.name].read(event.stream, event.line)
                 self._write(event.name, level, text)
                 if level >= logging.WARNING:
-                    self._complaints.append(f"{event.name} said: {text}")
+                    self._complaints.append(f"{event.name}: {text}")
             case Exited():
-                said = self._readers[event.name].last_error
-                self._ended[event.name] = f"{describe_exit(event.code)}{f' ({said})' if said else ''}"
+                error = self._readers[event.name].last_error
+                self._ended[event.name] = f"{describe_exit(event.code)}{f' ({error})' if error else ''}"
                 self._exits.put(event)
                 self._woken()
 

@@ -29,7 +29,7 @@ class Echo(Emulator):
         with self._listener.accept()[0] as client:
             asked = client.recv(1000).decode()
             if self.faults.strikes("crash", self.clock.now_s()):
-                raise Crashed("as it was told to")
+                raise Crashed("on request")
             told = str(self.clock.now_s()) if asked == "time" else f"{self.greeting} {asked}, seed {self.seed}"
             client.sendall(told.encode())
 

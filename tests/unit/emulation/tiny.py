@@ -40,7 +40,7 @@ class Tiny(Emulator):
     def _answer(self, asked: str) -> None:
         now_s = self.clock.now_s()
         if self.faults.strikes("crash", now_s):
-            raise Crashed("as it was told to")
+            raise Crashed("on request")
         if self.faults.strikes("no-reply", now_s):
             return
         if asked == "scan":

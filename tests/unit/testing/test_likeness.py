@@ -14,7 +14,7 @@ from afspm.testing.translators.checks.picture import CLEARLY, LIKE, Idea, ScanPi
 from afspm.testing.translators.measuring import FrameSettings
 
 WHOLE = Region((2e-6, -1e-6), (1e-6, 1e-6), math.radians(10.0))
-TOLD = "as told"
+TOLD = "as reported"
 
 
 def surface_m(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 8.0, 8.0, 34.0
 _MOST_POINTS = 200
 Size = tuple[int, int]
 FORWARD, BACKWARD = "#c2571a", "#3f7fc4"
-"""Colours that can be told apart on white and on black."""
+"""Colours that are distinct on white and on black."""
 
 
 @dataclass(frozen=True)

@@ -91,7 +91,7 @@ def timeline_html(
     read = [(row, tuple(row.spans)) for row in rows]
     starts = [spans[0].start_ns for _, spans in read if spans]
     if not starts:
-        return '<p class="nothing">Nothing has been heard yet.</p>'
+        return '<p class="nothing">No data yet.</p>'
     begin_ns = min(starts) if begin_ns is None else begin_ns
     end_ns = max(end_ns, begin_ns + NS_PER_S)
     body = "".join(_row(row, stretches(spans, begin_ns, end_ns), begin_ns, end_ns, zone) for row, spans in read)

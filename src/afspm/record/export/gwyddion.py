@@ -182,16 +182,16 @@ def _typical(values: NDArray[np.float64]) -> float:
 
 
 def _meta(about: PlainMapping) -> dict[str, str]:
-    said = {}
+    texts = {}
     for name, value in about.items():
         if name in ("channels", "variables", "content") or value is None:
             continue
         if name == "angle_rad":
-            said["angle"] = f"{math.degrees(value):g} deg"
+            texts["angle"] = f"{math.degrees(value):g} deg"
         elif name == "notes":
-            said |= {f"note {number}": note for number, note in enumerate(value, 1)}
+            texts |= {f"note {number}": note for number, note in enumerate(value, 1)}
         elif isinstance(value, Mapping):
-            said |= {f"{name} {inner}": str(one) for inner, one in value.items()}
+            texts |= {f"{name} {inner}": str(one) for inner, one in value.items()}
         else:
-            said[str(name)] = str(value)
-    return said
+            texts[str(name)] = str(value)
+    return texts

@@ -26,13 +26,13 @@ def write(folder: str | Path) -> Path:
         FileError: there is no record, or the report can't be written.
     """
     with open_run(folder) as run:
-        told = story.read(run)
-        bad_ns = pictures.bad_ns(run, told)
-        shown = pictures.of_scans(run, pictures.chosen(told.scans, kept_ns=bad_ns), bad_ns)
+        contents = story.read(run)
+        bad_ns = pictures.bad_ns(run, contents)
+        shown = pictures.of_scans(run, pictures.chosen(contents.scans, kept_ns=bad_ns), bad_ns)
         target = run.folder / REPORT_FILE
         try:
-            pictures.draw(run, told, shown)
-            text = page.html(told, shown, curves.read(run), pictures.of_figures(run.folder))
+            pictures.draw(run, contents, shown)
+            text = page.html(contents, shown, curves.read(run), pictures.of_figures(run.folder))
             replace_file(target, [text.encode()], synced=False)
         except OSError as error:
             raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error

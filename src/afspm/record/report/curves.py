@@ -153,14 +153,14 @@ def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
 
 
 def _legend(group: SpectrumGroup) -> str:
-    told = []
+    sentences = []
     if len(group.measured) >= _LEAST_AVERAGED:
-        told.append("Thin: single curves. Thick: their mean; the band is one standard deviation.")
+        sentences.append("Thin: single curves. Thick: their mean; the band is one standard deviation.")
     if any(one.back for one in group.measured):
-        told.append("Orange: on the way there; blue: on the way back.")
+        sentences.append("Orange: on the way there; blue: on the way back.")
     if left_out := group.count - len(group.measured):
-        told.append(f"{left_out} more are not read.")
-    return " ".join(told)
+        sentences.append(f"{left_out} more are not read.")
+    return " ".join(sentences)
 
 
 def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
@@ -174,9 +174,9 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
         _figure(one, axes, clock, names[k : k + 3], places[k] if places else "") for k, one in enumerate(shown)
     )
     style = f' style="grid-template-columns:repeat({columns},minmax(0,1fr));gap:.3rem"' if places else ""
-    told = "Each lies where it was measured on the grid, y upwards. " if places else ""
+    position = "Each lies where it was measured on the grid, y upwards. " if places else ""
     more = f" {group.count - len(shown)} more are not shown." if group.count > len(shown) else ""
-    note = f'<p class="note">{told}Click a curve to enlarge it; all have the same axes.{more}</p>'
+    note = f'<p class="note">{position}Click a curve to enlarge it; all have the same axes.{more}</p>'
     return f'<div class="sheet"{style}>{figures}</div>{note}'
 
 
@@ -204,7 +204,7 @@ def _figure(
         "finished": clock.whole(row.time_ns),
         "at": where,
         "points": str(row.points),
-        "in control": escape(row.holder or "nobody"),
+        "in control": escape(row.holder or "none"),
         "problems": escape(", ".join(row.problems)),
         "file": escape(row.file),
         "variables": f'<div class="charts">{"".join(charts[1:])}</div>' if charts[1:] else "",

@@ -83,14 +83,14 @@ def figure(
         beside: names of the previous and next figure; empty if there is none.
         style: CSS classes; ratio: width by height; place: in a grid, as CSS.
     """
-    told = "".join(f"<dt>{escape(head)}</dt><dd>{text}</dd>" for head, text in facts.items() if text)
+    entries = "".join(f"<dt>{escape(head)}</dt><dd>{text}</dd>" for head, text in facts.items() if text)
     steps = "".join(
         f'<a href="#{other}">{word}</a>' for word, other in zip(("‹ before", "next ›"), beside, strict=True) if other
     )
     return (
         f'<figure id="{name}" class="{style}" style="--ratio:{ratio:.5g};{place}"><div class="view">'
         f'<a class="back more" href="#close" aria-label="close"></a><a class="open" href="#{name}">{shown}</a>'
-        f'<div class="more"><dl>{told}</dl><div class="steps">{steps}<a href="#close">close</a></div></div></div>'
+        f'<div class="more"><dl>{entries}</dl><div class="steps">{steps}<a href="#close">close</a></div></div></div>'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 

@@ -66,20 +66,20 @@ def _zones(clock: PageTimes) -> str:
 
 
 def _sample_line(story: RunStory) -> str:
-    told = [text for name in ("sample", "person", "project") if (text := story.metadata.get(name))]
-    return f"<p>{escape(' · '.join(told))}</p>" if told else ""
+    known = [text for name in ("sample", "person", "project") if (text := story.metadata.get(name))]
+    return f"<p>{escape(' · '.join(known))}</p>" if known else ""
 
 
 def _duration_line(story: RunStory, clock: PageTimes) -> str:
-    told = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
+    period = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
     if story.real_s is not None:
-        told += f" ({duration_text(story.real_s)} real)"
+        period += f" ({duration_text(story.real_s)} real)"
     end = story.end
     ended = story.ended
     if end is not None and component_of(end.who) != SUPERVISOR:  # otherwise `ended` states why: nothing was left to run
         reason = f": {end.reason}" if end.reason else ""
         ended = f"{end.who} ended the experiment at {clock.whole(end.time_ns)}{reason}"
-    return f"<p>{escape(told)}; {escape(ended)}</p>"
+    return f"<p>{escape(period)}; {escape(ended)}</p>"
 
 
 def _figures(figures: Sequence[FigurePicture]) -> str:
@@ -139,10 +139,10 @@ def _drift(story: RunStory, clock: PageTimes) -> str:
     failed = (
         f" The estimator failed over {counted(errors, 'pair')}: an error of its own; see the log." if errors else ""
     )
-    told = f"<p>{escape(story.overview.registration.capitalize())}.{failed}</p>"
+    summary = f"<p>{escape(story.overview.registration.capitalize())}.{failed}</p>"
     left_out = len(story.unregistered) - len(rows)
     more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
-    return told + table(["scan", "key", "finished", "registration", "standard deviation", "why"], rows) + more
+    return summary + table(["scan", "key", "finished", "registration", "standard deviation", "why"], rows) + more
 
 
 def _shares(story: RunStory) -> str:
@@ -177,7 +177,7 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
                 escape(span.label),
                 clock.both(span.start_ns),
                 escape(span.by or "not known"),
-                escape(", ".join(story.repairs(span)) or "nobody"),
+                escape(", ".join(story.repairs(span)) or "none"),
                 escape(", ".join(story.done_meanwhile(span))),
                 duration_text((end_ns - span.start_ns) / NS_PER_S),
                 "<b>not solved</b>" if span.end_ns is None else clock.both(end_ns),

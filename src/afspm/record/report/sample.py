@@ -165,7 +165,7 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
     if one.image is not None:
         span = one.image.span
         yield "shown", f"{escape(one.channel)}, {quantity(span.high - span.low, one.unit, 3)} from dark to light"
-    yield "in control", escape(row.holder or "nobody")
+    yield "in control", escape(row.holder or "none")
     yield "problems", escape(", ".join(row.problems))
     yield "interrupted", "yes" if row.interrupted else ""
     notes = [note for note in story.notes if note.scan == row.number]

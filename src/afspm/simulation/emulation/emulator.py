@@ -216,7 +216,7 @@ class Emulator(ABC):
         """Remove the button."""
         button, self._button = self._button, None
         if button is not None:
-            with suppress(OSError):  # a file that can't be deleted presses nothing any more
+            with suppress(OSError):  # the button is gone: a file that stays has no effect
                 button.file.unlink()
 
     def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
@@ -263,7 +263,7 @@ class Emulator(ABC):
         self._wake()
 
     def _wake(self) -> None:
-        if hasattr(self, "woken"):  # it is made when it runs
+        if hasattr(self, "woken"):  # it exists only while running
             self.woken.post()
 
     @contextmanager

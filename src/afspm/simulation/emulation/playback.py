@@ -99,7 +99,7 @@ class Playback:
             if exchange.after < line - 1 and not self._has_passed(connection, exchange.after, line):
                 return None
             if exchange.lost and line == self._last_line:
-                return None  # by the end of the recording, and not by the controller
+                return None  # cut by the end of the recording, not by the controller
             cursor.next = index + 1
             self._reached = max(self._reached, line)
         if exchange.lost and not exchange.answered:

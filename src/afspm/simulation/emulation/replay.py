@@ -92,7 +92,7 @@ class TraceReplay(Emulator):
         else:
             self._serve_tcp(timeout_s)
         while any(self._answer(client) for client in self._clients):
-            pass  # an answer to one may be what another one's waits for
+            pass  # repeated, since the answer to one client may release the answer to another
         self._write_files()
 
     def _serve_tcp(self, timeout_s: float) -> None:

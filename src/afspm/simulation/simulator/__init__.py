@@ -184,7 +184,7 @@ class Simulator(Driver):
             )
             if not fault_action:
                 self.table = self.table.without(_FAULT_PARAMETERS)
-            if loop is not None:  # else it can't be said what a setpoint is
+            if loop is not None:  # an invalid feedback leaves the unit of the setpoint unknown
                 self._check_values(loop, initial or {}, errors)
         errors.raise_all()
 
@@ -225,7 +225,7 @@ class Simulator(Driver):
         self._reached(refuses=False)
 
     def _switch_on(self) -> SimulatedController:
-        import_module("scipy.io")  # which saves files: the first is not to be later than others
+        import_module("scipy.io")  # imported in advance: otherwise the first saved file would be late
         kept = self.memory
         if "start_s" not in kept:
             values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
@@ -327,7 +327,7 @@ def _merged(*tables: Mapping[str, Mapping[str, object]]) -> Rows:
     merged: Rows = {}
     for table in tables:
         for name, row in table.items():
-            # what is no table is for the table of parameters to refuse
+            # the table of parameters refuses a row that is not a table
             merged[name] = {**merged.get(name, {}), **row} if isinstance(row, Mapping) else row
     return merged
 

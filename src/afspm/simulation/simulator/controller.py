@@ -152,7 +152,7 @@ class SimulatedController:
             elif isinstance(ended, SpectrumActivity):
                 self._save_spectrum(ended)
         except AfspmError as error:
-            # as with a controller that fails: it is free again, and there is no file
+            # like a controller that fails: free again, without a file
             self._log.error("the simulated measurement failed: %s; it has no file", error)
         self._keep()
 
@@ -170,11 +170,11 @@ class SimulatedController:
         rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
             self._instrument.follow(rate_m_s, now_s)
-        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a driver may lack some
+        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a table of parameters may lack some
             self._instrument.adjust(now_s)
         way_m = _distance(before, after, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
         if way_m > 0.0 or _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y) > 0.0:
-            self.stop(now_s)  # as far as that is allowed, it ends what is being measured
+            self.stop(now_s)  # a change allowed at this moment ends the measurement
             place_m = (float(after[names.PROBE_POS_X]), float(after[names.PROBE_POS_Y]))
             with _refusing():
                 self._instrument.move_probe(place_m, now_s, way_m=way_m)

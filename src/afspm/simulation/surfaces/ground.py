@@ -114,7 +114,7 @@ class Particles:
         ground = np.zeros(shape) + grain(seed, x_m, y_m, self.roughness_rms_m, 60e-9, resolution_m)
         height_m, material = ground.copy(), np.zeros(shape)
         if self.radius_m * _LARGEST < resolution_m / 4:
-            return Relief(height_m, material)  # far too small to be seen one by one
+            return Relief(height_m, material)  # far below the resolution
         sites = self._present(seed + 10, x_m, y_m)
         radii = self.radius_m * np.exp(self.spread * chance.normal(seed + 11, sites.key))
         radii = np.minimum(radii, _LARGEST * self.radius_m)

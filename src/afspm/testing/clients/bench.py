@@ -79,13 +79,14 @@ class ClientBench:
     def perform(self, check: Check) -> str | None:
         """Run a check. Raises Failed, also for an unreadable answer, and for errors in the experiment."""
         try:
-            told: str | None = check.do(self)
-            return told
+            remark: str | None = check.do(self)
+            return remark
         except ConfigError:
             raise
-        except AfspmError as error:  # something that the judge itself did was not possible, with this client beside it
+        except AfspmError as error:  # the judge's own request failed, with this client beside it
             raise Failed("an experiment that goes on with the client in it", str(error)) from error
-        except (LookupError, TypeError, ValueError, AttributeError) as error:  # by indexing and converting an answer
+        # an answer has the wrong type or lacks a field
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise Failed(
                 "an answer as the page of steps describes it", f"one that can't be read ({error!r})"
             ) from error

@@ -62,14 +62,14 @@ def _values(values: NDArray[np.float64]) -> Facts:
     }
 
 
-def compare(told: Facts, packet: Packet) -> None:
+def compare(reported: Facts, packet: Packet) -> None:
     """Compare a client's report of a packet with the packet. Raises Failed."""
     for name, right in facts_of(packet).items():
-        came = told.get(name)
+        came = reported.get(name)
         if name == "values":
             _compare_values(packet.envelope, right, came)
         elif not _same(right, came):
-            raise Failed(f"{packet.envelope} with {name} = {right!r}", repr(came) if name in told else "none")
+            raise Failed(f"{packet.envelope} with {name} = {right!r}", repr(came) if name in reported else "none")
 
 
 def _compare_values(envelope: str, right: Facts, came: object) -> None:

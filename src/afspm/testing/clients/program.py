@@ -62,7 +62,7 @@ class ClientProgram:
         self._pump, self._wake = pump, wake
         self._answers: dict[int, Answer] = {}
         self._garbage: deque[str] = deque(maxlen=_LAST_WORDS)
-        self._said: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._stderr_lines: deque[str] = deque(maxlen=_LAST_WORDS)
         self._begun: dict[int, str] = {}
         self._next = 0
         self._log = log
@@ -151,8 +151,8 @@ class ClientProgram:
     @property
     def last_words(self) -> str:
         """The last lines on standard error, and on standard output beside answers; empty if there are none."""
-        said = [*self._garbage, *self._said]
-        return f"; it said: {' / '.join(said)}" if said else ""
+        lines = [*self._garbage, *self._stderr_lines]
+        return f"; its last lines: {' / '.join(lines)}" if lines else ""
 
     def close_stdin(self) -> None:
         """Close its standard input, which requests its end."""
@@ -183,7 +183,7 @@ class ClientProgram:
 
     def _write(self, line: str) -> None:
         assert self._popen.stdin is not None
-        with contextlib.suppress(OSError):  # it has ended: waiting for the answer tells
+        with contextlib.suppress(OSError):  # it has ended, which the wait for the answer reports
             self._popen.stdin.write(line.encode() + b"\n")
             self._popen.stdin.flush()
 
@@ -203,7 +203,7 @@ class ClientProgram:
             self._garbage.append(line[:200])
 
     def _note(self, line: str) -> None:
-        self._said.append(line[:300])
+        self._stderr_lines.append(line[:300])
         with self._log.open("a", encoding="utf-8") as file:
             file.write(f"{self.pid} {line}\n")
 

@@ -152,8 +152,8 @@ class ScriptedScheduler:
 
     def _answer_clock_request(self, request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
         now_s = self._clock.now_s()
-        told = {"now_ns": round(now_s * 1e9), "origin_s": now_s, "start_s": now_s, "speed": 1.0, "simulated": True}
-        return [request.answered(payload=json.dumps(told).encode())]
+        clock = {"now_ns": round(now_s * 1e9), "origin_s": now_s, "start_s": now_s, "speed": 1.0, "simulated": True}
+        return [request.answered(payload=json.dumps(clock).encode())]
 
     def _take_subscription(self) -> None:
         (frame,) = receive_frames(self._publisher)[:1]

@@ -55,8 +55,8 @@ class InstrumentReport:
     @property
     def row(self) -> str:
         """The row of the matrix, in Markdown."""
-        told = [f"{name}: {outcome}" for name, outcome in self.operations.items()]
-        return f"| {self.maker} | {self.release} | {self.tried_on} | {', '.join(told)} |"
+        outcomes = [f"{name}: {outcome}" for name, outcome in self.operations.items()]
+        return f"| {self.maker} | {self.release} | {self.tried_on} | {', '.join(outcomes)} |"
 
     def write(self, file: Path) -> None:
         """Write the report as TOML. Raises FileError."""

@@ -120,7 +120,7 @@ def _compare_values(guide: Guide) -> int:
 
 @_step(
     "The tip is withdrawn",
-    "All that follows until you are told moves the scanner sideways and takes scans. It never approaches.",
+    "The next steps, up to the next notice, move the scanner sideways and take scans. They never approach.",
     "Withdraw the tip with the coarse motor, so far that the scanner can't reach the sample, and begin again.",
     after=("controller",),
     moves=False,
@@ -199,7 +199,7 @@ def _scan(guide: Guide) -> str:
         expect(abs(late_s) <= _NOTICED_S, wanted, f"{abs(late_s):.0f} s {'later' if late_s > 0 else 'earlier'}")
     elif taken.expected_s is not None:
         wanted = f"a scan of about {taken.expected_s:.3g} s, by its speed"
-        # the program's own time is real time, of which more passes in an experiment that goes faster
+        # the program's own delay is real time; in experiment time it is longer if the clock runs faster
         own_s = max(2.0 * _NOTICED_S, guide.program_s / guide.kit.client.clock.real_s(1.0))
         most_s = 1.5 * taken.expected_s + own_s
         expect(free_s - begin_s <= most_s, wanted, f"{_lasted(guide, free_s - begin_s)} until its end was noticed")
@@ -224,8 +224,8 @@ def _watched(guide: Guide) -> tuple[Taken, float | None]:
     panel_s = None if answer is None or answer.strip() else client.clock.now_s()
     limit_s = 1200.0 if expected_s is None else 5.0 * expected_s + 60.0
     client.wait_state(ScopeState.FREE, mark, client.real_s(limit_s))
-    heard = client.settled(mark)
-    taken = Taken(frame, heard, expected_s)
+    observed = client.settled(mark)
+    taken = Taken(frame, observed, expected_s)
     expect(taken.scans, "a Scan2d of the scan", "none: see the files of the controller")
     guide.kit.keep("scan of the plain frame", taken)
     return taken, panel_s
@@ -341,7 +341,7 @@ def _contact(guide: Guide) -> str:
     needs=(names.START_SCAN,),
 )
 def _axes(guide: Guide) -> str:
-    guide.kit.forget()  # what was taken with the tip withdrawn
+    guide.kit.forget()  # those measurements were taken with the tip withdrawn
     picture.picture(guide.kit)
     taken = guide.kit.scan("wide").scans
     scan = next((one for one in taken if one.unit == "m"), taken[0])
@@ -350,4 +350,4 @@ def _axes(guide: Guide) -> str:
     file.write_bytes(raster.png(levels))
     guide.prompts.show(f"  {scan.channel}, y upwards: {file}")
     guide.require_at_panel("Does the panel show the same picture, not mirrored and not turned?", "the panel's picture")
-    return "details fit into the larger scan as told"
+    return "details fit into the larger scan as reported"

@@ -73,7 +73,7 @@ class Observations:
             thing = wire.decode(message, bytes(packet.payload))
         except WireError as error:
             thing = error
-        # the rest comes from the scheduler, or only where a client asks for it
+        # other packets come from the scheduler, or only on request of a client
         if isinstance(thing, WireError) or _is_always_published(wire.declaration(message)):
             self.all.append(Observation(message, thing, packet.time_ns))
 
@@ -125,13 +125,13 @@ def states(observed: list[Observation]) -> list[str]:
 
 
 STARTED_S = 30.0
-"""Real seconds until translator and scheduler are up and the microscope has said that it is free."""
+"""Real seconds until translator and scheduler are up and the microscope has reported that it is free."""
 ANSWERED_S = 15.0
 """Real seconds until an answer: longer than a scheduler waits for the translator's."""
 NOTICED_S = 10.0
 """Real seconds until what was asked for is published."""
 QUIET_S = 0.2
-"""Real seconds without anything after which nothing more is said to come."""
+"""Real seconds without a packet that count as a pause."""
 MOVED_S = 60.0
 """Experiment seconds that a move may take."""
 

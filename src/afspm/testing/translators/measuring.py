@@ -118,7 +118,7 @@ LINE_S = 0.25
 LONG_REAL_S = 3.0
 """Real seconds that a scan has to last at least in the middle of which something is asked."""
 UNKNOWN_S = 1200.0
-"""Experiment seconds after which a scan or spectrum of unknown duration is said not to end."""
+"""Experiment seconds after which a scan or spectrum of unknown duration counts as endless."""
 
 T = TypeVar("T")
 
@@ -246,7 +246,8 @@ class CheckMeasurements:
         if self.support.parameters.get(names.SCAN_SPEED) is None:
             return None
         speed_m_s = 2.0 * frame.region.size_m[0] * frame.shape[0] / lasts_s
-        client.set(names.SCAN_SPEED, f"{speed_m_s:.4g}", "m/s")  # if that is refused, it lasts as long as it does
+        # may be refused: the scan then takes the controller's time
+        client.set(names.SCAN_SPEED, f"{speed_m_s:.4g}", "m/s")
         in_force_m_s = number(client.get(names.SCAN_SPEED), "m/s")
         expect(in_force_m_s > 0.0, "a scan-speed above zero", f"{in_force_m_s:g} m/s")
         return 2.0 * frame.region.size_m[0] * frame.shape[0] / in_force_m_s
@@ -334,5 +335,5 @@ def number(parameter: Parameter, unit: str = "") -> float:
     try:
         found = float(str(parameter.value))
         return convert(found, parameter.unit or unit, unit) if unit else found
-    except ValueError as error:  # an AfspmError of units is one
+    except ValueError as error:  # an AfspmError of units is a ValueError
         raise Failed(f"a number in {unit or 'its unit'} as the value of {parameter.name}", str(error)) from error

@@ -46,8 +46,8 @@ class Support:
     @property
     def controller(self) -> str:
         """The controller's name and version, as reported."""
-        told = self.parameters.get(names.CONTROLLER)
-        return "" if told is None else str(told.value)
+        reported = self.parameters.get(names.CONTROLLER)
+        return "" if reported is None else str(reported.value)
 
 
 def find_out(client: CheckClient, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:

@@ -47,7 +47,7 @@ def impostor(bench: ClientBench) -> None:
 
 def _require_silence(run: ScriptedRun, which: str) -> None:
     run.client.begin("request", number=7)
-    # a busy computer may take longer to start a program than silence is listened to
+    # on a busy computer the start of a program may take longer than the wait for silence
     has_come = run.scheduler.pump(lambda: run.scheduler.connections > 0, ANSWER_S)
     expect(has_come, "a connection to the scheduler's address", f"none in {ANSWER_S:g} s{run.client.last_words}")
     run.scheduler.serve(_LISTENED_S)

@@ -77,7 +77,7 @@ def stdin(bench: ClientBench) -> None:
         await_beat(run.beats, run.scheduler.pump)
         run.client.close_stdin()
         require_end(run.client, run.beats, run.scheduler.pump, (ExitCode.DONE, ExitCode.ORPHAN))
-    with bench.scripted(ready=False) as run:  # without a scheduler, too
+    with bench.scripted(ready=False) as run:  # it must also end before it is connected
         run.scheduler.shut()
         run.scheduler.open()
         run.client.close_stdin()

@@ -47,19 +47,19 @@ def require_scans(experiment: JudgedExperiment, answer: Answer, asked: Plain) ->
         expect(near(scan["angle_deg"], asked["angle_deg"], 1e-3, 1e-3), f"{asked['angle_deg']}°", scan["angle_deg"])
 
 
-def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, object]) -> None:
+def _require_published(experiment: JudgedExperiment, message: str, reported: dict[str, object]) -> None:
     # a client need not report which packet was its own measurement, so the fields are compared
-    told = {"message": message, **told}
+    reported = {"message": message, **reported}
     wrong: list[Failed] = []
 
     def is_there() -> bool:
         wrong.clear()
         for packet in experiment.packets(message):
             of_packet = {"envelope": packet.envelope, "timestamp_ns": packet.time_ns}
-            if any(told.get(name, value) not in (value, None) for name, value in of_packet.items()):
+            if any(reported.get(name, value) not in (value, None) for name, value in of_packet.items()):
                 continue
             try:
-                compare({**told, **of_packet}, packet)
+                compare({**reported, **of_packet}, packet)
             except Failed as failure:
                 wrong.append(failure)
             else:
@@ -67,7 +67,7 @@ def _require_published(experiment: JudgedExperiment, message: str, told: dict[st
         return False
 
     if not experiment.pump(is_there, 5.0):
-        raise wrong[-1] if wrong else Failed(f"a {message} that was published", str(told))
+        raise wrong[-1] if wrong else Failed(f"a {message} that was published", str(reported))
 
 
 @client_check(
@@ -132,11 +132,13 @@ def spectrum(bench: ClientBench) -> None:
         for position in ([0.1e-6, 0.2e-6], [-0.3e-6, 0.0]):
             answer = client.program.do("spectrum", position_m=position, kind="IV", timeout_s=SCAN_S)
             expect(answer.ok and answer.get("spectra"), "a spectrum", str(answer))
-            for told in answer["spectra"]:
-                _require_published(experiment, "Spec1d", told)
-                came = told["position_m"]
+            for reported in answer["spectra"]:
+                _require_published(experiment, "Spec1d", reported)
+                came = reported["position_m"]
                 right = all(near(a, b, 1e-3, 1e-10) for a, b in zip(came, position, strict=True))
-                expect(right and told["kind"] == "IV", f"an IV curve at {position}", f"{told['kind']} at {came}")
+                expect(
+                    right and reported["kind"] == "IV", f"an IV curve at {position}", f"{reported['kind']} at {came}"
+                )
 
 
 @client_check(

@@ -58,7 +58,7 @@ def marker(bench: ClientBench) -> None:
 @client_check(
     "replay/late-joiner",
     "What was published before the client came arrives once, oldest first, only what it asked for, "
-    "and nobody else gets it again.",
+    "and no other subscriber gets it again.",
     "Deliver the packets under your marker's topic before those that follow; compare envelopes with your prefixes.",
 )
 def late_joiner(bench: ClientBench) -> None:

@@ -39,8 +39,8 @@ def repeat(bench: ClientBench) -> None:
     with bench.scripted(request_timeout_s=_TRY_S, request_retries=_RETRIES) as run:
         run.scheduler.reply = lambda request: []
         answer = ask(run, ControlRequest.RELEASE_CTRL)
-        told = (answer.get("response"), answer.get("detail"))
-        expect(told == ("REP_NO_RESPONSE", 2), "REP_NO_RESPONSE with the detail 2", str(answer))
+        reply = (answer.get("response"), answer.get("detail"))
+        expect(reply == ("REP_NO_RESPONSE", 2), "REP_NO_RESPONSE with the detail 2", str(answer))
         ids = [request.id for request in run.scheduler.requests]
         expect(len(set(ids)) == 1, "repetitions with the id of the first", f"the ids {sorted(set(ids))}")
         right = f"the request and {_RETRIES} repetitions, and perhaps some after a new connection"
@@ -99,7 +99,7 @@ def _executed(experiment: JudgedExperiment) -> int:
         return sum((entry.who, entry.request) == (who, ControlRequest.PARAM) for log in logs for entry in log.entries)
 
     known = logged(JUDGE)
-    experiment.scope.get(_PARAMETER)  # the log is in order: once this is in it, all before it is
+    experiment.scope.get(_PARAMETER)  # the log is in order: with this entry, all earlier ones are in it
     if not experiment.pump(lambda: logged(JUDGE) > known, _LOGGED_S):
         raise Lost(f"the scheduler's log of requests did not come within {_LOGGED_S:g} s")
     return logged(CLIENT)
@@ -180,7 +180,7 @@ def refusals(bench: ClientBench) -> None:
             ),
         ]
         for answer, response in refused:
-            told = answer.get("response")
-            expect(not answer.ok and told == response, f"the refusal {response}", str(answer))
+            reply = answer.get("response")
+            expect(not answer.ok and reply == response, f"the refusal {response}", str(answer))
             expect(answer.get("reason"), f"the reason of {response}", str(answer))
         program.succeed("release_control")

@@ -36,8 +36,8 @@ def bytes_in(answer: Answer, name: str) -> bytes:
 
 @client_check(
     "wire/decode",
-    "Every message of `proto/golden.json` is decoded, and says what it should.",
-    "Compile `proto/` anew. Keep presence: a zero that is set is not one that is missing.",
+    "Every message of `proto/golden.json` is decoded to the right fields.",
+    "Compile `proto/` again. Keep presence: a zero that is set is not one that is missing.",
 )
 def decode(bench: ClientBench) -> None:
     with bench.scripted() as run:
@@ -53,11 +53,11 @@ def _require_fields(entry: Plain, answer: Answer) -> None:
     kind = message_type(entry["type"])
     right = kind.FromString(bytes.fromhex(entry["hex"]))
     try:
-        told = json_format.ParseDict(answer["fields"], kind())
+        decoded = json_format.ParseDict(answer["fields"], kind())
     except (json_format.ParseError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise Failed(f"the fields of {entry['name']} ({entry['type']})", f"{answer} ({error})") from None
-    # as dictionaries: JSON as some languages write it has no negative zero, which the bytes then tell
-    same = json_format.MessageToDict(told) == json_format.MessageToDict(right)
+    # as dictionaries: the JSON of some languages has no negative zero; the comparison of bytes finds that
+    same = json_format.MessageToDict(decoded) == json_format.MessageToDict(right)
     expect(same, f"{entry['name']} with the fields {entry['fields']}", str(answer.get("fields")))
 
 
@@ -137,8 +137,8 @@ def _answered(run: ScriptedRun, code: int, payload: bytes, reason: str, detail: 
     expect(answer.ok == (code == 0), f"ok = {str(code == 0).lower()} with {name}", str(answer))
     expect(bytes_in(answer, "object") == payload, f"the object {in_base64(payload)!r} with {name}", str(answer))
     if code:
-        told = (answer.get("reason"), answer.get("detail"))
-        expect(told == (reason, detail), f"the reason {reason!r} and the detail {detail} with {name}", str(answer))
+        reply = (answer.get("reason"), answer.get("detail"))
+        expect(reply == (reason, detail), f"the reason {reason!r} and the detail {detail} with {name}", str(answer))
 
 
 def response_name(code: int) -> str | int:
@@ -164,7 +164,7 @@ def packets(bench: ClientBench) -> None:
             run.scheduler.publish(*frames)
         for envelope, frames in reversed(sent.items()):
             answer = run.client.succeed("wait", prefix=envelope, timeout_s=_PACKET_S)
-            if answer.get("envelope") != envelope:  # of a longer one that begins the same
+            if answer.get("envelope") != envelope:  # ZeroMQ's prefix match also delivers longer envelopes
                 answer = run.client.succeed("wait", prefix=envelope, timeout_s=_PACKET_S)
             compare(answer, decode_packet(frames))
 
@@ -200,5 +200,5 @@ def bad_packets(bench: ClientBench) -> None:
         compare(run.client.succeed("wait", prefix="Scan2d_good", timeout_s=_PACKET_S), Packet(
             "Scan2d_good", payload, _FIRST_NS + 2_000_000
         ))  # fmt: skip
-        told = run.client.succeed("state").get("scope_state")
-        expect(told == "SS_SPEC", "the scope state SS_SPEC, which came after bad ones", str(told))
+        scope_state = run.client.succeed("state").get("scope_state")
+        expect(scope_state == "SS_SPEC", "the scope state SS_SPEC, which came after bad ones", str(scope_state))

@@ -75,9 +75,9 @@ def _require_set(kit: CheckMeasurements, name: str) -> None:
         step = _STEPS.get(name, ParameterStep())
     wanted, response = _set_near(kit, name, now, step, unit)
     kit.support.settable[name] = True
-    _require_told(name, value_in(response, name), wanted, unit, "the answer")
+    _require_reported(name, value_in(response, name), wanted, unit, "the answer")
     client.settled(client.observations.mark())
-    _require_told(name, client.get(name), wanted, unit, "the value read back")
+    _require_reported(name, client.get(name), wanted, unit, "the value read back")
     if unit in _SMALLER:
         _require_other_unit(kit, name, now, unit)
 
@@ -104,14 +104,18 @@ def _require_other_unit(kit: CheckMeasurements, name: str, value: float, unit: s
     response = kit.client.set(name, text, other)
     expect(response.ok, f"REP_SUCCESS to {name} = {text} {other}", answer_in_words(response))
     kit.client.settled(kit.client.observations.mark())
-    _require_told(name, kit.client.get(name), value, unit, f"the value read back after setting {text} {other}")
-    _require_told(name, kit.client.get(name, other), value, unit, f"the value read back in {other}")
+    _require_reported(name, kit.client.get(name), value, unit, f"the value read back after setting {text} {other}")
+    _require_reported(name, kit.client.get(name, other), value, unit, f"the value read back in {other}")
 
 
-def _require_told(name: str, told: Parameter, wanted: float, unit: str, where: str) -> None:
-    came = number(told, unit) if unit else number(told)
+def _require_reported(name: str, reported: Parameter, wanted: float, unit: str, where: str) -> None:
+    came = number(reported, unit) if unit else number(reported)
     alike = near(came, wanted, absolute=1e-12 if unit == "m" else 1e-6 if unit == "deg" else 0.0)
-    expect(alike, f"{name} = {wanted:.6g} {unit}".rstrip() + f" as {where}", f"{told.value} {told.unit or ''}".rstrip())
+    expect(
+        alike,
+        f"{name} = {wanted:.6g} {unit}".rstrip() + f" as {where}",
+        f"{reported.value} {reported.unit or ''}".rstrip(),
+    )
 
 
 def _written(value: float, name: str) -> str:

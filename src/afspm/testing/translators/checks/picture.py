@@ -45,7 +45,7 @@ def ideas(angle_rad: float) -> dict[str, Idea]:
         return replace(picture, region=replace(picture.region, angle_rad=2 * angle_rad - picture.region.angle_rad))
 
     found: dict[str, Idea] = {
-        "as told": lambda picture: picture,
+        "as reported": lambda picture: picture,
         "with x mirrored": lambda picture: replace(picture, values=picture.values[:, ::-1]),
         "with y mirrored": lambda picture: replace(picture, values=picture.values[::-1]),
         "with x and y mirrored": lambda picture: replace(picture, values=picture.values[::-1, ::-1]),
@@ -108,7 +108,7 @@ def _correlation(larger: ScanPicture, detail: Array, x_m: Array, y_m: Array) -> 
 
 
 def _at(picture: ScanPicture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np.bool_]]:
-    # bilinear
+    # bilinear; the mask marks positions inside the picture
     region, (rows, columns) = picture.region, picture.values.shape
     cos, sin = np.cos(region.angle_rad), np.sin(region.angle_rad)
     right, up = x_m - region.center_m[0], y_m - region.center_m[1]
@@ -150,16 +150,16 @@ def picture(kit: CheckMeasurements) -> None:
         raise Failed("the same channels in all scans", "no channel that all have")
     best = max(found, key=lambda likeness: max(likeness.values()))
     name, likeness = best_of(best)
-    as_told = best["as told"]
+    as_reported = best["as reported"]
     if likeness < LIKE:
         raise Skipped(f"no structure is seen in all scans (correlation {likeness:.2f}): noise shows no coordinates")
-    if as_told < likeness - CLEARLY:
+    if as_reported < likeness - CLEARLY:
         raise Failed(
             "details that fit into a larger scan at their position and angle",
-            f"a correlation of {as_told:.2f}, and of {likeness:.2f} {name}",
+            f"a correlation of {as_reported:.2f}, and of {likeness:.2f} {name}",
         )
-    if as_told < LIKE:
-        raise Skipped(f"no structure is seen clearly in all scans (correlation {as_told:.2f})")
+    if as_reported < LIKE:
+        raise Skipped(f"no structure is seen clearly in all scans (correlation {as_reported:.2f})")
 
 
 def _common(larger: Taken, details: list[Taken]) -> list[str]:

@@ -136,7 +136,7 @@ def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str
         raise Skipped(f"the {what} has no time")
     begin_s, free_s = taken.time_s(begun), taken.time_s(ScopeState.FREE)
     lasted_s, at_s = free_s - begin_s, time_ns / 1e9 - begin_s
-    # a controller may take its time to save it: what is free late did not end late
+    # a controller may take long to save a scan, so SS_FREE does not give the time of its end
     least_s = 0.5 * min(lasted_s, taken.expected_s or lasted_s) - CLOCK_S
     if least_s <= at_s <= lasted_s + CLOCK_S:
         return
@@ -177,7 +177,7 @@ def again(kit: CheckMeasurements) -> None:
         old = next(one for one in first.scans if one.channel == scan.channel)
         if scan.filename:
             expect(scan.filename != old.filename, f"a new file for {scan.channel!r}", f"{old.filename} again")
-        # a detector that is off gives the same zeros for ever
+        # a detector that is switched off gives constant zeros
         if np.ptp(old.values) > 0:
             alike = old.values.shape == scan.values.shape and np.array_equal(old.values, scan.values)
             same = alike and old.time_ns == scan.time_ns

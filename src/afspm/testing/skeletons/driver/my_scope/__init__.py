@@ -26,7 +26,7 @@ class MyScope(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    simulated = True  # take this out for a real microscope: its time is real, and its tip can break
+    simulated = True  # remove this line for a real microscope: its time is real, and its tip can break
 
     def __init__(self, *, address: str = "127.0.0.1:5000", **settings: Any) -> None:
         super().__init__(**settings)
