@@ -12,7 +12,7 @@ BAD = 0.0
 VERDICT_MESSAGE = "SpatialROIWithScoreList"
 _SAME_SCAN_NS = 1_000_000_000  # the channels of a scan get their times one after the other
 _NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)})
-"""Problems that say nothing about the scan before them: where the sample is, and whether the controller answers."""
+"""Problems without a verdict on the previous scan: they concern the sample's position or the controller."""
 
 
 def read_verdict(message: Any) -> tuple[int, float] | None:

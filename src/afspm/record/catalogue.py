@@ -26,7 +26,7 @@ from afspm.wire.messages import CONTROL_STATE, DRIFT_RESCAN, JOURNAL
 INDEX_FILE: Final = "runs.sqlite"
 _FORMAT: Final = 2
 _WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
-"""Files of a run by which it is seen that something has changed."""
+"""Files of a run whose change shows that the run has changed."""
 _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
 
 
@@ -77,7 +77,7 @@ class RunSummary:
 
 
 FIELDS: Final = tuple(RunSummary("", "").texts())
-"""What a word may be looked for in, as `field:word`."""
+"""The fields that a search may name, as `field:word`."""
 
 
 def find_runs(
@@ -137,7 +137,7 @@ def _up_to_date(root: Path) -> list[RunSummary]:
         known = {folder: (stamp, about) for folder, stamp, about in index.execute("SELECT * FROM runs")}
         read: list[tuple[RunSummary, str]] = []
         for path in _folders(root):
-            # looked at before it is read: what is recorded meanwhile is then read the next time
+            # taken before the run is read: packets recorded meanwhile are then read next time
             folder, stamp = path.relative_to(root).as_posix(), _stamp(path)
             known_stamp, about = known.get(folder, ("", ""))
             is_known = known_stamp == stamp

@@ -22,7 +22,7 @@ from afspm.storage.atomic import replace_file
 
 PAGE_FILE: Final = "index.html"
 _PICTURES: Final = 4
-"""So many scans of a run are shown, spread over it."""
+"""The number of shown scans of a run, evenly selected."""
 _ABOUT: Final = ("sample", "person", "project")
 _REPORT: Final = "report.html"
 _CSS: Final = """

@@ -17,7 +17,7 @@ from afspm.basics.errors import FileError
 JOURNAL_FILE = "journal.sqlite"
 FORMAT = "afspm record 1"
 SCHEDULER = ""
-"""The source of what the scheduler publishes; that of others is their address."""
+"""The source of the scheduler's packets; other publishers are recorded by address."""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -99,7 +99,7 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
         except sqlite3.OperationalError as error:
             if "unable to open" not in str(error) and "readonly" not in str(error):
                 raise
-            return _checked_copy(path)  # what is beside it can't be made there
+            return _checked_copy(path)  # SQLite can't create its files beside the journal there
     except _DAMAGE as error:
         raise damaged(path, error) from error
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", ScanRow, SpectrumRow)
 Row = tuple[Any, ...]
-"""Of a table in SQLite."""
+"""A row of a table in SQLite."""
 Query = Callable[[str], list[Row]]
 
 _PUBLISHED = {

@@ -20,7 +20,7 @@ from afspm.record.running_scan import DoneScan, RunningScan
 MOST_MEASURED = 100_000
 MOST_TARGETS = 1_000
 SOON_NS = 1_000_000_000
-COMPARED = 5  # earlier scans of which the median predicts the duration
+COMPARED = 5  # earlier scans, whose median duration is the prediction
 K = TypeVar("K")
 V = TypeVar("V")
 

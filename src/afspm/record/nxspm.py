@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import h5py
 
 _VERSION: Final = "v2024.02"
-"""Of the NeXus definitions."""
+"""The version of the NeXus definitions."""
 _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
 
 

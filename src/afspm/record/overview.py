@@ -70,7 +70,7 @@ OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 """Conditions after which a process reports nothing more."""
 FREE = None
 ROUTINE = "normal at the start: the first scan is taken in both directions, which gives the velocity of the drift"
-"""Why a problem that is flagged in the normal course of a run is none."""
+"""The explanation of a routine problem."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.storage.formats.content import FileContent
 
 Query = Callable[[str, Sequence[object]], list[Row]]
-"""Asks the journal; raises FileError where it is damaged."""
+"""Runs a query on the journal; raises FileError where it is damaged."""
 
 _AT_ONCE = 500
 _FILES_KEPT = 4

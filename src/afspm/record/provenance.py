@@ -14,7 +14,7 @@ from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeS
 from afspm.model.drift_mapping import drift_knowledge
 
 _BACK = 20
-"""So many states are looked back through for the one in which a measurement began."""
+"""The number of earlier states that are searched for the start of a measurement."""
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ Image = TypeVar("Image", Scan, ScanLines)
 
 _log = logging.getLogger("afspm.record")
 NOTE = "note"
-"""The kind of a journal entry that is a note."""
+"""The kind of journal entries for notes."""
 _ALL_OF_THEM = (OSError, sqlite3.OperationalError)
 """Errors of the disk, which the next write would meet, too."""
 _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM processes WHERE name = ? ORDER BY rowid DESC"

@@ -200,7 +200,7 @@ _COLUMNS = {
     "translation_m": ("x_m", "y_m"),
     "rate_m_s": ("rate_x_m_s", "rate_y_m_s"),
 }
-"""The columns that some attributes are taken apart into."""
+"""Attributes that are split into several columns."""
 
 
 def _names(kind: type) -> list[str]:
@@ -249,7 +249,7 @@ def _array(name: str, values: list[object]) -> NDArray[Any]:
 
 MOST_ROWS: Final = 60
 _ENDS: Final = 10
-"""Rows that are shown at both ends of a longer table."""
+"""The number of rows shown at both ends of a long table."""
 _UNITS: Final = {"_m_s": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
 _FIRST: Final = ("number", "key")
 _CELL: Final = 'style="text-align:left;white-space:nowrap;max-width:18em;overflow:hidden;text-overflow:ellipsis"'

@@ -34,7 +34,7 @@ class Timeline:
     def __init__(self, most: int = MOST_SPANS) -> None:
         self.spans: deque[Span] = deque(maxlen=most)
         self.changed_ns: int | None = None
-        """When it changed last, to something or to nothing."""
+        """The time of the last change, to a span or to a gap."""
 
     @property
     def now(self) -> Span | None:

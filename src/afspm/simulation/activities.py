@@ -17,7 +17,7 @@ from afspm.simulation.scanning import Course, SimulatedScan
 Channels = dict[str, tuple[str, Array]]
 """Channel -> (unit, values [y, x], both ascending)."""
 RETRACE = " Retrace"
-"""What the name of a channel ends with that is recorded on the way back."""
+"""Suffix of the names of retrace channels."""
 
 
 class ScanValues(Protocol):

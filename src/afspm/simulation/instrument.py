@@ -38,7 +38,7 @@ from afspm.simulation.world import World
 
 Doing = ScanActivity | SpectrumActivity | Occupied
 Note = Callable[[float, str, Mapping[str, object]], None]
-"""Takes the time of an event, its name, and facts of it."""
+"""Called with the time of an event, its name, and its facts."""
 _MOST_AVERAGED = 32  # more sweeps reduce the noise no further
 _FASTEST_DRIFT_M_S = 1e-6
 _FEW = (2, 2)  # pixels: enough to find the channels

@@ -88,7 +88,7 @@ def attraction_hz(loop: Loop, tip: TipShape, sharp_m: float, gap_m: Array, bias_
 
 Channels = dict[str, tuple[str, Array]]
 TipTimes = Sequence[tuple[float, TipShape]]
-"""(since when, tip), the first not later than the scan's start."""
+"""(start time, tip), the first not later than the scan's start."""
 
 _POINTS = 1_400_000  # of the grid, with automatic oversampling
 _MOST_POINTS = 4_000_000  # of the grid in any case

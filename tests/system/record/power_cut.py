@@ -38,11 +38,11 @@ from afspm.wire import KILL, decode_packet
 CLOCK = ExperimentClock.real()
 DEADLINE_S = 60.0
 LOSS_S = 1.5
-"""What was published so short a time before a power cut may be lost. It is a tenth of a second that is promised; the
-others are for a busy machine. A sync that was under way adds its time: it copies whole files here."""
+"""Packets published in this time before a power cut may be lost. A tenth of a second is guaranteed; the
+rest is for a busy machine. A running sync adds its time: it copies whole files here."""
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 LONGEST_LIFE_S = 2.5
-"""From the first scan of a life to the cut; of every fourth, from its first line."""
+"""From the first scan of a life to the cut; in every fourth life, from its first line."""
 COMMAND = (sys.executable, "-m", "afspm", "run", "--no-report")
 
 EXPERIMENT = """

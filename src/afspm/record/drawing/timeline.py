@@ -16,7 +16,7 @@ MOST_PICTURES = 14
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 _DAY_S = _STEPS_S[-1]
 _EDGES = ((0.0, 3.0, 0), (97.0, 100.0, -100))
-"""Percent of the row in which the text of a tick does not lie about the tick: from, to, and its shift."""
+"""(from, to, shift) in percent: near the ends of a row the label of a tick is shifted inwards."""
 
 CSS = """
 .lanes{display:grid;gap:3px}

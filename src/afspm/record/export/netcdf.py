@@ -14,7 +14,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 from afspm.storage.formats.netcdf import Attributes, Variable, encoded
 
 _RENAMED = {"mode": "control_mode", "filename": "controller_file"}
-"""scipy's reader, which xarray uses, has attributes of its own by these names."""
+"""scipy's reader, which xarray uses, has its own attributes with these names."""
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:

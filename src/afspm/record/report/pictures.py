@@ -27,7 +27,7 @@ LARGEST_PX = 192
 FIGURE_PX = 1400
 _QUALITY = 80
 NIGHT, OFFSET = "night.png", "drift_offset.png"
-"""As components draw them."""
+"""File names of figures drawn by components."""
 OWN_NIGHT, OWN_OFFSET = "report.png", "report_drift.png"
 _TOPOGRAPHY = ("height", "topo", "z ", "z")
 _log = logging.getLogger("afspm.report")

@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
 _AGAIN_S = 1.0
-"""After an error that nobody foresaw, `tick` is called again after so long, experiment time."""
+"""Delay of the next `tick` after an unexpected error, experiment time."""
 _TAKEN = {100, 10013, 10048} if sys.platform == "win32" else {errno.EADDRINUSE}
-"""The errors of a port that another program has. On Windows those of its C library, which ZeroMQ hands on, and of its
-sockets: WSAEACCES, where the other has it for itself alone, and WSAEADDRINUSE."""
+"""Error numbers of a port in use. On Windows they come from the C library, as ZeroMQ reports them, and from its
+sockets: WSAEACCES, if the other program uses the port exclusively, and WSAEADDRINUSE."""
 _LOOKS_S = 0.2
-"""While a button can be pressed, its file is looked for so often, real time."""
+"""Interval between checks of a button's file, real time."""
 FAREWELL_S = 0.5
-"""So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
+"""Real seconds that a controller stays after the end of the experiment, so that the translator can stop the tip."""
 
 
 class Crashed(AfspmError):
@@ -96,17 +96,17 @@ class Emulator(ABC):
 
     vendor: ClassVar[str]
     usual: ClassVar[PlainMapping] = {}
-    """Settings by which it is found where the vendor's own controller is: for `afspm emulate` alone, and on request."""
+    """Settings that put it at the address of the vendor's own controller: for `afspm emulate` alone, on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
-    """The faults of the maker's program, with the effect of each; `all_faults` has those of all emulators, too."""
+    """The faults of the maker's program, with the effect of each; `all_faults` adds the common ones."""
 
     modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
-    """Of the simulated feedback: those that the controller has."""
+    """The modes of the simulated feedback that the controller supports."""
 
     emulated: ClassVar[bool] = True
-    """An experiment with it is a simulated one: its clock may go at another speed than the real one."""
+    """An experiment with it counts as simulated: its clock may run at another speed."""
     listens: ClassVar[tuple[str, ...]] = ()
-    """It takes no part in the experiment but to end with it."""
+    """It receives only the end of the experiment."""
 
     clock: Clock
     log: logging.Logger

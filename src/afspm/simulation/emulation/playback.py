@@ -162,7 +162,7 @@ def _line_before(cursor: _Cursor, index: int) -> int:
 
 
 def _compared(asked: bytes | None) -> bytes:
-    # without the ids by which a client numbers its requests
+    # without the ids that a client gives its requests
     found = _json(asked or b"")
     if found is None or not any(key in found for key in _IDS):
         return asked or b""

@@ -33,7 +33,7 @@ SCRIPT_FAULTS: Final = {
 }
 
 Client = Hashable
-"""A client, as its wire tells it from others."""
+"""The wire's identification of a client."""
 OnRequest = Callable[[Client, bytes], None]
 
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Table = dict[str, object]
-"""Settings as the experiment file has them."""
+"""Settings in the form of the experiment file."""
 Rows = dict[str, Table]
 
 FAULT_KINDS: Final[Mapping[str, str]] = {

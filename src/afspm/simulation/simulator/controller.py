@@ -29,7 +29,7 @@ from afspm.translator.state import Kept
 
 LISTED_RESULTS = 16
 ADJUSTED: Final = (names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.TIP_BIAS_VOLTAGE)
-"""What holds from the next line on, when it is set during a scan."""
+"""Parameters that take effect from the next line on when set during a scan."""
 
 _STATES: Final = {
     "": ScopeState.FREE,

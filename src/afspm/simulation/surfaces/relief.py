@@ -99,7 +99,7 @@ class Sites:
             math.floor((y_m.min() - margin_m) / spacing_m), math.floor((y_m.max() + margin_m) / spacing_m) + 1
         )
         column, row, copy = (a.ravel() for a in np.meshgrid(i, j, np.arange(3), indexing="ij"))
-        # 0, 1, 2, 3 with the probabilities of a Poisson number of mean 1 (what is above 3 counted as 3)
+        # 0, 1, 2, 3 with the probabilities of a Poisson number of mean 1 (larger ones counted as 3)
         count = np.searchsorted([0.3679, 0.7358, 0.9197], chance.uniform(seed, column, row))
         there = copy < count
         column, row, copy = column[there], row[there], copy[there]

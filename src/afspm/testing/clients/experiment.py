@@ -72,7 +72,7 @@ class Security(Enum):
 
     EVERYWHERE = f'[security]\nkeys = "{KEYS}"\n'
     REQUESTS = ""
-    """As every run on one computer is by default: with keys that are made for it. Packets are plain."""
+    """The default on one computer: requests are encrypted with keys generated for the run, packets are plain."""
     NONE = "[security]\ninsecure = true\n"
 
 

@@ -20,7 +20,7 @@ from afspm.basics.plain_data import Plain
 from afspm.testing.conformance import Failed, expect
 
 ANSWER_S = 30.0
-"""Longest time for an answer, beside what the step itself may wait."""
+"""Longest time for an answer, in addition to the step's own wait."""
 _LAST_WORDS = 3
 
 

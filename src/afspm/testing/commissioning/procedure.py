@@ -149,7 +149,7 @@ def _report(
     return InstrumentReport(
         maker=session.maker or "unknown",
         driver=session.translator,
-        release=support.controller or "not told",
+        release=support.controller or "not reported",
         tried_on=tried_on,
         evidence="afspm commission",
         began=checks.began,

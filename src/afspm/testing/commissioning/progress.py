@@ -11,7 +11,7 @@ from afspm.testing.conformance import Check, CheckOutcome, CheckResult
 _MISMATCH: Final = "mismatch"
 """The word for a failed step in reports and in the public matrix."""
 _GOES_ON = (CheckOutcome.PASSED, CheckOutcome.SKIPPED, CheckOutcome.UNSUPPORTED)
-"""What is not supported, or not shown at the panel, keeps nothing else from being tried."""
+"""An unsupported step, or one not shown at the panel, does not block others."""
 
 
 _WORSE = (

@@ -25,7 +25,7 @@ READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
 )  # fmt: skip
 OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
 _NOTICED_S: Final = 5.0
-"""Seconds between the end of a scan at the panel and the one that afspm publishes: reaction, saving, polling."""
+"""Seconds between the end of a scan at the panel and its publication: reaction, saving, polling."""
 _LOST_S: Final = 60.0
 _STEPS: list[CommissioningStep] = []
 _FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)

@@ -12,7 +12,7 @@ _NAMES = {
     "component": ("my_component", "MyComponent"),
     "experiment": ("my_experiment", "MyExperiment"),
 }
-"""Of each kind, the module and the class that are called otherwise."""
+"""Module and class of each kind, which are renamed in the copy."""
 _SKIPPED = {"__pycache__", "__init__.pyc"}
 
 

@@ -129,11 +129,11 @@ STARTED_S = 30.0
 ANSWERED_S = 15.0
 """Real seconds until an answer: longer than a scheduler waits for the translator's."""
 NOTICED_S = 10.0
-"""Real seconds until what was asked for is published."""
+"""Real seconds until the effect of a request is published."""
 QUIET_S = 0.2
 """Real seconds without a packet that count as a pause."""
 MOVED_S = 60.0
-"""Experiment seconds that a move may take."""
+"""Longest experiment seconds of a move."""
 
 _STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 
@@ -360,6 +360,6 @@ def value_in(response: Response, name: str) -> Parameter:
         found = wire.decode_parameter(response.payload)
     except WireError as error:
         raise Failed(f"REP_SUCCESS with a ParameterMsg of {name}", f"one that can't be read: {error}") from error
-    expect(found.name == name, f"the value of {name}", f"that of {found.name!r}")
+    expect(found.name == name, f"the value of {name}", f"the value of {found.name!r}")
     expect(found.value is not None, f"REP_SUCCESS with the value of {name} in force", "no value")
     return found

@@ -28,7 +28,7 @@ from afspm.testing.translators.client import CheckClient, Observation, answer_in
 from afspm.testing.translators.support import Support
 
 NEAR = 1e-3
-"""Of a frame's size: closer than that is the same. Half a pixel of the largest frame here is more."""
+"""Tolerance in units of the frame's size: less than half a pixel of the largest frame here."""
 TURN_RAD = math.radians(20.0)
 
 
@@ -112,11 +112,11 @@ def in_words(xy_m: tuple[float, float]) -> str:
 
 
 SCAN_S = 8.0
-"""Experiment seconds that a scan is to last, where its speed can be set: long enough to tell its start from its end."""
+"""Experiment seconds of a scan, where its speed can be set: long enough to distinguish its start from its end."""
 LINE_S = 0.25
-"""Experiment seconds that a line, there and back, is to last at least: no scanner is driven to its limits."""
+"""Least experiment seconds of a line, trace and retrace, far from the limits of any scanner."""
 LONG_REAL_S = 3.0
-"""Real seconds that a scan has to last at least in the middle of which something is asked."""
+"""Least real seconds of a scan during which requests are sent."""
 UNKNOWN_S = 1200.0
 """Experiment seconds after which a scan or spectrum of unknown duration counts as endless."""
 

@@ -38,7 +38,7 @@ from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"
 SPEED = 20.0
-"""Experiment seconds in a real second where the microscope is simulated: quick, and slow enough to stop a scan."""
+"""Experiment seconds in a real second of a simulated microscope: quick, but slow enough to stop a scan."""
 _OVERLAY = f"""
 [{NAME}]
 component = true

@@ -36,7 +36,7 @@ def wrong_key(bench: ClientBench) -> None:
 
 @client_check(
     "keys/impostor",
-    "Whoever else listens at the scheduler's address, without its key, is sent nothing.",
+    "Another program that listens at the scheduler's address, without its key, receives nothing.",
     "Set the server key of the address's owner before you connect.",
 )
 def impostor(bench: ClientBench) -> None:

@@ -12,10 +12,10 @@ from afspm.testing.conformance import expect
 from afspm.wire import BEAT, KILL
 
 ENDED_S = 4.0
-"""Twice what the page gives a program: the computer may be busy."""
+"""Twice the documented limit, for a busy computer."""
 _WATCHED_S = 5.0
 _MOST_BEATS_APART = 4.0
-"""Periods: three missed ones count as dead, and the computer may be busy."""
+"""In periods: three missed beats count as dead; one more for a busy computer."""
 
 
 def await_beat(beats: BeatRecorder, pump: Pump) -> None:

@@ -16,7 +16,7 @@ from afspm.testing.conformance import Failed, expect, near
 
 SCAN_S = 120.0
 CHANNELS = 2
-"""The least that the simulated microscope records."""
+"""The smallest number of channels of the simulated microscope."""
 
 
 def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s: float = SCAN_S) -> Plain:

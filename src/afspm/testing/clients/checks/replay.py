@@ -59,7 +59,7 @@ def marker(bench: ClientBench) -> None:
     "replay/late-joiner",
     "What was published before the client came arrives once, oldest first, only what it asked for, "
     "and no other subscriber gets it again.",
-    "Deliver the packets under your marker's topic before those that follow; compare envelopes with your prefixes.",
+    "Deliver the packets under your marker's topic before the following ones; compare envelopes with your prefixes.",
 )
 def late_joiner(bench: ClientBench) -> None:
     with bench.scripted(ready=False, envelopes=("Note",)) as run:
@@ -137,7 +137,7 @@ def reconnect(bench: ClientBench) -> None:
         again = scheduler.pump(lambda: len(scheduler.markers) > 1, 10.0)
         expect(again, "a new marker after the connection was lost", "none in 10 s")
         since_ns, newest_ns = scheduler.markers[-1].since_ns, _FIRST_NS + 2_000_000
-        expect(since_ns == newest_ns, f"a marker that asks for what is newer than {newest_ns}", f"since {since_ns}")
+        expect(since_ns == newest_ns, f"a marker that requests packets newer than {newest_ns}", f"since {since_ns}")
         scheduler.publish(*_notes(4)[0])
         came = _times(run, 2)
         expect(came == [3, 4], "the packets 3, which was missed, and 4", str(came))

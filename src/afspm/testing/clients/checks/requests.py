@@ -19,14 +19,14 @@ from afspm.wire import decode, encode, encode_subject
 REQUESTS = 1000
 _AT_A_TIME = 16
 _LONGEST = 12
-"""Chunks with replies: so many a connection delivers at most, before it is cut."""
+"""The most chunks with replies that a connection delivers before it is cut."""
 _TRY_S, _RETRIES = 0.3, 3
 _CUT_RETRIES = 100
-"""For 30 s: a scheduler that a busy computer gives no processor for 6 s is not the client's fault."""
+"""Retries for 30 s: on a busy computer the scheduler may get no processor for 6 s."""
 _ALL_S = 300.0
 _SEEN_S = 10.0
 _LOGGED_S = 60.0
-"""Of thousands of entries on a busy computer; a count of a part of them would be the client's fault."""
+"""Longest wait for thousands of log entries on a busy computer; an incomplete count would blame the client."""
 _PARAMETER = "scan-speed"
 
 

@@ -64,7 +64,7 @@ def _require_fields(entry: Plain, answer: Answer) -> None:
 @client_check(
     "wire/encode",
     "Every message is encoded to the reference bytes.",
-    "Write fields in the order of their numbers, repeated numbers packed, and only what is present.",
+    "Write fields in the order of their numbers, repeated numbers packed, and only present fields.",
 )
 def encode(bench: ClientBench) -> None:
     with bench.scripted() as run:

@@ -17,7 +17,7 @@ _NUMBERS = {
     "setpoint": names.ZCTRL_SETPOINT,
 }
 _STEP = 1.02
-"""A tip that is not engaged does not mind, and neither would one that is."""
+"""A relative change that is harmless even for an engaged tip."""
 
 
 def in_force(kit: CheckMeasurements) -> Feedback:

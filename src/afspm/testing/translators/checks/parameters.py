@@ -12,7 +12,7 @@ from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.translator_suite import check
 
 _SMALLER = {"m": "nm", "m/s": "nm/s", "V": "mV", "deg": "rad", "A": "pA"}
-"""A peer may give and ask for a value in any unit of its kind."""
+"""Peers may set and read a value in any unit of its kind."""
 _NO_VALUES = ("nan", "inf", "-inf", "abc", "")
 _BAD_UNIT = "kg"
 

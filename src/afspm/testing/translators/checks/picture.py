@@ -19,11 +19,11 @@ from afspm.testing.translators.translator_suite import check
 
 Array = NDArray[np.float64]
 LIKE = 0.6
-"""Correlation from which on two pictures show the same."""
+"""The least correlation of two pictures of the same structure."""
 CLEARLY = 0.1
 _EQUAL = 0.01
 _SHIFTS = (-0.04, -0.02, 0.0, 0.02, 0.04)
-"""Of the larger scan: drift between two scans, and an imperfect scanner."""
+"""In units of the larger scan: drift between two scans, and an imperfect scanner."""
 _INSIDE = 0.6
 
 

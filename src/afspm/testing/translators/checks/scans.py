@@ -60,9 +60,9 @@ def stop_nothing(kit: CheckMeasurements) -> None:
 
 _NEEDS = (names.START_SCAN,)
 CLOCK_S = 2.0
-"""Files have their times in whole seconds, and who wrote them may have done it a moment after the end."""
+"""Files have times in whole seconds, and may be written a moment after the end."""
 _FASTER, _SLOWER, _EDGES_S = 2.5, 5.0, 30.0
-"""A fast way back; turning at the edges; and what a controller does before and after."""
+"""Bounds for a fast retrace, turns at the edges, and work of the controller before and after."""
 
 
 @check("scan/order", "start-scan: SS_SCANNING, the Scan2d of every channel once, and only then SS_FREE", needs=_NEEDS)
