@@ -118,6 +118,7 @@ def _has(texts: Mapping[str, str], words: Sequence[tuple[str, str]]) -> bool:
 
 
 def _was_within(run: RunSummary, since: date | None, until: date | None) -> bool:
+    # a run without publications has no days
     if run.began_ns is None or run.ended_ns is None:
         return since is None and until is None
     starts_ns = None if since is None else _midnight_ns(since)
@@ -143,6 +144,7 @@ def _up_to_date(root: Path) -> list[RunSummary]:
             is_known = known_stamp == stamp
             read.append((_from_json(about) if is_known else replace(_summary(path), folder=folder), stamp))
         with suppress(sqlite3.OperationalError), index:  # a disk that is full or can't be written to costs time alone
+            # rewritten as a whole, so that deleted runs disappear
             index.execute("DELETE FROM runs")
             rows = [(run.folder, stamp, json.dumps(asdict(run))) for run, stamp in read]
             index.executemany("INSERT INTO runs VALUES (?, ?, ?)", rows)
@@ -152,6 +154,7 @@ def _up_to_date(root: Path) -> list[RunSummary]:
 def _opened(root: Path) -> sqlite3.Connection:
     # a damaged index, or one of another version, is rebuilt; where the folder can't be written, the index is in memory
     file = root / INDEX_FILE
+    # the second attempt creates the index again after a damaged one was removed
     for _ in range(2):
         try:
             return _prepared(sqlite3.connect(file))
@@ -167,6 +170,7 @@ def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
         (version,) = index.execute("PRAGMA user_version").fetchone()
         if version not in (0, _FORMAT):
             raise ValueError("of another version")
+        # an index may come with a folder from another person, like a journal
         if not_a_table(index):
             raise ValueError("not made by afspm")
         index.execute("CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT NOT NULL, about TEXT)")

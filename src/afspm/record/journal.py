@@ -97,6 +97,7 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
         try:
             return _checked(read_only(path.resolve()), path)
         except sqlite3.OperationalError as error:
+            # SQLite reports a read-only folder by its text only
             if "unable to open" not in str(error) and "readonly" not in str(error):
                 raise
             return _checked_copy(path)  # SQLite can't create its files beside the journal there
@@ -118,6 +119,7 @@ def measured_file(folder: Path, file: str) -> Path:
 
 def read_only(path: PurePath) -> str:
     """Return the URI that opens an absolute path read-only in SQLite, where a network share is part of the path."""
+    # SQLite refuses a host in a URI, so the share of a network path goes into the path
     scheme, _, place = path.as_uri().partition("//")
     return f"{scheme}{'//' if place.startswith('/') else '////'}{place}?mode=ro"
 
@@ -135,6 +137,7 @@ def not_a_table(connection: sqlite3.Connection) -> str:
 
 def is_damage(error: sqlite3.DatabaseError) -> bool:
     """Return whether an error means a damaged file, and not a full disk."""
+    # SQLite reports damage as a bare DatabaseError; its subclasses report the disk, locks and wrong statements
     return type(error) is sqlite3.DatabaseError
 
 
@@ -173,6 +176,7 @@ def _checked_copy(path: Path) -> sqlite3.Connection:
     except OSError as error:
         raise FileError(f"can't be read, there is no room for a copy: {error}", where=str(path)) from error
     try:
+        # the newest transactions are in the write-ahead log
         for suffix in ("", "-wal"):
             with suppress(FileNotFoundError):
                 shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
@@ -192,6 +196,7 @@ def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Conn
         uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0, factory=kind
     )
     try:
+        # the journal may come from another person: no writes, and no functions called by its schema
         connection.execute("PRAGMA query_only = 1")
         connection.execute("PRAGMA trusted_schema = 0")
         if strange := not_a_table(connection):

@@ -74,6 +74,7 @@ class MeasuredFiles:
         measured_ns = published_ns if first.time_ns is None else first.time_ns
         new: dict[str, Scan] = {}
         for _, scan in taken.channels:
+            # a restarted translator publishes channels again: the first counts
             new.setdefault(scan.channel, scan)
         known = self._find_recorded(new, measured_ns)
         if known is None:
@@ -166,6 +167,7 @@ class MeasuredFiles:
         packet, spectrum = taken.packet, taken.spectrum
         published_ns = packet.time_ns or 0
         time_ns = published_ns if spectrum.time_ns is None else spectrum.time_ns
+        # a restarted translator publishes a spectrum again: it is recorded once
         known = self._journal.execute(
             "SELECT number FROM spectra WHERE time_ns = ? AND filename = ? AND kind = ?",
             (time_ns, spectrum.filename, spectrum.kind),

@@ -81,6 +81,7 @@ def quoted(path: PurePath) -> str:
 def _is_left(folder: Path) -> bool:
     try:
         with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
+            # shared: concurrent queries must not look like a running supervisor to each other
             lock(file, shared=True)
     except OSError:
         return False

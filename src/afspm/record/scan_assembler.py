@@ -105,6 +105,7 @@ class ScanAssembler:
     def status(self, status: ScopeStatus, time_ns: int) -> list[Assembled]:
         """Process a new state of the microscope."""
         before, self._state = self._state, status.state
+        # a scan with channels is complete: translators publish none of an interrupted scan
         if status.state is ScopeState.INTERRUPTED and before is ScopeState.SCANNING and not self._open.channels:
             interrupted, self._open = self._open, AssembledScan()
             interrupted.interrupted_ns = time_ns

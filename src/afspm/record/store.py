@@ -140,6 +140,7 @@ class RecordStore:
         """Sync the record to the disk, so that it survives a power cut. Raises OSError."""
         with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
             sync_file(file.fileno())
+        # a new file survives a power cut only if its folder is synced, too
         sync_folder(self._folder)
 
     def settle(self) -> None:
@@ -159,6 +160,7 @@ class RecordStore:
         self._journal.execute("BEGIN IMMEDIATE")
         try:
             yield
+            # files first: the journal never names a file that a power cut could remove
             self._files.finish()
             self._journal.execute("COMMIT")
         except BaseException:  # only to roll back: every error is raised again, also KeyboardInterrupt
@@ -169,6 +171,7 @@ class RecordStore:
             raise
 
     def _take(self, packet: Packet, source: str) -> None:
+        # packets come again after a restart, from the log and from the scheduler's cache
         if self.has(packet):
             return
         message, thing = _read(packet)
@@ -202,6 +205,7 @@ class RecordStore:
 
     def _write(self, taken: Iterable[Assembled]) -> None:
         for one in taken:
+            # a measurement that fails leaves none of its rows in the transaction
             self._journal.execute("SAVEPOINT measured")
             try:
                 self._files.write(one)

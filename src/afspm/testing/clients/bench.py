@@ -81,6 +81,7 @@ class ClientBench:
         try:
             remark: str | None = check.do(self)
             return remark
+        # the conformance program can't be started: no check is possible
         except ConfigError:
             raise
         except AfspmError as error:  # the judge's own request failed, with this client beside it
@@ -146,7 +147,7 @@ class ClientBench:
 
     @contextmanager
     def second_publisher(self) -> Iterator[tuple[str, Callable[..., object]]]:
-        """Bind an unencrypted publisher of the judge; yield its address and a function that sends frames."""
+        """Bind a PUB socket of the judge, without replay; yield its address and a function that sends frames."""
         network = Network(keys.load(self._keys, JUDGE))
         try:
             socket = network.socket(zmq.PUB)

@@ -146,6 +146,7 @@ class JudgedExperiment:
         """Process publications until `done()`; return False on a timeout."""
         try:
             return self._link.wait(done, self._link.until(within_s))
+        # the link is over, but the client still has to end: its threads notify `_woken`
         except ExperimentEnded:
             with self._woken:
                 return self._woken.wait_for(done, within_s)

@@ -72,6 +72,7 @@ class ClientProgram:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
+                # its own process group, so that `kill` reaches its children
                 start_new_session=sys.platform != "win32",
             )
         except (OSError, ValueError) as error:
@@ -200,6 +201,7 @@ class ClientProgram:
             answer = Answer(json.loads(line))
             self._answers[int(answer["id"])] = answer
         except (ValueError, TypeError, KeyError):
+            # kept as evidence for `require_clean_output`
             self._garbage.append(line[:200])
 
     def _note(self, line: str) -> None:

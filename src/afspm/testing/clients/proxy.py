@@ -83,6 +83,7 @@ class CuttingProxy:
                 except OSError:
                     client.close()
                     continue
+                # the timeout is for connecting only
                 server.settimeout(None)
                 with self._lock:
                     self._open |= {client, server}
@@ -107,6 +108,7 @@ class CuttingProxy:
     def _end(self, *sockets: socket.socket) -> None:
         for one in sockets:
             with contextlib.suppress(OSError):
+                # wakes the thread that reads from this socket; close alone does not
                 one.shutdown(socket.SHUT_RDWR)
             one.close()
         self._open -= set(sockets)

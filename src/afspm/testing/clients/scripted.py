@@ -80,10 +80,12 @@ class ScriptedScheduler:
         control, publish, keys = self._bound
         self._network = Network(keys)
         self._router = self._network.socket(zmq.ROUTER)
+        # a client that reconnects replaces its old connection at once
         self._router.setsockopt(zmq.ROUTER_HANDOVER, 1)
         monitor = Monitor(self._network, self._router, ACCEPTED)
         self._network.bind(self._router, control, requests=True)
         self._publisher = self._network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
+        # manual: a marker subscribes to its topic, not to its own bytes; verboser: repeated subscriptions are recorded
         self._publisher.setsockopt(zmq.XPUB_MANUAL, 1)
         self._publisher.setsockopt(zmq.XPUB_VERBOSER, 1)
         self._network.bind(self._publisher, publish)

@@ -54,6 +54,7 @@ class SettingsBefore:
             ordered = sorted(self.parameters, key=lambda name: name in _LAST)
             for name in ordered:
                 self._put_back(client, name, wrong)
+        # listed in the report instead of raised: the results of the checks must not get lost
         except (Lost, Failed) as error:
             wrong.append(str(error))
         return wrong
@@ -146,5 +147,6 @@ def run(
         begun(report)
         with restored(session, report) as kit:
             report.run(checks, kit, done)
+            # after the scans, since some controllers report their version in their files only
             session.support.ask_again(session.client)
     return report

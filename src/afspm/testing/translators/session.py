@@ -217,6 +217,7 @@ def _planned_starts(
         log_level="DEBUG",
     )
     own = next(start.launch for start in starts if start.launch.name == NAME)
+    # the tester runs in this process
     return own, [start for start in starts if start.launch.name != NAME]
 
 

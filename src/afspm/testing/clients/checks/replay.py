@@ -119,9 +119,8 @@ def second_publisher(bench: ClientBench) -> None:
 
 @client_check(
     "replay/reconnect",
-    "After a connection is lost the client asks for what is newer than the newest that it has, "
-    "and delivers nothing twice.",
-    "Send a new marker after each connect, with the newest time in it; drop what is not newer than the last of its "
+    "After a lost connection the client requests packets newer than its newest one, and delivers none twice.",
+    "Send a new marker after each connect, with the newest time in it; drop packets not newer than the last of their "
     "envelope.",
 )
 def reconnect(bench: ClientBench) -> None:
