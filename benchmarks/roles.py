@@ -17,7 +17,7 @@ from afspm import wire
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import WireError
 from afspm.model import Response
-from afspm.simulation.emulation import registry
+from afspm.simulation.emulation.emulator import find_emulator
 from afspm.transport.network import Network
 from afspm.transport.port import PacketReceived, RequestReceived
 from afspm.transport.zmq_port import ZmqPort
@@ -78,7 +78,7 @@ def translator(scan_every_s: float | None = None) -> None:
 
 def emulator(vendor: str, folder: str) -> None:
     """An emulated controller."""
-    made = registry.emulator(vendor)(port=0)
+    made = find_emulator(vendor)(port=0)
     made.run(ExperimentClock.real(), Path(folder), logging.getLogger(vendor), ready)
 
 

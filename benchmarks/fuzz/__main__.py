@@ -12,14 +12,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from afspm.simulation.emulation import registry
-from afspm.simulation.emulation.emulator import Emulator
+from afspm.simulation.emulation.emulator import Emulator, emulator_names
 from benchmarks.fuzz.frame import Fuzzer, fuzz
 
 
 def emulators() -> Iterator[tuple[type[Fuzzer[Any]], Emulator]]:
     """Yield each emulator, with what calls it: from the modules of this folder that have the name of an emulator."""
-    for name in registry.names():
+    for name in emulator_names():
         if find_spec(f"benchmarks.fuzz.{name}") is not None:
             yield from import_module(f"benchmarks.fuzz.{name}").cases()
 

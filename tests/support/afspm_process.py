@@ -1,4 +1,4 @@
-"""`afspm` as a process of its own, whose output can be waited for."""
+"""`afspm` as a process of its own, with functions that wait for its output."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEADLINE_S = 60.0 * PATIENCE
 
 
 class AfspmProcess:
-    """An `afspm` command at work, in a group of its own, so that a Ctrl-C for it is not one for the tests."""
+    """A running `afspm` command, in its own process group, so that a Ctrl-C for it does not reach the tests."""
 
     def __init__(self, *arguments: str, folder: Path) -> None:
         self.process = subprocess.Popen(
@@ -43,11 +43,11 @@ class AfspmProcess:
             self._changed.notify_all()
 
     def said(self, *wanted: str) -> list[str]:
-        """The lines so far that match all the patterns `wanted`."""
+        """Return the lines so far that match all the patterns `wanted`."""
         return [line for line in self.lines if all(re.search(text, line) for text in wanted)]
 
     def wait_for(self, *wanted: str, count: int = 1) -> str:
-        """The line that matches all the patterns `wanted`, the `count`-th of that kind."""
+        """Return the `count`-th line that matches all the patterns `wanted`."""
         with self._changed:
             self._changed.wait_for(lambda: len(self.said(*wanted)) >= count or self._over, DEADLINE_S)
             if len(found := self.said(*wanted)) < count:
@@ -55,7 +55,7 @@ class AfspmProcess:
             return found[count - 1]
 
     def wait_for_next(self, *wanted: str) -> str:
-        """The next line of a kind, after those that have come already."""
+        """Return the next such line after the present ones."""
         with self._changed:
             already = len(self.said(*wanted))
         return self.wait_for(*wanted, count=already + 1)
@@ -69,17 +69,17 @@ class AfspmProcess:
         return Path(self.wait_for("processes, into ").split(", into ")[1])
 
     def wait_for_url(self, what: str) -> str:
-        """Where the dashboard, or the gateway, says that it is."""
+        """Return the printed address of the dashboard or the gateway."""
         (url,) = re.findall(r"https?://[^\s;]+", self.wait_for(f"the {what} is at "))
         return str(url)
 
     def pid(self, name: str) -> int:
-        """The process id of the component's newest process."""
+        """Return the process id of the component's newest process."""
         self.wait_for(rf" {name} .*started, process")
         return int(self.said(rf" {name} .*started, process")[-1].rsplit(" ", 1)[1])
 
     def wait_up(self, name: str, times: int) -> None:
-        """Wait until the component has come up so many times."""
+        """Wait until the component has started `times` times."""
         self.wait_for(rf" {name} .*is up$", count=times)
 
     def kill(self, name: str) -> None:
@@ -87,11 +87,11 @@ class AfspmProcess:
         kill(self.pid(name))
 
     def freeze(self, name: str) -> None:
-        """Stop the component's process where it is."""
+        """Suspend the component's process."""
         freeze(self.pid(name))
 
     def end(self) -> int:
-        """The exit code, once it has ended by itself."""
+        """Wait for its end without a signal; return the exit code."""
         try:
             code = self.process.wait(DEADLINE_S)
         except subprocess.TimeoutExpired:
@@ -100,7 +100,7 @@ class AfspmProcess:
         return code
 
     def close(self) -> None:
-        """End it however it is; its processes end with it."""
+        """Kill it; its processes end with it."""
         self.process.kill()
         self.process.wait()
         self._reader.join(DEADLINE_S)

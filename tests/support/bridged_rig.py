@@ -1,4 +1,4 @@
-"""Programs of the published implementation beside ours, with the bridge in a process of its own between them."""
+"""Programs of the published implementation beside afspm's, with the bridge in its own process between them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Bridge:
 
 
 class BridgedRig(Rig):
-    """A rig whose addresses are those that their programs know. Ours have others, behind the bridge."""
+    """A rig whose addresses are known to the published programs; afspm's programs use others, behind the bridge."""
 
     def __init__(self, folder: Path, keys_folder: Path | None = None) -> None:
         super().__init__(folder, keys_folder)
@@ -49,7 +49,7 @@ class BridgedRig(Rig):
         return replace(launch, sockets=sockets)
 
     def start(self) -> None:
-        """Their translator is there if ours is not."""
+        """Start the rig and its bridges, one of them to the published translator if afspm's is not part of it."""
         super().start()
         inside = self.inside
         sockets = Sockets(subscribe=(str(inside.publish),), control=inside.serve)
@@ -62,7 +62,7 @@ class BridgedRig(Rig):
             )
 
     def component(self, name: str, envelopes: list[str] | None = None, owner: str = "") -> Component:
-        """Their scheduler is there if ours is not."""
+        """Return a component; with the bridge to the published scheduler if afspm's is not part of it."""
         inside = self.inside
         if self.process is None:
             sockets = Sockets(publish=inside.publish, serve=inside.serve)

@@ -1,4 +1,4 @@
-"""A clock that goes when a test says so."""
+"""A clock set by the test."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, nullcontext
 
 
 class FakeClock:
-    """Stands still at `t_s`, experiment time and real time in one, until that is changed."""
+    """Stays at `t_s`, for experiment time and real time, until the test changes it."""
 
     def __init__(self, t_s: float = 1000.0) -> None:
         self.t_s = t_s

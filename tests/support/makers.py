@@ -1,4 +1,4 @@
-"""The makers whose controllers are emulated: found by what packages declare, so that no test lists the makers."""
+"""The makers with emulated controllers, found by the packages' declarations, so that no test lists them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ VENDORS = Path(__file__).parents[1] / "plugins"
 
 @dataclass(frozen=True)
 class Maker:
-    """A maker, as the tests of all makers need to know it: from `maker.toml` in the folder of the maker's own tests.
+    """The facts about a maker for the tests of all makers, from `maker.toml` in the folder of the maker's own tests.
 
     Attributes:
         name: as of `afspm emulate`; driver: the short name of the driver's class.
         heights: a channel with heights.
         address: of the controller at a "{port}" of this computer.
-        files: the setting that says where the controller's files are, for a folder "{here}" that was "{there}".
+        files: the setting for the folder of the controller's files, "{here}" in place of "{there}".
         transports: of the emulator, beside the usual one.
     """
 
@@ -34,7 +34,7 @@ class Maker:
 
     @property
     def emulated(self) -> Path:
-        """The second file of an experiment, with the driver and the emulator."""
+        """Return the second file of an experiment, with the driver and the emulator."""
         folder = entry_points.folder(entry_points.DRIVERS, self.driver)
         assert folder is not None
         return folder / "emulated.toml"

@@ -1,6 +1,6 @@
-"""Which part of a large set of cases is tried at this commit; `AFSPM_CASES=all` tries all of them, once a night.
+"""Selects the part of a large set of cases for this commit; `AFSPM_CASES=all` selects all of them, once a night.
 
-Another commit tries another part, and the same commit always the same one.
+Different commits try different parts, and the same commit always the same part.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ALL = os.environ.get("AFSPM_CASES") == "all"
 
 @cache
 def commit_number() -> int:
-    """Return a number that differs from commit to commit; 0 where there is no commit."""
+    """Return a number that differs from commit to commit; 0 without a commit."""
     try:
         done = subprocess.run(
             ["git", "rev-parse", "--short=12", "HEAD"],
@@ -33,5 +33,5 @@ def commit_number() -> int:
 
 
 def rotated(cases: Sequence[T], parts: int) -> list[T]:
-    """Return every `parts`-th of the cases, beginning with another one at another commit."""
+    """Return every `parts`-th of the cases, with a start that depends on the commit."""
     return list(cases) if ALL else list(cases)[commit_number() % parts :: parts]

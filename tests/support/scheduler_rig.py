@@ -1,4 +1,4 @@
-"""A scheduler in a process of its own, with the test as its translator and its components."""
+"""A scheduler in its own process, with the test as its translator and its components."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ANY = "tcp://127.0.0.1:0"
 
 
 class Component:
-    """A component, by what it has received."""
+    """A component that records received packets."""
 
     def __init__(self, rig: Rig, name: str, envelopes: list[str] | None, owner: str) -> None:
         self._rig, self.name = rig, name
@@ -34,7 +34,7 @@ class Component:
         self._asked = 0
 
     def send(self, kind: int, subject: Any = None, key: str | None = None) -> str:
-        """Ask; returns the id."""
+        """Send a request; return its id."""
         self._asked += 1
         request_id = key or f"{self.name}/session/{self._asked}"
         self.port.send(wire.encode_request(Request(kind, subject, id=request_id)))
@@ -45,7 +45,7 @@ class Component:
         return answers[-1] if answers else None
 
     def ask(self, kind: int, subject: Any = None, key: str | None = None) -> Response:
-        """Ask, once there is somebody to be asked, and wait for the answer."""
+        """Send a request once the scheduler is connected, and wait for the answer."""
         self._rig.until(self.connected)
         request_id = self.send(kind, subject, key)
         answer: Response = self._rig.until(lambda: self.answer_to(request_id))
@@ -59,13 +59,13 @@ class Component:
         ]
 
     def connected(self) -> bool:
-        """As far as it knows; what is asked without a connection is dropped."""
+        """Whether it counts as connected; requests without a connection are dropped."""
         changes = [i for i in self.found if isinstance(i, ControlConnected | ControlDisconnected)]
         return bool(changes) and isinstance(changes[-1], ControlConnected)
 
 
 class Rig:
-    """All of it. What is asked of the translator is in `asked`, and answered by `answer` (None: not at all)."""
+    """Scheduler, translator and components. `asked` has the translator's requests; `answer` gives their answers."""
 
     def __init__(self, folder: Path, keys_folder: Path | None = None) -> None:
         self._folder = folder
@@ -112,7 +112,6 @@ class Rig:
         self.process.stdin.flush()
 
     def kill(self) -> None:
-        """kill -9."""
         assert self.process is not None
         self.process.kill()
         self.process.wait()
@@ -120,19 +119,19 @@ class Rig:
         self.process.stdin.close()
 
     def component(self, name: str, envelopes: list[str] | None = None, owner: str = "") -> Component:
-        """Connected; with the key of `owner`, its own if none is named."""
+        """Return a connected component with the key of `owner`, or its own."""
         component = Component(self, name, envelopes, owner)
         self.components.append(component)
         self.until(component.connected)
         return component
 
     def linked(self, component: Component) -> None:
-        """Wait until the scheduler has found its translator: before, what is asked is refused."""
+        """Wait until the scheduler has found its translator: earlier requests are refused."""
         self.until(lambda: component.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok)
         self.asked.clear()
 
     def pump(self) -> None:
-        """Let everything that is played by the test see to what has come."""
+        """Process pending messages of all parts played by the test."""
         if self.translator is not None:
             for received in self.translator.poll(0.001):
                 if isinstance(received, RequestReceived):
@@ -150,7 +149,7 @@ class Rig:
             peer.pump()
 
     def until(self, condition: Callable[[], Any], timeout_s: float = 15.0) -> Any:
-        """Pump until the condition is true; returns its value."""
+        """Pump until the condition is true; return its value."""
         deadline_s = time.monotonic() + timeout_s
         while not (value := condition()):
             assert time.monotonic() < deadline_s, "it did not happen in time"

@@ -1,4 +1,4 @@
-"""Installs a package into a folder, as an installer does, without network or build tools."""
+"""Installs a package into a folder, without an installer, network or build tools."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ EXAMPLE_MAKER = Path(__file__).parent / "example_maker"
 
 
 def install(project: Path, site: Path) -> None:
-    """Copy the package of a project to `site`, with the metadata that its pyproject.toml asks for."""
+    """Copy the package of a project to `site`, with the metadata of its pyproject.toml."""
     described = tomllib.loads((project / "pyproject.toml").read_text())["project"]
     module = described["name"].replace("-", "_")
     shutil.copytree(project / module, site / module, ignore=shutil.ignore_patterns("__pycache__"))

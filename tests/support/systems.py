@@ -1,4 +1,4 @@
-"""The system that the tests run on, where a test goes by it."""
+"""Differences of the operating systems for tests."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ WINDOWS: Final = sys.platform == "win32"
 WINE: Final = WINDOWS and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
 """A Windows Python runs the tests, but Windows' own functions are those of Wine."""
 PATIENCE: Final = 4.0 if WINE else 1.0
-"""How many times longer tests wait there for what takes time: starting a process takes seconds."""
+"""Factor of timeouts under Wine, where the start of a process takes seconds."""
 KILLED: Final = 1 if WINDOWS else -9
-"""The exit code of a process that Popen.kill has ended."""
+"""The exit code of a process after Popen.kill."""
 KILLED_FROM_OUTSIDE: Final = 15 if WINDOWS else -9
-"""The exit code of a process that `kill` has ended."""
+"""The exit code of a process after `kill`."""
 HAS_CONSOLE: Final = not WINDOWS or bool(ctypes.WinDLL("kernel32").GetConsoleWindow())
 
 can_interrupt = pytest.mark.skipif(not HAS_CONSOLE, reason="without a console nobody can press Ctrl-C in it")
@@ -31,19 +31,19 @@ def not_on_wine(reason: str) -> pytest.MarkDecorator:
 
 
 def kill(pid: int) -> None:
-    """End a process from outside, so that it can do nothing about it."""
+    """Kill a process from outside, without any chance to react."""
     psutil.Process(pid).kill()
 
 
 def freeze(pid: int) -> None:
-    """Stop a process where it is, with its connections open."""
+    """Suspend a process, with its connections open."""
     psutil.Process(pid).suspend()
 
 
 def interrupt(process: subprocess.Popen[Any]) -> None:
-    """Press Ctrl-C for a process that shares our console.
+    """Press Ctrl-C for a process that shares this console.
 
-    On Windows all that share it hear of it: we ourselves must not, from now on.
+    On Windows every process of the console receives it, so this process ignores it from now on.
     """
     if sys.platform == "win32":
         signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -53,7 +53,7 @@ def interrupt(process: subprocess.Popen[Any]) -> None:
 
 
 def wait_until_gone(pids: dict[str, int], seconds: float) -> None:
-    """Wait for the end of processes that others have started; fails with the names of those that live on."""
+    """Wait for the end of processes started by others; fail with the names of the remaining ones."""
     processes = {psutil.Process(pid): name for name, pid in pids.items() if psutil.pid_exists(pid)}
     _, alive = psutil.wait_procs(processes, seconds)
     assert not alive, f"{[processes[process] for process in alive]} live on"

@@ -260,7 +260,7 @@ def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
     press(page, "Stop the scan")
     said(page, "The scan is stopped")
     night.until(lambda: night.follower.overview.status.state is ScopeState.FREE)
-    assert any(span.label == "interrupted" for span in night.follower.overview.states.spans)
+    assert any(span.label == "interrupted" for span in night.follower.overview.timelines.scope_state.spans)
     fill(page, "scan-speed", "4 um/s")
     press(page, "Set")
     said(page, "scan-speed is now 4 µm/s")

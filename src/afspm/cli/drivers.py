@@ -138,16 +138,16 @@ def emulate(
     to the vendor's usual port may expect a real controller there. A replay ends with 1 if something else was asked
     than what was recorded.
     """
-    from afspm.simulation.emulation.registry import emulator, names
+    from afspm.simulation.emulation.emulator import emulator_names, find_emulator
 
     if replay is not None:
         _replay(replay, port, folder)
         return
     if not name:
-        for known in names():
-            typer.echo(_described(known, emulator(known)))
+        for known in emulator_names():
+            typer.echo(_described(known, find_emulator(known)))
         return
-    class_ = emulator(name)
+    class_ = find_emulator(name)
     given = {**(class_.usual if usual else {}), **({"port": port} if port else {}), **_settings(settings or [])}
     made = class_(seed=seed, faults=fault or [], **given)
     made.check()

@@ -52,7 +52,7 @@ def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
 def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
     """Yield (number, name, since when and by whom) of each problem that is flagged."""
     for number in seen.control.problems if seen.control else ():
-        yield number, seen.problems.name(number), seen.problem_timelines[number].now
+        yield number, seen.problems.name(number), seen.timelines.problems[number].now
 
 
 def log_line(line: LogLine) -> Text:
@@ -116,7 +116,7 @@ class StatusText:
         mode = seen.control.mode.name
         line.append(mode, "bold yellow" if mode == "MANUAL" else "")
         if mode == "MANUAL":
-            return line.append(self._since(seen.modes.changed_ns))
+            return line.append(self._since(seen.timelines.mode.changed_ns))
         return line.append(f", {seen.in_control or 'nobody'} is in control{self._since(seen.control_since_ns)}")
 
     def _problems(self) -> Iterator[Text]:
@@ -133,7 +133,7 @@ class StatusText:
         line, status = _label("microscope"), self._seen.status
         if status is None:
             return line.append("has not reported yet")
-        now = self._seen.states.now
+        now = self._seen.timelines.scope_state.now
         line.append(status.state.name.lower().replace("_", " ")).append(", paused" if status.paused else "", "yellow")
         return line.append(self._since(now.start_ns if now else None))
 
@@ -144,7 +144,7 @@ class StatusText:
             return line
         if (progress := seen.scan_progress(self._now_ns)) is not None:
             line.append(f"  {self._bar(progress[0])} {self._left(progress[1])}")
-        parameters = seen.scan_parameters
+        parameters = seen.readings.scan_parameters
         if parameters is None or not isinstance(parameters.region, Region):
             return line
         pixels = f", {parameters.shape[1]} x {parameters.shape[0]}" if isinstance(parameters.shape, tuple) else ""
@@ -162,7 +162,7 @@ class StatusText:
         return f"{duration_text(left_ns / NS_PER_S)} left{real}"
 
     def _progress(self) -> Iterator[Text]:
-        for told in self._seen.told_progress.values():
+        for told in self._seen.progress_reports.values():
             if told.of <= 0:
                 continue
             left_ns = told.remaining_ns(self._now_ns)
@@ -178,7 +178,7 @@ class StatusText:
         """Yield those that are well in one line; each of the others in its own."""
         seen, states = self._seen, self._seen.processes.values()
         running = [state.name for state in states if state.condition not in OVER]
-        unheard = {name: ns for name in running if (ns := seen.unheard_ns(name, self._run.speed)) is not None}
+        unheard = {name: ns for name in running if (ns := seen.silent_ns(name, self._run.speed)) is not None}
         well = [_well(state) for state in states if state.condition in WELL and state.name not in unheard]
         if well:
             yield _label("processes").append(", ".join(well))
@@ -243,7 +243,7 @@ class StatusText:
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},
             "progress": {
                 name: {"done": told.done, "of": told.of, "remaining_s": _seconds(told.remaining_ns(self._now_ns))}
-                for name, told in seen.told_progress.items()
+                for name, told in seen.progress_reports.items()
             },
             "processes": [self._process_json(state) for state in seen.processes.values()],
             "refusals": [
@@ -265,7 +265,7 @@ class StatusText:
             **{name: getattr(state, name) for name in _PROCESS},
             "condition": state.condition.name,
             "since": _iso(state.since_ns),
-            "heard_of": self._seen.unheard_ns(state.name, self._run.speed) is None,
+            "heard_of": self._seen.silent_ns(state.name, self._run.speed) is None,
         }
 
 

@@ -1,4 +1,4 @@
-"""The one rule by which a scan is marked as bad: in the report, on its map, and in pictures of the night."""
+"""The rule that marks a scan as bad: for the report, its map, and pictures of the night."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from afspm.model import Problem
 BAD = 0.0
 """The score of a scan that was judged to show a bad tip."""
 VERDICT_MESSAGE = "SpatialROIWithScoreList"
-_SAME_SCAN_NS = 1_000_000_000  # channels of one scan are stamped one after the other
+_SAME_SCAN_NS = 1_000_000_000  # the channels of a scan get their times one after the other
 _NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)})
-"""Problems that say nothing about the scan before them: where the sample is, and whether the controller answers."""
+"""Problems without a verdict on the previous scan: they concern the sample's position or the controller."""
 
 
 def read_verdict(message: Any) -> tuple[int, float] | None:
@@ -28,15 +28,15 @@ def bad_scans(
     flagged_ns: Mapping[int, Iterable[int]],
     interrupted_ns: Iterable[int] = (),
 ) -> frozenset[int]:
-    """Return the times of the scans that are bad.
+    """Return the times of the bad scans.
 
     A scan is bad if it was interrupted, or if the last verdict on it is bad. In a run without verdicts, the newest scan
     is bad when a problem is flagged.
 
     Args:
-        times_ns: when scans were finished, or interrupted.
-        verdicts: time of the scan and score, in the order in which they came.
-        flagged_ns: when each problem was flagged, by its number.
+        times_ns: ends of scans, or their interruptions.
+        verdicts: time of the scan and score, in the order of arrival.
+        flagged_ns: the times at which each problem was flagged, by its number.
     """
     judged: dict[int, float] = {}
     for of_ns, score in verdicts:

@@ -1,4 +1,4 @@
-"""All runs under a folder, with what one looks for them by: an index beside them that can be made anew at any time."""
+"""The catalogue of all runs under a folder, with an SQLite index beside them that can be rebuilt at any time."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from afspm.wire.messages import CONTROL_STATE, DRIFT_RESCAN, JOURNAL
 INDEX_FILE: Final = "runs.sqlite"
 _FORMAT: Final = 3
 _WATCHED: Final = (RUN_FILE, "journal.sqlite", "journal.sqlite-wal")
-"""Files of a run by which it is seen that something has changed."""
+"""Files of a run whose change shows that the run has changed."""
 _SEARCHED: Final = ("sample", "person", "project", "technique", "probe")
 _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
 
@@ -45,16 +45,16 @@ class RunSummary:
     Attributes:
         folder: relative to the folder of all runs, with "/".
         name: of the experiment.
-        began_ns, ended_ns: when it began and ended, in experiment time (or was published last); None: nothing was.
-        state: how it ended, in words.
-        metadata: sample, person, project, technique … as far as they are known.
-        scans: the whole ones; spectra: their number.
-        problems: the names of those that were flagged.
+        began_ns, ended_ns: start and end (or last publication) in experiment time; None if nothing was published.
+        state: running, ended or cut off, in words.
+        metadata: sample, person, project, technique … where known.
+        scans: the number of complete scans; spectra: their number.
+        problems: the names of all flagged problems.
         notes: the texts of all notes.
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
         treatments: how often each action that is not a measurement was executed, by its name.
         judged: scans with a last verdict, and those of them with a good tip.
-        damage: why its record can't be read; empty: it can.
+        damage: why the record can't be read; empty if it can.
     """
 
     folder: str
@@ -75,12 +75,11 @@ class RunSummary:
 
     @property
     def measured(self) -> str:
-        """Return the numbers of scans and spectra, in words."""
         scans, spectra = counted(self.scans, "scan"), counted(self.spectra, "spectrum", "spectra")
         return f"{scans}, {spectra}" if self.spectra else scans
 
     def texts(self) -> dict[str, str]:
-        """Return the fields that are looked through, by name."""
+        """Return the searched fields, by name."""
         lists = {"problem": self.problems, "note": self.notes}
         texts = {"folder": self.folder, "name": self.name, "state": self.state, "microscope": self.microscope}
         texts |= {name: self.metadata.get(name, "") for name in _SEARCHED}
@@ -88,37 +87,37 @@ class RunSummary:
 
     @property
     def microscope(self) -> str:
-        """Vendor and model, as far as they are known."""
         return " ".join(filter(None, (self.metadata.get("vendor"), self.metadata.get("microscope"))))
 
 
 FIELDS: Final = tuple(RunSummary("", "").texts())
-"""What a word may be looked for in, as `field:word`."""
+"""The fields that a search may name, as `field:word`."""
 
 
 def find_runs(
     root: Path, words: Sequence[str] = (), since: date | None = None, until: date | None = None
 ) -> list[RunSummary]:
-    """Return the runs under a folder that have all words in them, the newest first.
+    """Return the runs under a folder that contain all words, the newest first.
 
     Args:
-        root: searched with all folders in it; the index `runs.sqlite` is kept there, where that can be written.
-        words: each in any field, or as "sample:gold" in that field; upper and lower case are the same.
-        since, until: the first and last day (UTC) of which something was published.
+        root: searched with all its subfolders; keeps the index `runs.sqlite` where it can be written.
+        words: each in any field, or as "sample:gold" in that field; case is ignored.
+        since, until: the first and last day (UTC) with publications.
 
     Raises:
         FileError: there is no such folder.
-        InvalidValue: a word names a field that there is not.
+        InvalidValue: a word names an unknown field.
     """
     wanted = [_read_word(word) for word in words]
     if not root.is_dir():
-        raise FileError("there is no such folder", where=str(root), hint="runs are in runs/, or where --runs said")
+        raise FileError(
+            "there is no such folder", where=str(root), hint="runs are in runs/, or in the folder of --runs"
+        )
     found = [run for run in _up_to_date(root) if _was_within(run, since, until) and _has(run.texts(), wanted)]
     return sorted(found, key=lambda run: (run.began_ns or 0, run.folder), reverse=True)
 
 
 def _read_word(word: str) -> tuple[str, str]:
-    """Return field ("" for any) and text of a word."""
     match = _WORD.fullmatch(word.strip())
     if match is None:
         raise InvalidValue("a word to look for is empty")
@@ -133,6 +132,7 @@ def _has(texts: Mapping[str, str], words: Sequence[tuple[str, str]]) -> bool:
 
 
 def _was_within(run: RunSummary, since: date | None, until: date | None) -> bool:
+    # a run without publications has no days
     if run.began_ns is None or run.ended_ns is None:
         return since is None and until is None
     starts_ns = None if since is None else _midnight_ns(since)
@@ -152,12 +152,13 @@ def _up_to_date(root: Path) -> list[RunSummary]:
         known = {folder: (stamp, about) for folder, stamp, about in index.execute("SELECT * FROM runs")}
         read: list[tuple[RunSummary, str]] = []
         for path in _folders(root):
-            # looked at before it is read: what is recorded meanwhile is then read the next time
+            # taken before the run is read: packets recorded meanwhile are then read next time
             folder, stamp = path.relative_to(root).as_posix(), _stamp(path)
             known_stamp, about = known.get(folder, ("", ""))
             is_known = known_stamp == stamp
             read.append((_from_json(about) if is_known else replace(_summary(path), folder=folder), stamp))
         with suppress(sqlite3.OperationalError), index:  # a disk that is full or can't be written to costs time alone
+            # rewritten as a whole, so that deleted runs disappear
             index.execute("DELETE FROM runs")
             rows = [(run.folder, stamp, json.dumps(asdict(run))) for run, stamp in read]
             index.executemany("INSERT INTO runs VALUES (?, ?, ?)", rows)
@@ -165,8 +166,9 @@ def _up_to_date(root: Path) -> list[RunSummary]:
 
 
 def _opened(root: Path) -> sqlite3.Connection:
-    """Return the index; one that is damaged, or of another version, is made anew; one that can't be is in memory."""
+    # a damaged index, or one of another version, is rebuilt; where the folder can't be written, the index is in memory
     file = root / INDEX_FILE
+    # the second attempt creates the index again after a damaged one was removed
     for _ in range(2):
         try:
             return _prepared(sqlite3.connect(file))
@@ -182,18 +184,19 @@ def _prepared(index: sqlite3.Connection) -> sqlite3.Connection:
         (version,) = index.execute("PRAGMA user_version").fetchone()
         if version not in (0, _FORMAT):
             raise ValueError("of another version")
+        # an index may come with a folder from another person, like a journal
         if not_a_table(index):
             raise ValueError("not made by afspm")
         index.execute("CREATE TABLE IF NOT EXISTS runs (folder TEXT PRIMARY KEY, stamp TEXT NOT NULL, about TEXT)")
         index.execute(f"PRAGMA user_version = {_FORMAT}")
-    except BaseException:
+    except BaseException:  # only to close: every error is raised again
         index.close()
         raise
     return index
 
 
 def _folders(root: Path) -> Iterator[Path]:
-    """Yield the folders of runs; links are not followed, such as that to the newest."""
+    # links are not followed: `latest` points to a run that is listed anyway
     for folder, inner, files in os.walk(root):
         if RUN_FILE in files:
             inner.clear()
@@ -201,12 +204,11 @@ def _folders(root: Path) -> Iterator[Path]:
 
 
 def _stamp(folder: Path) -> str:
-    """Return what changes when anything is recorded."""
     stamps = []
     for name in _WATCHED:
         with suppress(OSError):
             stat = (folder / name).stat()
-            if stat.st_size:  # one that is empty is left by whoever reads
+            if stat.st_size:  # SQLite's readers leave empty files
                 stamps.append(f"{name} {stat.st_mtime_ns}/{stat.st_size}")
     return " ".join(stamps)
 
@@ -227,7 +229,7 @@ def _summary(folder: Path) -> RunSummary:
 
 def _read(run: Run) -> RunSummary:
     overview = run.overview((CONTROL_STATE.name, JOURNAL.name, DRIFT_RESCAN.name))
-    began = next(iter(overview.controls.spans), None)
+    began = next(iter(overview.timelines.control.spans), None)
     return RunSummary(
         folder="",
         name=run.name,

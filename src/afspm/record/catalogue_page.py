@@ -22,7 +22,7 @@ from afspm.storage.atomic import replace_file
 
 PAGE_FILE: Final = "index.html"
 _PICTURES: Final = 4
-"""So many scans of a run are shown, spread over it."""
+"""The number of shown scans of a run, evenly selected."""
 _ABOUT: Final = ("sample", "person", "project")
 _REPORT: Final = "report.html"
 _CSS: Final = """
@@ -36,7 +36,7 @@ _CSS: Final = """
 
 
 def write_page(root: Path, runs: Sequence[RunSummary]) -> Path:
-    """Write `index.html` into the folder of all runs, and return it. Reports stay where they are."""
+    """Write `index.html` into the folder of all runs, and return its path; reports are linked, not copied."""
     cards = "".join(_card(root, run) for run in runs)
     body = f"<header><h1>{escape(root.resolve().name)}</h1><p>{counted(len(runs), 'run')}</p></header>"
     body += section("", f'<div class="runs">{cards}</div>')
@@ -61,7 +61,6 @@ def _card(root: Path, run: RunSummary) -> str:
 
 
 def _pictures(folder: Path) -> Iterator[str]:
-    """Yield pictures of some scans; none where the record can't be read any more."""
     with suppress(FileError), open_run(folder) as run:
         whole = [row for row in run.scans if not row.interrupted]
         for picture in pictures.of_scans(run, pictures.chosen(whole, _PICTURES)):
@@ -70,7 +69,6 @@ def _pictures(folder: Path) -> Iterator[str]:
 
 
 def _lines(run: RunSummary) -> list[str]:
-    """Return what a card says, as HTML."""
     if run.damage:
         return [f"<b>{escape(run.damage)}</b>"]
     about = " · ".join(

@@ -1,4 +1,4 @@
-"""journal.sqlite: the tables, and how the file is opened. One process writes, any number read meanwhile."""
+"""journal.sqlite: its tables, and functions that open it. One process writes; any number read at the same time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.basics.errors import FileError
 JOURNAL_FILE = "journal.sqlite"
 FORMAT = "afspm record 1"
 SCHEDULER = ""
-"""The source of what the scheduler publishes; that of others is their address."""
+"""The source of the scheduler's packets; other publishers are recorded by address."""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
@@ -45,7 +45,7 @@ CREATE TABLE IF NOT EXISTS entries (
 CREATE INDEX IF NOT EXISTS entries_by_time ON entries (time_ns);
 -- When scans and spectra were asked for, and under which keys; the answer may have come after what was measured.
 CREATE TABLE IF NOT EXISTS starts (sent_ns INTEGER NOT NULL, action TEXT NOT NULL, key TEXT NOT NULL);
--- A row for each change of a process, not for each time that it was told.
+-- A row for each change of a process, not for each report.
 CREATE TABLE IF NOT EXISTS processes (
   time_ns INTEGER NOT NULL, name TEXT NOT NULL, role TEXT NOT NULL, condition INTEGER NOT NULL,
   since_ns INTEGER NOT NULL, starts INTEGER NOT NULL, pid INTEGER NOT NULL, last_exit TEXT NOT NULL);
@@ -59,10 +59,10 @@ _DAMAGE = (sqlite3.DatabaseError, UnicodeDecodeError)  # SQLite quotes what it c
 
 
 def open_to_write(folder: Path) -> sqlite3.Connection:
-    """The journal in a run folder, made if it is not there.
+    """Open the journal in a run folder; create it if it is missing.
 
     Raises:
-        FileError: it is damaged, or something else.
+        FileError: it is damaged, or another kind of file.
         sqlite3.OperationalError: the disk is full …
     """
     path = folder / JOURNAL_FILE
@@ -71,7 +71,9 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         format_row = f"INSERT OR IGNORE INTO about VALUES ('format', '{FORMAT}');"
-        connection.executescript(f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;")  # whoever reads finds all or none
+        connection.executescript(
+            f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;"
+        )  # a reader finds all tables or none
         check_format(connection, path)
     except sqlite3.OperationalError:
         connection.close()
@@ -83,10 +85,10 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
 
 
 def open_to_read(folder: Path) -> sqlite3.Connection:
-    """The journal in a run folder, which may be written at the same time, or on a disk that can't be written to.
+    """Open the journal in a run folder for reading; another process may write it, and the disk may be read-only.
 
     Raises:
-        FileError: there is none, or it is damaged, or something else.
+        FileError: it is missing, damaged, or another kind of file.
     """
     path = folder / JOURNAL_FILE
     if not path.is_file():
@@ -95,9 +97,10 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
         try:
             return _checked(read_only(path.resolve()), path)
         except sqlite3.OperationalError as error:
+            # SQLite reports a read-only folder by its text only
             if "unable to open" not in str(error) and "readonly" not in str(error):
                 raise
-            return _checked_copy(path)  # what is beside it can't be made there
+            return _checked_copy(path)  # SQLite can't create its files beside the journal there
     except _DAMAGE as error:
         raise damaged(path, error) from error
 
@@ -106,7 +109,7 @@ def measured_file(folder: Path, file: str) -> Path:
     """Return the file of a scan or spectrum, which the journal names relative to its folder.
 
     Raises:
-        FileError: it is elsewhere. The folder may come from another person, and its files are read and exported.
+        FileError: it is outside the run folder. A run may come from another person; its files are read and exported.
     """
     path = folder / file
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -115,7 +118,8 @@ def measured_file(folder: Path, file: str) -> Path:
 
 
 def read_only(path: PurePath) -> str:
-    """An absolute path as SQLite is told to open it for reading. It knows no hosts: a share is part of the path."""
+    """Return the URI that opens an absolute path read-only in SQLite, where a network share is part of the path."""
+    # SQLite refuses a host in a URI, so the share of a network path goes into the path
     scheme, _, place = path.as_uri().partition("//")
     return f"{scheme}{'//' if place.startswith('/') else '////'}{place}?mode=ro"
 
@@ -123,7 +127,7 @@ def read_only(path: PurePath) -> str:
 def not_a_table(connection: sqlite3.Connection) -> str:
     """Return the name of a view, trigger or virtual table of a database; empty: it has none.
 
-    In the place of a table it would run the program of its author, perhaps without end.
+    A view in the place of a table would run its author's SQL, perhaps without end.
     """
     for name, kind, sql in connection.execute("SELECT name, type, sql FROM sqlite_master"):
         if kind not in ("table", "index") or _VIRTUAL.match(sql or ""):
@@ -132,25 +136,25 @@ def not_a_table(connection: sqlite3.Connection) -> str:
 
 
 def is_damage(error: sqlite3.DatabaseError) -> bool:
-    """Return whether an error says that the file is damaged, and not that the disk is full."""
+    """Return whether an error means a damaged file, and not a full disk."""
+    # SQLite reports damage as a bare DatabaseError; its subclasses report the disk, locks and wrong statements
     return type(error) is sqlite3.DatabaseError
 
 
 def damaged(path: Path, error: Exception) -> FileError:
-    """Return the error to raise for a journal that can't be read."""
     return error if isinstance(error, FileError) else FileError(f"is damaged: {error}", where=str(path))
 
 
 def check_format(connection: sqlite3.Connection, path: Path) -> None:
-    """Raises FileError: it is something else, or of a version to come."""
+    """Raise FileError if the file is not a journal, or of a later version."""
     found = connection.execute("SELECT value FROM about WHERE name = 'format'").fetchone()
     if found is None or found[0] != FORMAT:
-        said = found[0] if found else "something else"
-        raise FileError(f"is not a journal of this version: {said}", where=str(path), hint="a newer afspm may read it")
+        name = found[0] if found else "unknown format"
+        raise FileError(f"is not a journal of this version: {name}", where=str(path), hint="a newer afspm may read it")
 
 
 class _OfCopy(sqlite3.Connection):
-    """Removes the copy that it reads when it is closed, forgotten, or (but on Windows) the program ends."""
+    """A connection to a copy, which is removed when it is closed, collected, or (except on Windows) at exit."""
 
     remove: Callable[[], object] = staticmethod(lambda: None)
 
@@ -172,12 +176,13 @@ def _checked_copy(path: Path) -> sqlite3.Connection:
     except OSError as error:
         raise FileError(f"can't be read, there is no room for a copy: {error}", where=str(path)) from error
     try:
+        # the newest transactions are in the write-ahead log
         for suffix in ("", "-wal"):
             with suppress(FileNotFoundError):
                 shutil.copy(f"{path}{suffix}", folder / f"{path.name}{suffix}")
         connection = _checked(read_only(folder / path.name), path, _OfCopy)
         assert isinstance(connection, _OfCopy)
-    except BaseException as error:
+    except BaseException as error:  # only to remove the copy: every error is raised again
         shutil.rmtree(folder, ignore_errors=True)
         if isinstance(error, OSError):
             raise FileError(f"can't be read, no copy can be made of it: {error}", where=str(path)) from error
@@ -191,6 +196,7 @@ def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Conn
         uri, uri=True, isolation_level=None, check_same_thread=False, timeout=30.0, factory=kind
     )
     try:
+        # the journal may come from another person: no writes, and no functions called by its schema
         connection.execute("PRAGMA query_only = 1")
         connection.execute("PRAGMA trusted_schema = 0")
         if strange := not_a_table(connection):
@@ -201,7 +207,7 @@ def _checked(uri: str, path: Path, kind: type[sqlite3.Connection] = sqlite3.Conn
         if "about" not in tables:
             raise FileError("is not a journal of an experiment", where=str(path))
         check_format(connection, path)
-    except BaseException:
+    except BaseException:  # only to close: every error is raised again
         connection.close()
         raise
     return connection

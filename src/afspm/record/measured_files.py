@@ -27,7 +27,7 @@ PART = ".part"
 
 
 class MeasuredFiles:
-    """Writes what was measured, in the transaction that is open.
+    """Writes measurements, in the open transaction.
 
     Args:
         folder: of the run.
@@ -47,7 +47,7 @@ class MeasuredFiles:
                 half.unlink(missing_ok=True)
 
     def write(self, taken: Assembled) -> None:
-        """Write the file, and the rows of the journal. Raises OSError, sqlite3.OperationalError: the disk is full …"""
+        """Write the file and the rows of the journal. Raises OSError, sqlite3.OperationalError: disk full …"""
         if isinstance(taken, AssembledSpectrum):
             self._write_spectrum(taken)
         elif taken.interrupted_ns is None:
@@ -56,15 +56,14 @@ class MeasuredFiles:
             self._write_interrupted(taken, taken.interrupted_ns)
 
     def finish(self) -> None:
-        """Have all files on the disk, under their names. Raises OSError."""
+        """Sync all files to the disk and give them their final names. Raises OSError."""
         self._batch.finish()
 
     def discard(self) -> None:
-        """Remove the files that were written since `finish`."""
+        """Remove the files written since the last `finish`."""
         self._batch.discard()
 
     def close(self) -> None:
-        """Write no more."""
         self._batch.close()
 
     # --- scans ---
@@ -75,8 +74,9 @@ class MeasuredFiles:
         measured_ns = published_ns if first.time_ns is None else first.time_ns
         new: dict[str, Scan] = {}
         for _, scan in taken.channels:
+            # a restarted translator publishes channels again: the first counts
             new.setdefault(scan.channel, scan)
-        known = self._known(new, measured_ns)
+        known = self._find_recorded(new, measured_ns)
         if known is None:
             stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SCANNING, measured_ns)
             number = self._add_scan(list(new.values()), measured_ns, stood, published_ns, interrupted=False)
@@ -85,8 +85,7 @@ class MeasuredFiles:
             self._add_channels(number, self._folder / known[1], new)
         self._insert_scan_packets(taken, number)
 
-    def _known(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
-        """Return number and file of the recorded scan that these are channels of; None if there is none."""
+    def _find_recorded(self, new: Mapping[str, Scan], measured_ns: int) -> tuple[int, str] | None:
         rows = self._journal.execute(
             "SELECT number, file FROM scans WHERE time_ns = ? AND NOT interrupted ORDER BY number", (measured_ns,)
         )
@@ -97,7 +96,6 @@ class MeasuredFiles:
         return None
 
     def _channels(self, number: int) -> Iterator[tuple[str, str]]:
-        """Yield the channels of a recorded scan, with the controller's files that they came from."""
         rows = self._journal.execute("SELECT payload FROM packets WHERE scan = ? AND message = 'Scan2d'", (number,))
         for (payload,) in rows:
             message: Any = wire.message_type("Scan2d").FromString(payload)
@@ -115,7 +113,7 @@ class MeasuredFiles:
         filename = scans[0].filename if scans else ""
         number, name = self._next(SCANS, time_ns)
         facts = {**self._facts, **stood.facts(self._problems), "number": number, "interrupted": interrupted}
-        filenames = {scan.filename for scan in scans}  # some controllers write one for each channel
+        filenames = {scan.filename for scan in scans}  # some controllers write a file for each channel
         mapping = provenance.drift(self._journal, published_ns, stood.began_ns, filenames)
         if mapping is not None:
             facts["drift"] = mapping
@@ -134,10 +132,10 @@ class MeasuredFiles:
         return number
 
     def _add_channels(self, number: int, path: Path, new: Mapping[str, Scan]) -> None:
-        """Add channels that came after the file was written, since the recorder was killed in between."""
+        # the recorder was killed between writing the file and these channels
         from afspm.storage.formats import read
 
-        self._batch.finish()  # it may be one of these
+        self._batch.finish()  # the file may be in the open batch
         content = read(path)
         there = {scan.channel for scan in content.scans}
         if new.keys() <= there:
@@ -153,7 +151,7 @@ class MeasuredFiles:
         (channels,) = self._journal.execute("SELECT channels FROM scans WHERE number = ?", (number,)).fetchone()
         in_file = {channel for channel, _ in json.loads(channels)}
         for packet, lines in taken.lines:
-            if lines.channel not in in_file:  # it ended before this channel was published
+            if lines.channel not in in_file:  # the scan ended before this channel was published
                 insert_packet(self._journal, packet, "ScanLines", bytes(packet.payload))
                 continue
             head = without_values("ScanLines", packet.payload)
@@ -169,6 +167,7 @@ class MeasuredFiles:
         packet, spectrum = taken.packet, taken.spectrum
         published_ns = packet.time_ns or 0
         time_ns = published_ns if spectrum.time_ns is None else spectrum.time_ns
+        # a restarted translator publishes a spectrum again: it is recorded once
         known = self._journal.execute(
             "SELECT number FROM spectra WHERE time_ns = ? AND filename = ? AND kind = ?",
             (time_ns, spectrum.filename, spectrum.kind),
@@ -193,13 +192,12 @@ class MeasuredFiles:
     # --- both ---
 
     def _next(self, kind: str, time_ns: int) -> tuple[int, str]:
-        """Return the next number and its file, relative to the run folder."""
         number = int(self._journal.execute(f"SELECT coalesce(max(number), 0) + 1 FROM {kind}").fetchone()[0])
         name = f"{kind}/{_stamp(time_ns)}-{number:05d}{SUFFIX}"
         for orphan in (self._folder / kind).glob(f"{_stamp(time_ns)}-*{SUFFIX}"):
             if self._journal.execute(f"SELECT 1 FROM {kind} WHERE file = ?", (f"{kind}/{orphan.name}",)).fetchone():
                 continue
-            orphan.unlink()  # written right before a kill, under a number that it did not get
+            orphan.unlink()  # written right before a kill; the journal never got its number
         return number, name
 
     def _control(self, stood: ControlAtStart) -> tuple[str | None, str | None, str]:
@@ -222,7 +220,7 @@ def insert_packet(
     """Insert the row of a packet.
 
     Args:
-        payload: what of it is kept here; its values are in the file of `scan` or `spectrum`.
+        payload: the part stored in the journal; the values are in the file of `scan` or `spectrum`.
         rows: (channel, first row, number of rows) of a scan's values.
     """
     journal.execute(
@@ -240,17 +238,17 @@ def header_of(filename: str, folder: Path) -> Mapping[str, object]:
         if not path.is_file():
             return {}
         content = read(path)
-    except Exception as error:  # a folder that can't be reached, a file that a reader errs at: the scan is recorded
+    except Exception as error:  # unreachable folder, or any error of a package's reader: the scan is recorded without
         _log.debug("the header of %s is left out: %s", filename, error)
         return {}
     return {"controller": content.controller, **content.header}
 
 
 def write_synced(path: Path, data: bytes) -> None:
-    """Write a file so that it is there as a whole or not at all, after a power cut too. Raises OSError."""
+    """Write a file atomically, also across a power cut. Raises OSError."""
     replace_file(path, [data], aside=path.with_name(path.name + PART))
 
 
 def _stamp(time_ns: int) -> str:
-    """Return a time as it may stand in the name of a file; programs that cut names at a dot get the whole."""
+    # no dot: programs that cut a file name at its first dot still show the whole time
     return iso_utc(time_ns).replace("-", "").replace(":", "").replace(".", "_")

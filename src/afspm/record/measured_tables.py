@@ -1,4 +1,4 @@
-"""The tables of what was measured: rows by their keys, and spectra as one array."""
+"""Tables of measurements: rows by their keys, and spectra as one array."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 R = TypeVar("R", ScanRow, SpectrumRow)
 Row = tuple[Any, ...]
-"""Of a table in SQLite."""
+"""A row of a table in SQLite."""
 Query = Callable[[str], list[Row]]
 
 _PUBLISHED = {
@@ -32,7 +32,7 @@ _HAS_STARTS = "SELECT 1 FROM sqlite_master WHERE name = 'starts'"
 
 
 class KeyedTable(Table[R]):
-    """Rows of what was measured: `table["tile-1"]` is the one that was taken under this key."""
+    """Rows of measurements; `table["tile-1"]` is the row of that key."""
 
     @overload
     def __getitem__(self, index: int | str) -> R: ...
@@ -40,19 +40,19 @@ class KeyedTable(Table[R]):
     def __getitem__(self, index: slice) -> KeyedTable[R]: ...
     def __getitem__(self, index: int | str | slice) -> R | KeyedTable[R]:
         if isinstance(index, str):
-            return self._of_key(index)
+            return self._last_with_key(index)
         return self._with(self._rows[index]) if isinstance(index, slice) else self._rows[index]
 
     def where(self, wanted: Callable[[R], bool]) -> KeyedTable[R]:
-        """The rows for which it is true."""
+        """Return the rows for which `wanted` returns True."""
         return self._with(row for row in self._rows if wanted(row))
 
-    def _of_key(self, key: str) -> R:
-        """The last of this key: attempts before it were interrupted."""
+    def _last_with_key(self, key: str) -> R:
+        # the last one: earlier attempts of this key were interrupted
         found = [row for row in self._rows if row.key == key]
         if not found:
             known = dict.fromkeys(row.key for row in self._rows if row.key)
-            raise NoSuchItem(f"no key {key!r}; {_told(list(known))}")
+            raise NoSuchItem(f"no key {key!r}; {_describe_keys(list(known))}")
         return found[-1]
 
     def _with(self, rows: Iterable[R]) -> KeyedTable[R]:
@@ -60,7 +60,7 @@ class KeyedTable(Table[R]):
 
 
 class SpectrumTable(KeyedTable[SpectrumRow]):
-    """Rows of spectra, and how their curves are read."""
+    """Rows of spectra, with access to their curves."""
 
     def __init__(self, rows: Iterable[SpectrumRow], read: Callable[[SpectrumRow], Spectrum]) -> None:
         super().__init__(rows, SpectrumRow)
@@ -69,16 +69,16 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
     def stack(self, *, interpolate: bool = False) -> xarray.Dataset:
         """Return the curves of a grid as arrays over (y, x, repeat, direction, z) (needs the extra `xarray`).
 
-        x and y are along the sides of the grid, in m; `angle_rad` and `frame` are in the attributes. z is the variable
-        that was swept: its name and unit are in the attributes of the coordinate. Variables that were measured on the
-        way back, too ("Current Retrace"), have both directions. NaN where nothing was measured.
+        x and y are along the sides of the grid, in m; `angle_rad` and `frame` are in the attributes. z is the swept
+        variable: its name and unit are in the attributes of the coordinate. Variables with a retrace ("Current
+        Retrace") have both directions. NaN where nothing was measured.
 
         Args:
-            interpolate: bring curves that were not swept over the same values, such as force curves that begin at
-                the surface, to common ones: evenly spaced, linear between the points that were measured.
+            interpolate: resample curves with different sweeps, such as force curves that begin at the surface, to
+                common values (evenly spaced, linear between measured points).
 
         Raises:
-            InvalidValue: these spectra do not form a grid, or were not measured alike.
+            InvalidValue: these spectra do not form a grid, or were measured differently.
             FileError: a file is missing or damaged.
         """
         return self._stacked(interpolate=interpolate).to_xarray()
@@ -98,12 +98,12 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
             run.spectra.map(lambda spectrum: spectrum["Current"].max(), unit="A", name="largest current")
 
         Args:
-            quantity: the name of a variable, which is taken at one value of what was swept; or a function that makes a
-                number of one spectrum.
-            at: that value, in the unit of what was swept.
-            unit: of what the function returns.
+            quantity: the name of a variable, read at one value of the sweep; or a function of one spectrum that
+                returns a number.
+            at: the value of the sweep, in its unit.
+            unit: of the function's result.
             direction: "forward" or "backward" along the sweep.
-            name: of the channel; by default that of the variable or function.
+            name: of the channel; by default the variable's or function's.
 
         Raises:
             InvalidValue: these spectra do not form a grid of at least two by two, or there is no such quantity.
@@ -133,7 +133,6 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
 
 
 def read_scans(query: Query) -> KeyedTable[ScanRow]:
-    """Return all scans of a journal."""
     found = query("SELECT * FROM scans ORDER BY number")
     keys = _keys(query, "scans", names.START_SCAN, found)
     positions = _positions(query)
@@ -142,14 +141,13 @@ def read_scans(query: Query) -> KeyedTable[ScanRow]:
 
 
 def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> SpectrumTable:
-    """Return all spectra of a journal."""
     found = query("SELECT * FROM spectra ORDER BY number")
     keys = _keys(query, "spectra", names.START_SPEC, found)
     return SpectrumTable((spectrum_row(row, keys.get(row[0], "")) for row in found), read)
 
 
 def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[int, str]:
-    """Return the keys by the number of the row: each start belongs to the measurement that was published next."""
+    # the log has no link from a request to its measurement: each start belongs to the next published measurement
     starts = query(f"SELECT sent_ns, key FROM starts WHERE action = '{action}'") if query(_HAS_STARTS) else []
     if not any(key for _, key in starts):
         return {}
@@ -159,17 +157,17 @@ def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[in
     waiting = sorted(starts, key=itemgetter(0), reverse=True)
     for end_ns, number in ends:
         while waiting and waiting[-1][0] <= end_ns:
-            keys[number] = waiting.pop()[1]  # the last one counts: those before it came to nothing
+            keys[number] = waiting.pop()[1]  # the last start counts: earlier ones were without result
     return keys
 
 
 def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | None]]:
-    """Return how the position of each scan is known, by its number: the mapping that was published just before it."""
+    # the mapping of a scan is published just before the scan
     mappings = query("SELECT time_ns, payload FROM packets WHERE message = 'DriftMapping' ORDER BY time_ns DESC")
     if not mappings:
         return {}
     found, after_ns = {}, -1
-    from afspm.model.drift_mapping import drift_knowledge  # it loads numpy, which the supervisor does without
+    from afspm.model.drift_mapping import drift_knowledge  # imports numpy, which the supervisor avoids
 
     for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
         payload = None
@@ -178,12 +176,12 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
             payload = newest if time_ns > after_ns else payload
         after_ns = published_ns
         if number is not None and payload is not None:
-            with suppress(WireError):  # of a peer that writes it in another way
+            with suppress(WireError):  # another implementation may encode it differently
                 found[number] = drift_knowledge(wire.decode("DriftMapping", payload))
     return found
 
 
-def _told(keys: Sequence[str]) -> str:
+def _describe_keys(keys: Sequence[str]) -> str:
     if not keys:
         return "nothing was measured under a key"
     return f"there are {', '.join(keys[:20])}{' …' if len(keys) > 20 else ''}"
@@ -192,7 +190,6 @@ def _told(keys: Sequence[str]) -> str:
 def scan_row(
     row: Row, key: str = "", registration: RegistrationOutcome | None = None, position_sd_m: float | None = None
 ) -> ScanRow:
-    """Return a row of the journal as an object."""
     (
         number, time_ns, began_ns, filename, file, interrupted, x, y, width, height, angle, frame, rows, columns,
         channels, holder, mode, problems,
@@ -218,7 +215,6 @@ def scan_row(
 
 
 def spectrum_row(row: Row, key: str = "") -> SpectrumRow:
-    """Return a row of the journal as an object."""
     (
         number, time_ns, began_ns, filename, file, kind, x, y, frame, points, names, units, holder, mode, problems,
     ) = row  # fmt: skip

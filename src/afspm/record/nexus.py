@@ -1,13 +1,13 @@
-"""Scans and spectra as HDF5 files that follow NeXus' NXspm (spectra over the bias: NXsts), and lose nothing.
+"""Scans and spectra as HDF5 files that follow NeXus' NXspm (spectra over the bias: NXsts), without loss.
 
     /entry                  NXentry, definition "NXspm" or "NXsts"; technique, start_time, end_time, title
       data                  NXdata: a field for each channel over y and x (unrotated, in m), with units
-      experiment_instrument NXinstrument: hardware, software, where and in how many points was measured
+      experiment_instrument NXinstrument: hardware, software, position and number of points
       sample, user          NXsample, NXuser
-      afspm                 NXcollection: `about`, all that is known as JSON; who was in control, problems, drift …
+      afspm                 NXcollection: `about`, all facts as JSON: holder, problems, drift …
       vendor                NXcollection: `header` of the controller's own file as JSON, where that could be read
 
-What afspm does not know (temperatures, amplifiers; the technique of some microscopes) is left out, not made up.
+Unknown facts (temperatures, amplifiers; the technique of some microscopes) are left out, not made up.
 """
 
 from __future__ import annotations
@@ -39,16 +39,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 _SHOWN = ("in_control", "mode", "interrupted", "number", "run", "frame")
-"""Facts that are attributes, too, for whoever looks into a file with a viewer."""
+"""Facts that are also attributes, so that a viewer of HDF5 files shows them."""
 
 
 @dataclass(frozen=True)
 class FileProvenance:
-    """The provenance that is written into a file, as far as it is known.
+    """The provenance that is written into a file, where known.
 
     Attributes:
-        time_ns: when it was finished; began_ns: when it began.
-        facts: all else, in JSON's types: who was in control, mode, problems, feedback, drift, the run, its seed …
+        time_ns: the end of the measurement; began_ns: its start.
+        facts: all else, in JSON's types: holder, mode, problems, feedback, drift, the run, its seed …
         header: of the controller's own file.
     """
 
@@ -59,7 +59,7 @@ class FileProvenance:
 
 
 def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
-    """All channels of one scan, of the same region and shape, as a file."""
+    """Return the file of one scan; all channels have one region and shape."""
     first, fields = scans[0], field_names((scan.channel for scan in scans), ("x", "y"))
     region = first.region
     about = _about("scan", first.filename, circumstances) | {
@@ -90,7 +90,6 @@ def encode_scan(scans: Sequence[Scan], circumstances: FileProvenance) -> bytes:
 
 
 def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
-    """One spectrum as a file."""
     fields = field_names(spectrum.names)
     about = _about("spectrum", spectrum.filename, circumstances) | {
         "position_m": spectrum.position_m,
@@ -123,7 +122,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
 
 
 def facts_of(path: Path) -> Plain:
-    """Return what a file says beside its values. Raises FileError: it is damaged."""
+    """Return the facts stored in a file beside its values. Raises FileError: it is damaged."""
     with hdf5.opened(path) as file:
         return about_of(file)
 
@@ -134,7 +133,7 @@ def _encoded(
     circumstances: FileProvenance,
     fill: _Fill,
 ) -> bytes:
-    """Made in memory: whatever is wrong with the disk is then found in one place, where the bytes are written."""
+    # in memory: errors of the disk then occur in one place, where the bytes are written
     import h5py
 
     with h5py.File("aside", "w", driver="core", backing_store=False) as file:
@@ -167,7 +166,7 @@ def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[s
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return names that NeXus allows, all different; the real ones are in `long_name`."""
+    """Return unique names that NeXus allows; the original ones are stored as `long_name`."""
     found, used = [], set(taken)
     for name in names:
         plain = re.sub(r"[^a-z0-9_]+", "_", name.lower()).strip("_") or "value"
@@ -183,14 +182,12 @@ def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
 
 @cache
 def afspm_version() -> str:
-    """Return the version of this program."""
     from importlib.metadata import version
 
     return version("afspm")
 
 
 def _plain(value: object) -> object:
-    """Return a value of a vendor's header in JSON's types."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, np.ndarray):

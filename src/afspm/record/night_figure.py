@@ -1,4 +1,4 @@
-"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close look at each repair."""
+"""A `NightRecord` as a figure: contact sheet, bands over the night, and a close-up of each repair."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-WIDTH_IN = 7.2  # two columns of a journal
+WIDTH_IN = 7.2  # the width of two columns in a journal
 LANE_IN = 0.2
 THUMB_PX = 64
 GAP_PX = 6
@@ -38,7 +38,7 @@ PAPER = (255, 255, 255)
 
 
 def prepare() -> None:
-    """Load what takes long to load: modules, fonts, colours."""
+    """Load slow modules, fonts and colours in advance."""
     figure = _figure(1.0)
     figure.add_axes((0.0, 0.0, 1.0, 1.0)).text(0.5, 0.5, "a", weight="bold")
     figure.savefig(io.BytesIO(), dpi=50)
@@ -51,7 +51,7 @@ def draw(
 
     Args:
         problems: number -> name.
-        simulated: written on it, so that nobody takes it for a measurement.
+        simulated: printed on the picture, so that it can't pass as a measurement.
     """
     shots = _chosen(record)
     repairs = _episodes(record)[:MOST_LOOKS]
@@ -114,11 +114,11 @@ def _letter(figure: Figure, letter: str, x: float, y: float) -> None:
 
 
 def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mapping[str, str], rows: int) -> None:
-    """All pictures as one image, which is much faster than an image each; under each a bar of who took it."""
+    # one image for all pictures: drawing an image for each takes much longer
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
     bad_ns = record.bad_ns()
-    palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last: not measured
+    palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last colour marks unmeasured pixels
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
         picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
@@ -147,7 +147,6 @@ def _bands(
     *,
     names_too: bool,
 ) -> None:
-    """Draw a lane for each holder and each problem; time in ns."""
     labels: list[str] = []
     for lane, holder in enumerate(record.holders):
         _lane(ax, lane, record.control_spans(holder), limits, facecolor=colours[holder])
@@ -172,17 +171,17 @@ def _bands(
 
 
 def _lane(ax: Axes, lane: int, spans: Sequence[Span], limits: tuple[int, int], **style: Any) -> None:
-    least = (limits[1] - limits[0]) / 600  # what is too short to be seen is drawn so wide that it is
+    least = (limits[1] - limits[0]) / 600  # shorter spans would be invisible
     bars = []
     for span in spans:
         start, end = _clipped(span, limits)
-        if end >= start:  # else it lies outside
+        if end >= start:  # otherwise it is outside the limits
             bars.append((start, max(end - start, least)))
     ax.broken_barh(bars, (lane - 0.36, 0.72), linewidth=0, **style)
 
 
 def flagged_by(record: NightRecord, span: Span) -> str:
-    """Return the component that judged a scan bad when a problem was flagged; empty if none did."""
+    """Return the component whose verdict on a scan caused a flag; empty if there is none."""
     near = [m for m in record.marks if m.score == BAD and abs(m.time_ns - span.start_ns) < AROUND_NS / 4]
     return min(near, key=lambda m: abs(m.time_ns - span.start_ns)).by if near else ""
 
@@ -206,7 +205,6 @@ def _hours(ax: Axes, record: NightRecord) -> None:
 
 
 def _times(ax: Axes, begin_ns: int, end_ns: int, *, about: int) -> None:
-    """Label round times of day, as everywhere in the picture."""
     ticks_ns = [round(tick_s * NS_PER_S) for tick_s in time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S, about)]
     seconds = any(tick_ns % (60 * NS_PER_S) for tick_ns in ticks_ns)
     ax.set_xticks(ticks_ns, [time_of_day(tick_ns, UTC, seconds=seconds) for tick_ns in ticks_ns], size=6)
@@ -221,7 +219,6 @@ def _legend(ax: Axes) -> None:
 
 
 def _episodes(record: NightRecord) -> list[Span]:
-    """Return the spans from a problem flagged until none is."""
     spans = sorted((s for p in record.problems for s in record.problem_spans(p)), key=lambda s: s.start_ns)
     merged: list[Span] = []
     for span in spans:
@@ -241,7 +238,6 @@ def _around(span: Span, record: NightRecord) -> tuple[int, int]:
 
 
 def _chosen(record: NightRecord) -> list[Shot]:
-    """All scans, or if there are too many, those evenly through the night and every one that something happened to."""
     shots = sorted(record.shots, key=lambda shot: shot.time_ns)
     if len(shots) <= MOST_SHOTS:
         return shots
@@ -260,7 +256,6 @@ def _clipped(span: Span, limits: tuple[int, int]) -> tuple[float, float]:
 
 
 def _fitted(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """On THUMB_PX by THUMB_PX, nearest pixel; narrow ones in the middle."""
     ny, nx = picture.shape
     scale = THUMB_PX / max(ny, nx)
     rows = np.minimum((np.arange(max(1, round(ny * scale))) / scale).astype(int), ny - 1)

@@ -1,4 +1,4 @@
-"""The story of a night as it is told to us, kept line by line so that a restart loses nothing."""
+"""The events of a night, saved line by line so that a restart loses nothing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
 from afspm.record.drawing.raster import indices, reduced, value_range
-from afspm.record.overview import SOON_NS
+from afspm.record.measurement_history import SOON_NS
 from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64
@@ -23,7 +23,7 @@ THUMBNAIL_PX = 64
 
 @dataclass(frozen=True)
 class Shot:
-    """A scan: when it was finished and began, who was in control then, and a small picture of it."""
+    """A scan with its times, its holder, and a thumbnail."""
 
     time_ns: int
     start_ns: int | None
@@ -33,7 +33,7 @@ class Shot:
 
 @dataclass(frozen=True)
 class NightMark:
-    """Something that a component did or said at a moment: an action, or a verdict on the scan of `of_ns`."""
+    """An action of a component, or its verdict on the scan of `of_ns`."""
 
     time_ns: int
     by: str
@@ -44,11 +44,11 @@ class NightMark:
 
 @dataclass
 class NightRecord:
-    """Everything that the picture shows.
+    """The data of the night's picture.
 
     Attributes:
         routine: times at which thermal-drift was flagged in the normal course of a run; see `Overview.is_routine`.
-        scans_taken: how many scans there were, if not all are among `shots`.
+        scans_taken: the number of scans, if `shots` is not complete.
     """
 
     shots: list[Shot] = field(default_factory=list)
@@ -62,7 +62,7 @@ class NightRecord:
 
     @classmethod
     def from_lines(cls, lines: Iterable[str]) -> NightRecord:
-        """From the lines that `add` was given; what is no such line is left out."""
+        """Return a record from the lines of its entries; a line that is not an entry is skipped."""
         record = cls()
         for line in lines:
             try:
@@ -73,7 +73,7 @@ class NightRecord:
         return record
 
     def add(self, entry: Plain) -> bool:
-        """Take an entry in; False if it is known already (packets are replayed after a restart)."""
+        """Add an entry; return False for a known one (packets are replayed after a restart)."""
         kind, time_ns = entry["kind"], int(entry["time_ns"])
         identity = f"{kind} {time_ns} {entry.get('by', '')}"
         if identity in self._known:
@@ -98,50 +98,46 @@ class NightRecord:
 
     @property
     def start_ns(self) -> int:
-        """Return the time of the first scan or the first control state."""
+        """The time of the first scan or the first control state."""
         times = [shot.start_ns or shot.time_ns for shot in self.shots] + [t for t, s in self.control if s.holder]
         return min(times, default=self.end_ns)
 
     @property
     def scans(self) -> int:
-        """Return how many scans there were."""
         return len(self.shots) if self.scans_taken is None else self.scans_taken
 
     @property
     def holders(self) -> list[str]:
-        """Return all holders in the order in which they came."""
+        """All holders in the order of their first control."""
         return list(dict.fromkeys(state.holder for _, state in sorted_by_time(self.control) if state.holder))
 
     @property
     def problems(self) -> list[int]:
-        """Return all problems in the order in which they were flagged, but for routine ones."""
+        """All problems except routine ones, in the order of their first flag."""
         found = dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems)
         return [problem for problem in found if self.problem_spans(problem)]
 
     def holder_of(self, shot: Shot) -> str | None:
-        """Return the holder when a scan began; if that was not seen, when it ended."""
+        """Return the holder at the start of a scan; at its end if the start was not observed."""
         if shot.start_ns is not None:
             return shot.holder
         before = [state for time_ns, state in sorted_by_time(self.control) if time_ns < shot.time_ns]
         return before[-1].holder if before else None
 
     def control_spans(self, holder: str) -> list[Span]:
-        """Return the spans in which a component was in control."""
         return self._spans(lambda state: state.holder == holder, holder)
 
     def problem_spans(self, problem: int) -> list[Span]:
-        """Return the spans in which a problem was flagged, but for routine ones."""
+        """Return the spans in which a problem was flagged, except routine ones."""
         spans = self._spans(lambda state: problem in state.problems)
         if problem != Problem.THERMAL_DRIFT:
             return spans
         return [span for span in spans if all(abs(span.start_ns - ns) > SOON_NS for ns in self.routine)]
 
     def manual_spans(self) -> list[Span]:
-        """Return the spans of manual mode."""
         return self._spans(lambda state: state.mode is ControlMode.MANUAL)
 
     def bad_ns(self) -> frozenset[int]:
-        """Return the times of the scans that are bad."""
         verdicts = [(m.of_ns, m.score) for m in self.marks if m.of_ns is not None and m.score is not None]
         flagged_ns = {number: [span.start_ns for span in self.problem_spans(number)] for number in self.problems}
         return bad_scans([shot.time_ns for shot in self.shots], verdicts, flagged_ns, self.interruptions)
@@ -154,12 +150,10 @@ class NightRecord:
 
 
 def sorted_by_time(control: list[tuple[int, ControlState]]) -> list[tuple[int, ControlState]]:
-    """Control states oldest first."""
     return sorted(control, key=lambda pair: pair[0])
 
 
 def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | None) -> dict[str, object]:
-    """A scan as an entry."""
     picture = thumbnail(scan.values)
     return {
         "kind": "scan",
@@ -172,7 +166,6 @@ def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | Non
 
 
 def control_entry(state: ControlState, time_ns: int) -> dict[str, object]:
-    """A control state as an entry."""
     problems = list(state.problems)
     return {
         "kind": "control",
@@ -186,11 +179,10 @@ def control_entry(state: ControlState, time_ns: int) -> dict[str, object]:
 def mark_entry(
     by: str, what: str, time_ns: int, score: float | None = None, of_ns: int | None = None
 ) -> dict[str, object]:
-    """An action done, or a verdict, as an entry."""
     return {"kind": "mark", "time_ns": time_ns, "by": by, "what": what, "score": score, "of_ns": of_ns}
 
 
 def thumbnail(values: NDArray[np.float64], largest_px: int = THUMBNAIL_PX) -> NDArray[np.uint8]:
-    """Return a scan as a small picture [y, x] of indices into a colour map, flattened as all small pictures are."""
+    """Return a small levelled image of a scan, [y, x], as indices into a colour map."""
     small = flattened(reduced(values, largest_px))
     return indices(small, value_range(small))

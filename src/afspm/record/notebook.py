@@ -21,12 +21,12 @@ _LARGEST_PX = 256
 
 
 def scan_html(scan: Scan) -> str:
-    """Return the scan as an image with y upwards, scale bar and colour bar, and a line that says what it is."""
+    """Return the scan as an image with y upwards, scale bar, colour bar and a caption."""
     region, (rows, columns) = scan.region, scan.shape
     angle = f", turned by {np.degrees(region.angle_rad):.4g}°" if region.angle_rad else ""
     caption = (
         f"<b>{escape(scan.channel)}</b> [{escape(scan.unit)}] {columns} × {rows} px, {typeset_area(region.size_m)} "
-        f"at {typeset_position(region.center_m)}{angle}<br/>{_when(scan.time_ns)}"
+        f"at {typeset_position(region.center_m)}{angle}<br/>{_time_text(scan.time_ns)}"
     )
     if scan.values.size == 0:
         return f"<figure>{_caption(f'{caption}, no values')}</figure>"
@@ -37,7 +37,7 @@ def scan_html(scan: Scan) -> str:
 
 
 def scans_html(scans: Iterable[Scan]) -> str:
-    """Return channels in a row, which wraps where there is no room."""
+    """Return channels side by side; the row wraps."""
     return f'<div style="display:flex;flex-wrap:wrap;gap:12px">{"".join(map(scan_html, scans))}</div>'
 
 
@@ -45,12 +45,12 @@ def _caption(text: str) -> str:
     return f'<figcaption style="max-width:320px">{text}</figcaption>'
 
 
-def _when(time_ns: int | None) -> str:
+def _time_text(time_ns: int | None) -> str:
     return "time unknown" if time_ns is None else day_and_time(time_ns, UTC)
 
 
 def spectrum_html(spectrum: Spectrum) -> str:
-    """Return every variable against the first one, each way of it, as small charts in a row."""
+    """Return small charts of every variable over the first, side by side."""
     swept = spectrum.values[:, 0]
     x = Axis.over(spectrum.names[0], spectrum.units[0], swept)
     drawn = "".join(
@@ -58,5 +58,5 @@ def spectrum_html(spectrum: Spectrum) -> str:
         for name, unit, values in zip(spectrum.names[1:], spectrum.units[1:], spectrum.values.T[1:], strict=True)
     )
     place = "" if spectrum.position_m is None else f" at {typeset_position(spectrum.position_m)}"
-    head = f"<b>{escape(spectrum.kind)}</b>{place}, {_when(spectrum.time_ns)}"
+    head = f"<b>{escape(spectrum.kind)}</b>{place}, {_time_text(spectrum.time_ns)}"
     return f'<div>{head}<div style="display:flex;flex-wrap:wrap">{drawn}</div></div>'

@@ -1,4 +1,4 @@
-"""Notes that are written after the end of a run, into its record."""
+"""Notes written into the record after the end of a run."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ _STEP_NS = 1_000
 def append_note(
     folder: Path, who: str, text: str, written_ns: int, scan_ns: int | None = None, time_ns: int | None = None
 ) -> Note:
-    """Append a note to the record of a run that is over, in the form in which the scheduler publishes it.
+    """Append a note to the record of an ended run, in the form in which the scheduler publishes notes.
 
     Args:
         folder: of the run.
         who: the author.
         written_ns: real time.
-        scan_ns: of the scan that it belongs to.
-        time_ns: the moment that it is about; None: when the scan was finished, or the end of the run.
+        scan_ns: time of the scan that the note is about.
+        time_ns: the moment that the note is about; None: the end of the scan, or of the run.
 
     Raises:
         InvalidValue: the text is empty or too long.

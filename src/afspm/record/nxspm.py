@@ -1,4 +1,4 @@
-"""The parts of NXspm, and of NXsts for spectra over the bias, beside the values: technique, instrument, sample …"""
+"""The parts of NXspm, and of NXsts for spectra over the bias, except the values: technique, instrument, sample …"""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ if TYPE_CHECKING:
     import h5py
 
 _VERSION: Final = "v2024.02"
-"""Of the NeXus definitions."""
+"""The version of the NeXus definitions."""
 _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
 
 
 def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
-    """Return the definition that a spectrum follows: NXsts for one over the bias of a tunnelling microscope."""
+    """Return the NeXus definition of a spectrum: NXsts for one over the bias of a tunnelling microscope."""
     is_over_bias = spectrum.units[:1] == ("V",) and len(spectrum.values) > 0
     is_tunnelling = metadata.get("technique") in (_TECHNIQUE, _BIAS_TECHNIQUE)
     return BIAS_SPECTRUM if is_over_bias and is_tunnelling else DEFINITION
 
 
 def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: str) -> h5py.Group:
-    """Write what holds for the whole file, and return the instrument. What is not known is left out."""
+    """Write the facts about the whole file and return the instrument's group; unknown facts are left out."""
     entry["definition"] = definition
     entry["definition"].attrs["version"] = _VERSION
     metadata: Mapping[str, str] = about.get("metadata") or {}
@@ -59,19 +59,18 @@ def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: s
 
 
 def write_frame(instrument: h5py.Group, scan: Scan) -> None:
-    """Write region and pixels of a scan: start and end are those of the frame before it was turned."""
+    """Write region and pixels of a scan; start and end are those of the unrotated frame."""
     rows, columns = scan.shape
     _write_pattern(instrument, scan.region.center_m, scan.region, (columns, rows))
 
 
 def write_point(instrument: h5py.Group, spectrum: Spectrum) -> None:
-    """Write where the probe was, as a scan of one point."""
+    """Write the position of the probe, as a scan of one point."""
     if spectrum.position_m is not None:
         _write_pattern(instrument, spectrum.position_m, None, (1, 1))
 
 
 def write_bias_sweep(entry: h5py.Group, instrument: h5py.Group, spectrum: Spectrum) -> None:
-    """Write the sweep of a spectrum over the bias."""
     entry["scan_mode"] = "constant height"  # the feedback is held while the bias is swept
     environment = group(instrument, "bias_spectroscopy_environment", "NXenvironment")
     spectroscopy = group(environment, "bias_spectroscopy", "NXspm_bias_spectroscopy")
@@ -112,7 +111,6 @@ def _write_pattern(
 
 
 def group(parent: h5py.Group, name: str, nexus_class: str) -> h5py.Group:
-    """Create a group of a NeXus class."""
     made = parent.create_group(name)
     made.attrs["NX_class"] = nexus_class
     return made

@@ -1,4 +1,4 @@
-"""`Overview`: what an experiment has come to, from all that is published. Terminal, dashboard and report show it."""
+"""`Overview`: the state and history of an experiment, reduced from its packets. Terminal, page and report show it."""
 
 from __future__ import annotations
 
@@ -6,22 +6,17 @@ import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from statistics import median
-from typing import Any, TypeVar
-
-import numpy as np
+from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import WireError
-from afspm.basics.units import convert, same_kind
 from afspm.model import (
     ControlEvent,
     ControlMode,
     ControlRequest,
     ControlState,
     Feedback,
-    Frame,
     JournalEntries,
     JournalEntry,
     LogLine,
@@ -34,8 +29,6 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
-    Region,
-    RegistrationOutcome,
     RescanKind,
     Scan,
     ScanLines,
@@ -45,11 +38,17 @@ from afspm.model import (
     Spectrum,
     registration_summary,
 )
-from afspm.model.drift_mapping import drift_at, drift_knowledge
 from afspm.model.events import PERSON
-from afspm.model.geometry import XY
-from afspm.record.running_scan import DoneScan, RunningScan
-from afspm.record.timeline import Span, Timeline
+from afspm.record.measurement_history import (
+    SOON_NS,
+    DriftPoint,
+    FoundPlace,
+    MeasurementHistory,
+    ScanSummary,
+    SpectrumSummary,
+)
+from afspm.record.running_scan import RunningScan
+from afspm.record.timeline import Span, Timeline, Timelines
 
 __all__ = [
     "ROUTINE",
@@ -66,110 +65,17 @@ __all__ = [
 
 MOST_LINES = 2_000
 MOST_ENTRIES = 5_000
-MOST_MEASURED = 100_000
-MOST_TARGETS = 1_000
-SOON_NS = 1_000_000_000
-OLD_S = 6.0  # real; a supervisor says how its processes are every 2 s
+OLD_S = 6.0  # real time; a supervisor reports its processes every 2 s
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
-"""Of a process of which nothing more is to be heard."""
-COMPARED = 5  # scans before, by which it is told how long one takes
-NOBODY = None
+"""Conditions after which a process reports nothing more."""
+FREE = None
 ROUTINE = "normal at the start: the first scan is taken in both directions, which gives the velocity of the drift"
-"""Why a problem that is flagged in the normal course of a run is none."""
-K = TypeVar("K")
-V = TypeVar("V")
-
-
-@dataclass(frozen=True, slots=True)
-class ScanSummary:
-    """One channel of a scan, without its values.
-
-    Attributes:
-        time_ns: when it was finished, or interrupted.
-        began_ns: None if that was not seen.
-        shape: (rows, columns).
-        holder: who was in control; None if nobody was, or it is not known.
-        interrupted: only a part of it was taken.
-        setpoint: of the feedback when it began, in the unit of the operating mode; None if it was not published.
-        number: of the scan in the run, from 1; its channels have the same.
-    """
-
-    time_ns: int
-    began_ns: int | None
-    channel: str
-    unit: str
-    region: Region
-    shape: tuple[int, int]
-    filename: str = ""
-    holder: str | None = None
-    interrupted: bool = False
-    setpoint: float | None = None
-    number: int = 0
-
-    def is_of_scan(self, other: ScanSummary) -> bool:
-        """Return whether both are channels of one scan."""
-        if self.channel == other.channel or self.region != other.region:
-            return False
-        if self.began_ns is not None and other.began_ns is not None:
-            return self.began_ns == other.began_ns
-        return abs(self.time_ns - other.time_ns) <= SOON_NS
-
-
-@dataclass(frozen=True, slots=True)
-class SpectrumSummary:
-    """A spectrum, without its values. `position_m` is (x, y) in `frame`; None if it is not known."""
-
-    time_ns: int
-    kind: str
-    position_m: XY | None
-    frame: Frame
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    filename: str = ""
-    holder: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class FoundPlace:
-    """A place that a component has found, with its score if it gave one."""
-
-    xy_m: XY
-    score: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class DriftPoint:
-    """The drift after one scan.
-
-    Attributes:
-        translation_m: (x, y) displacement of the sample under the tip since the start, in tip coordinates.
-        rate_m_s: (x, y) velocity of the sample then.
-        matched: whether the scan was registered; else this is a prediction.
-        lost: it is not known any more where the sample is.
-        correcting: whether components were given sample coordinates.
-        reason: why it was not registered, or only coarsely.
-        outcome: how the position of the scan is known.
-        sd_m: standard deviation of the position along the axis where it is largest; None: not known.
-        failures: the number of errors of the estimator over the scan.
-        filename: of the scan.
-    """
-
-    time_ns: int
-    translation_m: XY
-    rate_m_s: XY
-    matched: bool = True
-    lost: bool = False
-    correcting: bool = False
-    reason: str = ""
-    outcome: RegistrationOutcome = RegistrationOutcome.REGISTERED
-    sd_m: float | None = None
-    failures: int = 0
-    filename: str = ""
+"""The explanation of a routine problem."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessRestart:
-    """A process was started anew: the `starts`-th time, after it had ended as `last_exit` says."""
+    """A restart of a process: its `starts`-th start, after an exit described by `last_exit`."""
 
     time_ns: int
     name: str
@@ -177,24 +83,51 @@ class ProcessRestart:
     last_exit: str
 
 
-class Overview:
-    """Reduces packets to what is so and what has happened. Nothing of it depends on clocks, sockets or files.
+@dataclass(slots=True)
+class Readings:
+    """The newest settings and position of the microscope; None before the first packet of each."""
 
-    A packet that was taken already changes nothing, so that replays can be given to it as they come; of each
-    envelope the packets are to come in the order of their times.
+    scan_parameters: ScanParameters | None = None
+    feedback: Feedback | None = None
+    probe_position: ProbePosition | None = None
+
+
+class ProcessHistory:
+    """The past conditions and restarts of the processes.
+
+    Attributes:
+        timelines: of the conditions of each process, by name; a busy process counts as alive.
+        reported_ns: the time of the last report on each process, by name.
+        restarts: newest last, bounded.
+    """
+
+    def __init__(self, most_restarts: int) -> None:
+        self.timelines: defaultdict[str, Timeline] = defaultdict(Timeline)
+        self.reported_ns: dict[str, int] = {}
+        self.restarts: deque[ProcessRestart] = deque(maxlen=most_restarts)
+
+    def add(self, state: ProcessState, starts_before: int, time_ns: int) -> None:
+        self.reported_ns[state.name] = time_ns
+        condition = ProcessCondition.ALIVE if state.condition is ProcessCondition.BUSY else state.condition
+        lane = self.timelines[state.name]
+        lane.change(condition.name.lower().replace("_", " "), max(state.since_ns, lane.changed_ns or 0))
+        if state.starts > starts_before:
+            self.restarts.append(ProcessRestart(state.since_ns, state.name, state.starts, state.last_exit))
+
+
+class Overview:
+    """Reduces packets to the present state and the history of an experiment. Pure: no clock, socket or file.
+
+    A packet older than the newest of its envelope is ignored, so replayed packets may be given as they arrive.
 
     Args:
-        problems: their names, by which it is found in the journal who flagged them.
+        problems: their names; the journal is searched by them for the component that flagged a problem.
 
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
-        status, control, scan_parameters, feedback, probe_position: the newest of each; None before the first.
-        processes, told_progress: by name; `processes_told_ns`: when each process was told of last.
+        status, control: the newest; None before the first.
+        processes, progress_reports: the newest of each, by name.
         log, notes, entries, refusals: newest last, bounded.
-        targets: the places that components have found, as each told last.
-        controls: lane of who was in control; `modes`, `states`: lanes of mode and scope state, in lower case.
-        problem_timelines: by number; `process_timelines`: by name. A process that is busy counts as alive.
-        running: the scan that is being taken; None if none is.
     """
 
     def __init__(self, problems: ProblemNames | None = None, *, most_entries: int = MOST_ENTRIES) -> None:
@@ -202,48 +135,43 @@ class Overview:
         self.newest_ns = 0
         self.status: ScopeStatus | None = None
         self.control: ControlState | None = None
-        self.scan_parameters: ScanParameters | None = None
-        self.feedback: Feedback | None = None
-        self.probe_position: ProbePosition | None = None
+        self.readings = Readings()
         self.processes: dict[str, ProcessState] = {}
-        self.processes_told_ns: dict[str, int] = {}
-        self.told_progress: dict[str, Progress] = {}
+        self.progress_reports: dict[str, Progress] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
         self.refusals: deque[JournalEntry] = deque(maxlen=most_entries)
-        self.controls, self.modes, self.states = Timeline(), Timeline(), Timeline()
-        self.problem_timelines: defaultdict[int, Timeline] = defaultdict(Timeline)
-        self.process_timelines: defaultdict[str, Timeline] = defaultdict(Timeline)
-        self.restarts: deque[ProcessRestart] = deque(maxlen=most_entries)
-        self.running: RunningScan | None = None
-        self._targets: dict[str, tuple[FoundPlace, ...]] = {}
-        self._done: deque[DoneScan] = deque(maxlen=20)
-        self._scans: dict[tuple[object, ...], ScanSummary] = {}
-        self._spectra: dict[tuple[object, ...], SpectrumSummary] = {}
-        self._drift: dict[int, DriftPoint] = {}
-        self._opposite_ns: deque[int] = deque(maxlen=20)
-        self._taken_ns: dict[str, int] = {}
+        self.timelines = Timelines()
+        self.process_history = ProcessHistory(most_entries)
+        self._measured = MeasurementHistory()
+        self._newest_of: dict[str, int] = {}
 
     @property
     def scans(self) -> Sequence[ScanSummary]:
-        """One for each channel of each scan, in the order in which they came."""
-        return tuple(self._scans.values())
+        """A summary for each channel of each scan, in the order of arrival."""
+        return self._measured.scans
 
     @property
     def spectra(self) -> Sequence[SpectrumSummary]:
-        """In the order in which they came."""
-        return tuple(self._spectra.values())
+        return self._measured.spectra
 
     @property
     def drift(self) -> Sequence[DriftPoint]:
-        """In the order in which they came."""
-        return tuple(self._drift.values())
+        return self._measured.drift
+
+    @property
+    def targets(self) -> Sequence[FoundPlace]:
+        return self._measured.places
+
+    @property
+    def running(self) -> RunningScan | None:
+        return self._measured.running
 
     @property
     def registration(self) -> str:
-        """Return how many scans were registered, for people; empty where drift is not followed."""
-        return registration_summary(point.outcome for point in self._drift.values()) if self._drift else ""
+        """The number of registered scans, as text; empty without drift correction."""
+        return registration_summary(point.outcome for point in self.drift) if self.drift else ""
 
     def is_routine(self, span: Span | None) -> bool:
         """Return whether a problem is flagged in the normal course of a run.
@@ -252,22 +180,22 @@ class Overview:
         """
         if span is None or span.label != self.problems.name(Problem.THERMAL_DRIFT):
             return False
-        return any(abs(span.start_ns - asked_ns) <= SOON_NS for asked_ns in self._opposite_ns)
+        return any(abs(span.start_ns - asked_ns) <= SOON_NS for asked_ns in self._measured.opposite_ns)
 
     @property
     def problem_spans(self) -> list[Span]:
-        """The spans of all problems in the order of time, without those that are routine."""
-        spans = (span for lane in self.problem_timelines.values() for span in lane.spans)
+        """The spans of all problems except routine ones, in the order of time."""
+        spans = (span for lane in self.timelines.problems.values() for span in lane.spans)
         return sorted((span for span in spans if not self.is_routine(span)), key=lambda span: span.start_ns)
 
     @property
     def routine_spans(self) -> list[Span]:
         """The spans of problems that are routine; see `is_routine`."""
-        return [s for lane in self.problem_timelines.values() for s in lane.spans if self.is_routine(s)]
+        return [s for lane in self.timelines.problems.values() for s in lane.spans if self.is_routine(s)]
 
     @property
     def in_control(self) -> str:
-        """The holder of control; in MANUAL the person who set that mode, or "a person"; empty: it is free."""
+        """The holder of control; in MANUAL the person who set that mode, or "a person"; empty if the scope is free."""
         if self.control is None:
             return ""
         if self.control.mode is not ControlMode.MANUAL:
@@ -279,139 +207,102 @@ class Overview:
 
     @property
     def ended_ns(self) -> int | None:
-        """When the experiment ended; None: it goes on, was stopped, or was cut off."""
+        """The end of the experiment; None if it continues, was stopped, or was cut off."""
         entries = reversed(self.entries)
         return next((one.time_ns for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
 
     @property
     def note_spans(self) -> list[Span]:
-        """The notes as spans without length, for time lines."""
+        """The notes as spans of zero length, for timelines."""
         spans = [Span(note.text, note.time_ns, note.time_ns, note.who) for note in self.notes]
         return sorted(spans, key=lambda span: span.start_ns)
 
     @property
-    def targets(self) -> Sequence[FoundPlace]:
-        """Of each channel, those of the newest list."""
-        return tuple(target for found in self._targets.values() for target in found)
-
-    @property
     def progress(self) -> dict[str, tuple[int, int]]:
-        """(done, of) of each component that says how far it is."""
-        return {name: (told.done, told.of) for name, told in self.told_progress.items()}
+        """(done, total) of each component that reports its progress."""
+        return {name: (report.done, report.of) for name, report in self.progress_reports.items()}
 
     @property
     def control_since_ns(self) -> int | None:
-        """Since when whoever is in control is, or nobody is; None if nothing is known."""
+        """The time of the last change of control; in MANUAL, of the mode. None if it is unknown."""
         is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL
-        return self.modes.changed_ns if is_manual else self.controls.changed_ns
+        return self.timelines.mode.changed_ns if is_manual else self.timelines.control.changed_ns
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
-        """Of the running scan: (the part that is done, 0 to 1, and how many ns remain); None if that is not known."""
-        if self.running is None:
-            return None
-        took_ns = [scan.took_ns for scan in reversed(self._done) if scan.resembles(self.running)][:COMPARED]
-        return self.running.progress(now_ns, round(median(took_ns)) if took_ns else None)
+        """Return (fraction done, ns remaining) of the running scan; None if it can't be estimated."""
+        return self._measured.scan_progress(now_ns)
 
-    def unheard_ns(self, name: str, speed: float) -> int | None:
-        """For how long nobody has said how a process is, while others are told of: its computer is gone. None: not so.
+    def silent_ns(self, name: str, speed: float) -> int | None:
+        """Return the time since the last report on a process; None while reports on it come.
+
+        Other packets arrive meanwhile: the computer of the process is gone.
 
         Args:
             speed: experiment seconds in a real second.
         """
-        silent_ns = self.newest_ns - self.processes_told_ns.get(name, self.newest_ns)
+        silent_ns = self.newest_ns - self.process_history.reported_ns.get(name, self.newest_ns)
         return silent_ns if silent_ns > OLD_S * speed * NS_PER_S else None
 
     def take(self, message: str, thing: object, time_ns: int, envelope: str = "") -> None:
-        """Take in what was published.
+        """Process a published packet. Unknown messages are ignored.
 
         Args:
             message: its name, e.g. "Scan2d".
-            thing: as `wire.decode` gives it. What is not known is passed over.
+            thing: as `wire.decode` returns it.
             time_ns: of the packet.
-            envelope: of the packet; without it, the name of the message.
+            envelope: of the packet; by default the name of the message.
         """
         key = envelope or message
-        # a scheduler stamps each packet anew: of one envelope, what is not newer came before
-        if time_ns <= self._taken_ns.get(key, -1):
+        # a scheduler gives each packet a new time: within one envelope, a packet that is not newer is a repetition
+        if time_ns <= self._newest_of.get(key, -1):
             return
-        self._taken_ns[key] = time_ns
+        self._newest_of[key] = time_ns
         self.newest_ns = max(self.newest_ns, time_ns)
         handler: Callable[[object, int], None] | None = getattr(self, f"_{_handler(message)}", None)
         if handler is not None:
             handler(thing, time_ns)
 
+    @property
+    def _holder(self) -> str | None:
+        return self.control.holder if self.control else None
+
     def _on_state(self, status: ScopeStatus, time_ns: int) -> None:
         before, self.status = self.status, status
-        self.states.change(sys.intern(status.state.name.lower()), time_ns)
+        self.timelines.scope_state.change(sys.intern(status.state.name.lower()), time_ns)
         if status.state is ScopeState.SCANNING:
             if before is None or before.state is not ScopeState.SCANNING or self.running is None:
-                holder = self.control.holder if self.control else None
-                setpoint = self.feedback.setpoint if self.feedback else None
-                self.running = RunningScan(time_ns if before else None, holder, self.scan_parameters, setpoint)
-            return
-        if status.state is ScopeState.FREE and self.running is not None and self.running.began_ns is not None:
-            self._done.append(DoneScan(self.running.parameters, time_ns - self.running.began_ns))
-        if status.state is ScopeState.INTERRUPTED and self.running is not None:
-            self._take_interrupted(self.running, time_ns)
-        if status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
-            self.running = None
-
-    def _take_interrupted(self, running: RunningScan, time_ns: int) -> None:
-        for channel, lines in running.channels.items():
-            self._add_scan(
-                ScanSummary(
-                    time_ns, running.began_ns, channel, lines.unit, lines.region, lines.shape,
-                    holder=running.holder, interrupted=True,
+                readings = self.readings
+                setpoint = readings.feedback.setpoint if readings.feedback else None
+                self._measured.running = RunningScan(
+                    time_ns if before else None, self._holder, readings.scan_parameters, setpoint
                 )
-            )  # fmt: skip
+        elif status.state in (ScopeState.FREE, ScopeState.INTERRUPTED):
+            self._measured.end_scan(time_ns, interrupted=status.state is ScopeState.INTERRUPTED)
 
     def _on_scan_lines(self, lines: ScanLines, time_ns: int) -> None:
         if self.running is not None:
             self.running.take(lines)
 
     def _on_scan(self, scan: Scan, time_ns: int) -> None:
-        began_ns, holder = None, self.control.holder if self.control else None
-        if self.running is not None:
-            began_ns, holder = self.running.began_ns, self.running.holder
-        self._add_scan(
-            ScanSummary(
-                scan.time_ns or time_ns, began_ns, scan.channel, scan.unit, scan.region, scan.shape, scan.filename,
-                holder,
-            )
-        )  # fmt: skip
-
-    def _add_scan(self, taken: ScanSummary) -> None:
-        last = next(reversed(self._scans.values()), None)
-        taken = _sharing(taken, last)
-        key = (taken.time_ns, taken.channel, taken.region, taken.interrupted)
-        if key in self._scans:
-            return
-        before = 0 if last is None else last.number
-        number = before if last is not None and taken.is_of_scan(last) else before + 1
-        setpoint = self.running.setpoint if self.running else None
-        _keep(self._scans, key, replace(taken, number=number, setpoint=setpoint))
+        self._measured.add_scan(scan, time_ns, self._holder)
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
-        taken_ns, holder = spectrum.time_ns or time_ns, self.control.holder if self.control else None
-        taken = SpectrumSummary(
-            taken_ns, spectrum.kind, spectrum.position_m, spectrum.frame, spectrum.names, spectrum.units,
-            spectrum.filename, holder,
-        )  # fmt: skip
-        _keep(self._spectra, (taken_ns, spectrum.kind, spectrum.position_m), taken)
+        self._measured.add_spectrum(spectrum, time_ns, self._holder)
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control
-        self.controls.change(control.holder or NOBODY, time_ns)
-        self.modes.change(control.mode.name.lower() if control.mode is not ControlMode.UNDEFINED else None, time_ns)
-        for number in {*control.problems, *self.problem_timelines}:
-            lane = self.problem_timelines[number]
+        self.timelines.control.change(control.holder or FREE, time_ns)
+        self.timelines.mode.change(
+            control.mode.name.lower() if control.mode is not ControlMode.UNDEFINED else None, time_ns
+        )
+        for number in {*control.problems, *self.timelines.problems}:
+            lane = self.timelines.problems[number]
             if number in control.problems and lane.now is None:
                 lane.change(self.problems.name(number), time_ns, by=self._flagger(number, time_ns))
             elif number not in control.problems:
                 lane.change(None, time_ns)
 
     def _flagger(self, number: int, time_ns: int) -> str:
-        """Return the component that asked for a problem to be flagged just before."""
         for entry in reversed(self.entries):
             if entry.time_ns < time_ns - SOON_NS:
                 break
@@ -421,7 +312,7 @@ class Overview:
 
     def _on_journal_entries(self, entries: JournalEntries, time_ns: int) -> None:
         for entry in entries.entries:
-            # thousands of entries are kept, and most have the same words
+            # thousands of entries are kept, and most have equal texts
             who, what, kind = map(sys.intern, (entry.who, entry.what, entry.kind))
             entry = replace(entry, who=who, what=what, kind=kind)
             self.entries.append(entry)
@@ -430,40 +321,35 @@ class Overview:
                 continue
             if entry.kind == "control":
                 self._take_change(entry)
-            for number, lane in self.problem_timelines.items():
+            for number, lane in self.timelines.problems.items():
                 # the batch comes a moment after the control state that it explains
                 is_near = bool(lane.spans) and abs(lane.spans[-1].start_ns - entry.time_ns) <= SOON_NS
                 if is_near and _flags(entry, number):
                     lane.name_last(entry.who)
 
     def _take_change(self, entry: JournalEntry) -> None:
-        """Take a change from the journal, which a late joiner has not seen as a state."""
+        # a late joiner has received the journal, but not the control states of that time
+        lanes = self.timelines
         match entry.event:
             case ControlEvent.CONTROL_GAINED:
-                self.controls.change(entry.who, entry.time_ns)
+                lanes.control.change(entry.who, entry.time_ns)
             case ControlEvent.CONTROL_LOST:
-                self.controls.change(None, entry.time_ns)
+                lanes.control.change(FREE, entry.time_ns)
             case ControlEvent.MODE_CHANGED if entry.mode is not None:
-                self.modes.change(entry.mode.name.lower(), entry.time_ns)
+                lanes.mode.change(entry.mode.name.lower(), entry.time_ns)
             case ControlEvent.PROBLEM_FLAGGED | ControlEvent.PROBLEM_CLEARED if entry.problem is not None:
                 is_flagged = entry.event is ControlEvent.PROBLEM_FLAGGED
                 label = self.problems.name(entry.problem) if is_flagged else None
-                self.problem_timelines[entry.problem].change(label, entry.time_ns, by=entry.who)
+                lanes.problems[entry.problem].change(label, entry.time_ns, by=entry.who)
 
     def _on_process_states(self, states: ProcessStates, time_ns: int) -> None:
         for state in states.processes:
-            self.processes_told_ns[state.name] = time_ns
-            before, self.processes[state.name] = self.processes.get(state.name), state
-            condition = state.condition
-            if condition is ProcessCondition.BUSY:
-                condition = ProcessCondition.ALIVE
-            lane = self.process_timelines[state.name]
-            lane.change(condition.name.lower().replace("_", " "), max(state.since_ns, lane.changed_ns or 0))
-            if state.starts > (before.starts if before else 1):
-                self.restarts.append(ProcessRestart(state.since_ns, state.name, state.starts, state.last_exit))
+            before = self.processes.get(state.name)
+            self.processes[state.name] = state
+            self.process_history.add(state, before.starts if before else 1, time_ns)
 
     def _on_progress(self, progress: Progress, time_ns: int) -> None:
-        self.told_progress[progress.name] = progress
+        self.progress_reports[progress.name] = progress
 
     def _on_log_lines(self, lines: LogLines, time_ns: int) -> None:
         self.log.extend(lines.lines)
@@ -472,56 +358,23 @@ class Overview:
         self.notes.append(note)
 
     def _on_drift_mapping(self, message: Any, time_ns: int) -> None:
-        if len(message.matrix) != 6 or len(message.center) != 2:
-            return
-        drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
-        rate = tuple(message.rate) if len(message.rate) == 2 else (0.0, 0.0)
-        at_ns = message.timestamp.ToNanoseconds()
-        point = DriftPoint(
-            at_ns, (float(drift_x), float(drift_y)), rate, message.matched, message.lost, message.correcting,
-            message.reason, *drift_knowledge(message), message.failures, message.filename,
-        )  # fmt: skip
-        _keep(self._drift, at_ns, point)
+        self._measured.add_drift(message)
 
     def _on_drift_rescan(self, message: Any, time_ns: int) -> None:
         if message.kind == RescanKind.OPPOSITE:
-            self._opposite_ns.append(message.timestamp.ToNanoseconds())
+            self._measured.opposite_ns.append(message.timestamp.ToNanoseconds())
 
     def _on_spatial_point_with_score_list(self, message: Any, time_ns: int) -> None:
-        found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
-        self._targets[message.channel] = tuple(
-            FoundPlace(
-                (convert(point.x, unit, "m"), convert(point.y, unit, "m")),
-                one.score if one.HasField("score") else None,
-            )
-            for point, unit, one in found
-            if same_kind(unit, "m")
-        )
+        self._measured.set_places(message)
 
     def _on_scan_parameters(self, parameters: ScanParameters, time_ns: int) -> None:
-        self.scan_parameters = parameters
+        self.readings.scan_parameters = parameters
 
     def _on_feedback(self, feedback: Feedback, time_ns: int) -> None:
-        self.feedback = feedback
+        self.readings.feedback = feedback
 
     def _on_probe_position(self, position: ProbePosition, time_ns: int) -> None:
-        self.probe_position = position
-
-
-def _sharing(taken: ScanSummary, last: ScanSummary | None) -> ScanSummary:
-    # a page keeps up to a hundred thousand: equal parts of channels and scans are kept once
-    channel, unit = sys.intern(taken.channel), sys.intern(taken.unit)
-    if last is None:
-        return replace(taken, channel=channel, unit=unit)
-    return replace(
-        taken,
-        channel=channel,
-        unit=unit,
-        time_ns=_one(last.time_ns, taken.time_ns),
-        region=_one(last.region, taken.region),
-        shape=_one(last.shape, taken.shape),
-        filename=_one(last.filename, taken.filename),
-    )
+        self.readings.probe_position = position
 
 
 def _handler(message: str) -> str:
@@ -531,17 +384,6 @@ def _handler(message: str) -> str:
         return ""
 
 
-def _one(before: V, now: V) -> V:
-    return before if before == now else now
-
-
 def _flags(entry: JournalEntry, number: int) -> bool:
     is_flag = entry.event is ControlEvent.PROBLEM_FLAGGED or entry.request == ControlRequest.ADD_EXP_PRBLM
     return is_flag and entry.problem == number
-
-
-def _keep(kept: dict[K, V], key: K, thing: V) -> None:
-    """Add what is not there yet; the oldest goes where there are too many."""
-    kept.setdefault(key, thing)
-    if len(kept) > MOST_MEASURED:
-        del kept[next(iter(kept))]

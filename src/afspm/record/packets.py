@@ -1,4 +1,4 @@
-"""Packets read back from the record: whole, or without the values that are in files; and played back in time."""
+"""Packets read from the record, whole or without the values that are in files, and their playback in time."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from afspm.storage.formats.content import FileContent
 
 Query = Callable[[str, Sequence[object]], list[Row]]
-"""Asks the journal; raises FileError where it is damaged."""
+"""Runs a query on the journal; raises FileError where it is damaged."""
 
 _AT_ONCE = 500
 _FILES_KEPT = 4
-_LAST = chr(0x10FFFF)  # after every envelope
+_LAST = chr(0x10FFFF)  # sorts after every envelope
 _COLUMNS = "time_ns, envelope, message, payload, scan, spectrum, channel, first_row, rows"
 
 
 class Timed(Protocol):
-    """Something recorded, with the time at which it was published."""
+    """A recorded item with the time of its publication."""
 
     @property
     def time_ns(self) -> int | None: ...
@@ -41,9 +41,9 @@ T = TypeVar("T", bound=Timed)
 
 
 class RecordPlayback(Generic[T]):
-    """Recorded things, oldest first, each given once its time has come: to a page or to components.
+    """Yields recorded items when they are due, oldest first, to a page or to components.
 
-    Where the time comes from, a clock that runs or the moment that a viewer has chosen, is the caller's affair.
+    The caller provides the time: a running clock, or the moment chosen by a viewer.
     """
 
     def __init__(self, things: Iterable[T]) -> None:
@@ -52,11 +52,11 @@ class RecordPlayback(Generic[T]):
 
     @property
     def next_ns(self) -> int | None:
-        """The time of the next one; None after the last."""
+        """The time of the next item; None after the last."""
         return None if self._next is None else self._next.time_ns or 0
 
     def due(self, now_ns: int) -> Iterator[T]:
-        """Yield those whose time has come; a caller that stops early loses none."""
+        """Yield all items up to `now_ns`; a caller that stops early loses none."""
         while self._next is not None and (self._next.time_ns or 0) <= now_ns:
             thing, self._next = self._next, next(self._things, None)
             yield thing
@@ -85,9 +85,9 @@ def packets(
 def without_reading_files(
     query: Query, frame: Frame, messages: Sequence[str] | None
 ) -> Iterator[tuple[Packet, str, Any]]:
-    """Packets, names of their messages, and what is in them: scans and spectra of the right shape, with NaN for values.
+    """Yield packet, name of its message and decoded content; scans and spectra have the right shape and NaN for values.
 
-    Lines of running scans and what can't be read are left out.
+    Lines of running scans and unreadable packets are left out.
     """
     for time_ns, envelope, message, payload, scan, spectrum, _, _, _ in _rows(query, -1, messages):
         if not message or message == "ScanLines":
@@ -104,7 +104,7 @@ def without_reading_files(
 
 
 def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterator[Row]:
-    """Read some rows at a time, so that a slow reader blocks no writer and sees what is written meanwhile."""
+    # in batches: a slow reader then blocks no writer, and sees rows written meanwhile
     wanted = "" if messages is None else f" AND message IN ({', '.join('?' * len(messages))})"
     sql = f"SELECT {_COLUMNS} FROM packets WHERE source = ? AND (time_ns, envelope) > (?, ?){wanted}"
     sql += f" ORDER BY time_ns, envelope LIMIT {_AT_ONCE}"
@@ -117,7 +117,7 @@ def _rows(query: Query, since_ns: int, messages: Sequence[str] | None) -> Iterat
 def _nan(shape: tuple[int, ...]) -> NDArray[np.float64]:
     import numpy as np
 
-    return np.broadcast_to(np.nan, shape)  # which takes no memory
+    return np.broadcast_to(np.nan, shape)  # a view of one value, so it takes no memory
 
 
 def _placed(thing: object, frame: Frame) -> object:
@@ -129,7 +129,7 @@ def _placed(thing: object, frame: Frame) -> object:
 
 
 class _Values:
-    """The values of packets, from the files that they are in; a few files are kept, since channels come together."""
+    """The values of packets, read from files; a few files stay open, since channels of a scan come together."""
 
     def __init__(self, query: Query, folder: Path) -> None:
         self._query = query
@@ -139,7 +139,7 @@ class _Values:
     def of(
         self, scan: int | None, spectrum: int | None, channel: str | None, first_row: int | None, rows: int | None
     ) -> NDArray[np.float64] | None:
-        """None: the packet is whole as it is. Raises FileError: the file is missing or damaged."""
+        """Return the values of a packet, or None if it contains its values. Raises FileError: missing or damaged."""
         if spectrum is not None:
             return self._content("spectra", spectrum).spectra[0].values
         if scan is None:

@@ -54,7 +54,6 @@ def draw(
 
 
 def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, float]) -> object:
-    """Draw the values, times a factor, over the places of their pixels, in m."""
     x, y = scan.region.pixels_m(scan.shape)
     values = np.ma.masked_invalid(scan.values * factor)
     look = {"cmap": gold(), "vmin": ends[0] * factor, "vmax": ends[1] * factor}
@@ -68,7 +67,7 @@ def _fill(scan: Scan, kind: str, axes: Any, factor: float, ends: tuple[float, fl
 
 
 def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool) -> None:
-    """Add what the first scan in axes needs: units, a colour bar, a scale bar. Others lie over it as they are."""
+    # only for the first scan in these axes: later ones lie over it in the same units and frame
     factor, length_unit = scale(max(scan.region.size_m), "m")
     for axis, name in ((axes.xaxis, "x"), (axes.yaxis, "y")):
         axis.set_major_formatter(lambda place_m, _: f"{place_m * factor:.6g}".replace("-", "−"))
@@ -76,9 +75,9 @@ def _explain(scan: Scan, drawn: object, axes: Any, label: str, *, colorbar: bool
     if hasattr(axes, "set_zlabel"):
         axes.set_zlabel(label)
         return
-    axes.set_facecolor("0.6")  # what was not measured, and behind contour lines
+    axes.set_facecolor("0.6")  # seen at unmeasured pixels, and behind contour lines
     axes.set_aspect("equal")
-    if colorbar:  # in axes within these: as high as the picture, which is rarely as high as its place in the figure
+    if colorbar:  # inset axes: as high as the image, which is rarely as high as its slot in the figure
         axes.figure.colorbar(drawn, cax=axes.inset_axes((1.03, 0.0, 0.05, 1.0)), label=label)
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     draw_scale_bar(axes, (right - left, high - low), (left, low), 1.0)
@@ -91,10 +90,10 @@ def draw_scale_bar(
     """Draw a bar of round length into the lower left corner of a picture.
 
     Args:
-        corner: where the picture begins in the axes.
-        length: a metre in the axes.
+        corner: the lower left corner of the picture, in coordinates of the axes.
+        length: a metre in coordinates of the axes.
         font: size of the label; None: matplotlib's.
-        named: with its length above it.
+        named: label the bar with its length.
     """
     bar_m = round_length_m(size_m[0] / 4.0)
     left, low = corner[0] + 0.05 * size_m[0] * length, corner[1] + 0.05 * size_m[1] * length

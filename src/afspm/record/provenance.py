@@ -1,4 +1,4 @@
-"""The provenance of a measurement, found in the journal among what was published before it."""
+"""The provenance of a measurement, searched in the journal among earlier publications."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeS
 from afspm.model.drift_mapping import drift_knowledge
 
 _BACK = 20
-"""So many states are looked back through for the one in which a measurement began."""
+"""The number of earlier states that are searched for the start of a measurement."""
 
 
 @dataclass(frozen=True)
 class ControlAtStart:
-    """Control and feedback when a measurement began; None: not known."""
+    """Control and feedback at the start of a measurement; None if unknown."""
 
     began_ns: int | None
     control: ControlState | None
     feedback: Feedback | None
 
     def facts(self, problems: ProblemNames) -> Plain:
-        """Return it in JSON's types, by names that people know."""
+        """Return the facts in JSON's types, with readable names."""
         facts: dict[str, object] = {}
         if self.control is not None:
             facts |= {
@@ -47,10 +47,10 @@ class ControlAtStart:
 def control_at_start(
     journal: sqlite3.Connection, time_ns: int, doing: ScopeState, measured_ns: int | None = None
 ) -> ControlAtStart:
-    """Return control and feedback at the start of what was published at `time_ns` and finished at `measured_ns`."""
+    """Return control and feedback at the start of a measurement published at `time_ns`."""
     began_ns = _began(journal, time_ns, doing)
     if began_ns is not None and measured_ns is not None and began_ns > measured_ns:
-        began_ns = None  # its beginning was not seen: this is when a microscope that was started anew told of it
+        began_ns = None  # the start was not observed: a restarted translator published the state later
     at_ns = time_ns if began_ns is None else began_ns
     control, feedback = _last(journal, "ControlState", at_ns), _last(journal, "ZCtrlParameters", at_ns)
     return ControlAtStart(
@@ -61,7 +61,7 @@ def control_at_start(
 
 
 def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filenames: Collection[str]) -> Plain | None:
-    """Return the drift mapping that was published just before a scan; None if there was none.
+    """Return the drift mapping published just before a scan; None if there was none.
 
     Args:
         filenames: of the channels of the scan.
@@ -90,7 +90,6 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
 
 
 def last_state(journal: sqlite3.Connection) -> ScopeState:
-    """Return the microscope's last state in the journal."""
     status = _last(journal, "ScopeStateMsg", 2**63 - 1)
     return status.state if isinstance(status, ScopeStatus) else ScopeState.UNDEFINED
 
@@ -105,7 +104,7 @@ def _began(journal: sqlite3.Connection, time_ns: int, doing: ScopeState) -> int 
     for at_ns, payload in rows:
         status = _decoded("ScopeStateMsg", payload)
         if isinstance(status, ScopeStatus) and status.state is doing:
-            began_ns = at_ns  # a scan that was paused, or told again to a scheduler started anew, began before
+            began_ns = at_ns  # a paused scan, or one published again to a restarted scheduler, began earlier
         elif began_ns is not None or (isinstance(status, ScopeStatus) and status.state is ScopeState.FREE):
             break
     return began_ns

@@ -1,4 +1,4 @@
-"""`open_run`: what is kept of a run, as tables and arrays, read when it is asked for."""
+"""`open_run`: the record of a run as tables and arrays, read on demand."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _SAME_SCAN_NS = 1_000_000_000
 
 
 def open_run(path: str | Path = "runs") -> Run:
-    """Open what is kept of a run; also of one that goes on, or that was killed.
+    """Open the record of a run, also of a running or killed one.
 
         run = afspm.open_run("runs/tip_repair-20261120-040000")
         run.scan(-1)["Height"].to_xarray()
@@ -61,7 +61,7 @@ def open_run(path: str | Path = "runs") -> Run:
         [entry.reason for entry in run.refusals]
 
     Args:
-        path: the folder of the run; or the folder of all runs: its newest is meant. Of a replay, what it replays.
+        path: the folder of the run, or of all runs: then the newest run. A replay opens the replayed run.
 
     Raises:
         FileError: there is no record, or it is damaged.
@@ -70,7 +70,7 @@ def open_run(path: str | Path = "runs") -> Run:
 
 
 class Run:
-    """The record of a run. Everything is read when you ask for it, so of a run that goes on you get the newest.
+    """The record of a run. Every access reads the files again, so a running experiment shows its newest data.
 
     Attributes:
         folder: of the run.
@@ -84,19 +84,19 @@ class Run:
 
     @property
     def scans(self) -> KeyedTable[ScanRow]:
-        """Return one row for each scan, also of interrupted ones, in the order in which they were recorded."""
+        """One row for each scan, also interrupted ones, in the order of recording."""
         return read_scans(self._query)
 
     @property
     def spectra(self) -> SpectrumTable:
-        """Return one row for each spectrum, in the order in which they were recorded."""
+        """One row for each spectrum, in the order of recording."""
         return read_spectra(self._query, self.spectrum)
 
     def scan(self, which: int | str | ScanRow) -> ScanSet:
-        """Return all channels of a scan: by its place in `scans` (-1: the last), its key, or its row.
+        """Return all channels of a scan: by its index in `scans` (-1: the last), its key, or its row.
 
         Raises:
-            FileError: its file is missing or damaged, or it was interrupted before anything of it was seen.
+            FileError: its file is missing or damaged, or it was interrupted before its first line.
             NoSuchItem: there is no such scan.
         """
         row = self.scans[which] if isinstance(which, str) else which
@@ -104,13 +104,13 @@ class Run:
         return ScanSet(self._content(row.file, f"scan {row.number}").scans)
 
     def spectrum(self, which: int | str | SpectrumRow) -> Spectrum:
-        """Return a spectrum: by its place in `spectra` (-1: the last), its key, or its row. Raises as `scan`."""
+        """Return a spectrum: by its index in `spectra` (-1: the last), its key, or its row. Raises as `scan`."""
         row = self.spectra[which] if isinstance(which, str) else which
         row = row if isinstance(row, SpectrumRow) else self._row("spectra", row, spectrum_row)
         return self._content(row.file, f"spectrum {row.number}").spectra[0]
 
     def about(self, row: ScanRow | SpectrumRow) -> dict[str, Any]:
-        """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
+        """Return the facts beside the values: drift, feedback, the controller's header, notes … Raises as `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
         return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
@@ -136,12 +136,12 @@ class Run:
         return film_of(self, scans, channel)
 
     def scan_at(self, time_ns: int, channel: str = "") -> ScanRow | None:
-        """Return the scan that was finished at a time; None if there is none.
+        """Return the scan that ended at a time; None if there is none.
 
-        Channels of one scan may be stamped one after the other, so the time may differ by up to a second.
+        The channels of one scan may have different times, so the time may differ by up to a second.
 
         Args:
-            channel: that it must have; empty: any.
+            channel: required channel; empty: any.
         """
         near = "SELECT * FROM scans WHERE abs(time_ns - ?) <= ? ORDER BY abs(time_ns - ?), number"
         rows = map(scan_row, self._query(near, (time_ns, _SAME_SCAN_NS, time_ns)))
@@ -151,11 +151,11 @@ class Run:
 
     @property
     def notes(self) -> Table[NoteRow]:
-        """Return the notes of persons and components, in the order of the moments that they are about."""
+        """Notes of persons and components, in the order of the moments that they are about."""
         return Table(map(self._note_row, self._notes()), NoteRow)
 
     def notes_on(self, row: ScanRow | SpectrumRow) -> Table[NoteRow]:
-        """Return the notes that belong to a scan."""
+        """Return the notes on a scan."""
         near = (one for one in self._notes() if one.scan_ns and abs(one.scan_ns - row.time_ns) <= _SAME_SCAN_NS)
         return Table(map(self._note_row, near), NoteRow).where(
             lambda note: isinstance(row, ScanRow) and note.scan == row.number
@@ -172,7 +172,7 @@ class Run:
 
     @property
     def journal(self) -> Table[JournalEntry]:
-        """Return requests with their answers, changes of control and orders; oldest first."""
+        """Requests with their answers, changes of control and orders; oldest first."""
         rows = self._query("SELECT payload FROM packets WHERE message = 'JournalEntries' ORDER BY time_ns, rowid")
         published = (self._decoded("JournalEntries", payload) for (payload,) in rows)
         entries = [entry for one in published if isinstance(one, JournalEntries) for entry in one.entries]
@@ -181,12 +181,12 @@ class Run:
 
     @property
     def refusals(self) -> Table[JournalEntry]:
-        """Return the requests that were refused, with the reasons; to wait for control is not to be refused."""
+        """The refused requests with their reasons; waiting for control is not a refusal."""
         return self.journal.where(lambda entry: entry.refused)
 
     @property
     def control(self) -> Table[ControlRow]:
-        """Return holder, mode and problems: a row for each change."""
+        """Holder, mode and problems: a row for each change."""
         rows: list[ControlRow] = []
         for time_ns, payload in self._query(
             "SELECT time_ns, payload FROM packets WHERE message = 'ControlState' ORDER BY time_ns"
@@ -198,8 +198,10 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Return each time that a problem was flagged, but for thermal-drift while the first scan of a run with drift
-        correction is taken in both directions, which belongs to every run."""
+        """Each flag of a problem, except routine ones.
+
+        Routine is thermal-drift while the first scan of a run with drift correction is taken in both directions.
+        """
         overview = self.overview()
         numbers = overview.problems
         rows = [
@@ -210,7 +212,7 @@ class Run:
 
     @property
     def processes(self) -> Table[ProcessRow]:
-        """Return a row for each change of a process."""
+        """A row for each change of a process."""
         rows = self._query("SELECT * FROM processes ORDER BY time_ns, rowid")
         made = (
             ProcessRow(time_ns, name, role, ProcessCondition(condition), *rest)
@@ -220,7 +222,7 @@ class Run:
 
     @property
     def restarts(self) -> Table[ProcessRow]:
-        """Each time that a process was started again: its first row with that number of starts."""
+        """Each restart of a process: the first row with that number of starts."""
         seen: dict[str, int] = {}
         rows = []
         for row in self.processes:
@@ -231,19 +233,19 @@ class Run:
 
     @property
     def log(self) -> Table[LogLine]:
-        """Return the log lines of all processes, oldest first."""
+        """The log lines of all processes, oldest first."""
         rows = self._query("SELECT * FROM log ORDER BY time_ns, rowid")
         return Table((LogLine(*row) for row in rows), LogLine)
 
     @property
     def drift(self) -> Table[DriftPoint]:
-        """Return the drift after each scan; empty without a Drift Compensated Scheduler."""
+        """The drift after each scan; empty without a Drift Compensated Scheduler."""
         from afspm.record.overview import DriftPoint
 
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
 
     def verdicts(self) -> list[tuple[int, float]]:
-        """Return (time of the scan, score) of each verdict on a scan, in the order in which they came."""
+        """Return (time of the scan, score) of each verdict on a scan, in the order of arrival."""
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         found = (self._decoded(VERDICT_MESSAGE, payload) for (payload,) in self._query(sql, (VERDICT_MESSAGE,)))
         verdicts = (read_verdict(message) for message in found if message is not None)
@@ -261,8 +263,8 @@ class Run:
         """Yield the scheduler's packets newer than `since_ns`, oldest first, as they were published.
 
         Args:
-            messages: names of those wanted, e.g. "ControlState"; None: all.
-            tell: is told what is left out since its file is missing or damaged; None: that is an error.
+            messages: names of the wanted messages, e.g. "ControlState"; None: all.
+            tell: called with a message for each packet without a readable file; None: that is an error.
 
         Raises:
             FileError: a file is missing or damaged.
@@ -270,16 +272,18 @@ class Run:
         yield from packets(self._query, self.folder, since_ns, messages, tell)
 
     def messages(self, messages: Sequence[str] | None = None) -> Iterator[tuple[Packet, str, Any]]:
-        """Yield packets, the names of their messages, and what is in them, without reading files: scans and spectra
-        have NaN for values, lines of running scans are left out."""
+        """Yield packet, name of its message and decoded content, without reading files.
+
+        Scans and spectra have NaN for values; lines of running scans are left out.
+        """
         yield from without_reading_files(self._query, self.frame, messages)
 
     def overview(self, messages: Sequence[str] | None = None, problems: ProblemNames | None = None) -> Overview:
         """Return the overview that the dashboard shows. Files of scans are not read for it.
 
         Args:
-            messages: names of those that it is made from; None: all.
-            problems: where they are known better than from the record.
+            messages: names of the messages to reduce; None: all.
+            problems: names that replace the recorded ones.
         """
         from afspm.record.overview import Overview
 
@@ -292,7 +296,7 @@ class Run:
 
     @cached_property
     def experiment(self) -> dict[str, Any]:
-        """The experiment file as it was expanded."""
+        """The expanded experiment file."""
         try:
             return tomllib.loads((self.folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
@@ -300,17 +304,17 @@ class Run:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """run.json: clock, addresses, how it ended. Empty if it can't be read."""
+        """The content of run.json: clock, addresses, the end. Empty if it can't be read."""
         return run_json_or_empty(self.folder)
 
     @property
     def metadata(self) -> dict[str, str]:
-        """Sample, person, project, technique … as far as they are known: [metadata] of the experiment file."""
+        """Sample, person, project, technique … where known: [metadata] of the experiment file."""
         return dict(self.facts.get(METADATA) or {})
 
     @property
     def name(self) -> str:
-        """Of the experiment."""
+        """The name of the experiment."""
         return str(self._note("experiment") or self.facts.get("name") or self.folder.name)
 
     @property
@@ -320,21 +324,21 @@ class Run:
 
     @property
     def simulated(self) -> bool:
-        """Return whether the microscope was simulated."""
+        """Whether the microscope was simulated."""
         return bool(self._note("simulated"))
 
     @property
     def seeds(self) -> dict[str, Any]:
-        """Of what was left to chance, by component."""
+        """The seeds of random numbers, by component."""
         return dict(self._note("seeds") or {})
 
     @property
     def frame(self) -> Frame:
-        """Of all places: those of the sample where drift was compensated."""
+        """The frame of all positions: of the sample where drift was compensated."""
         return Frame(self._note("frame") or Frame.TIP.value)
 
     def numbered(self, number: int) -> ScanRow:
-        """Return the scan with a number, as reports and exports show it. Raises InvalidValue: there is none."""
+        """Return the scan with a number, as in reports and exports. Raises InvalidValue: there is none."""
         rows = {row.number: row for row in self.scans}
         if number not in rows:
             hint = f"the last is {max(rows)}" if rows else "there is none yet"
@@ -343,11 +347,11 @@ class Run:
 
     @property
     def problem_names(self) -> ProblemNames:
-        """The problems of the experiment."""
+        """The names of the experiment's problems."""
         return ProblemNames((self.facts.get("guest") or {}).get("problems") or {})
 
     def close(self) -> None:
-        """Read nothing more. Safe to repeat."""
+        """Close the journal. Safe to repeat."""
         self._journal.close()
 
     def __enter__(self) -> Run:

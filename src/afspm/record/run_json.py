@@ -1,4 +1,4 @@
-"""run.json: what a run says of itself, to whoever joins it, resumes it or looks at it afterwards."""
+"""run.json: the facts about a run for processes that join it, resume it or read it afterwards."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from afspm.basics.plain_data import Plain
 
 RUN_FILE: Final = "run.json"
 STATE_DIR: Final = "state"
-"""Beside it: what the processes remember."""
+"""Folder beside run.json: saved memory of the processes."""
 ENDED: Final = "ended"
-"""In run.json once a run is over: how it ended, in words."""
+"""Key in run.json, after the end of a run: how it ended, in words."""
 REAL_S: Final = "real_s"
-"""In run.json once a run is over: how long it took in real time, in all its parts, without what follows the end."""
+"""Key in run.json, after the end of a run: its real duration, summed over its parts, without work after the end."""
 REPLAY_OF: Final = "replay_of"
-"""In run.json of a replay: the folder of the run that it publishes again."""
+"""Key in run.json of a replay: the folder of the replayed run."""
 EXPERIMENT_FILE: Final = "experiment.toml"
-"""Beside it: the experiment as it was expanded."""
+"""File beside run.json: the expanded experiment."""
 COMPUTER: Final = "computer"
-"""In run.json: the name of the computer that the run was started on."""
+"""Key in run.json: the name of the computer that started the run."""
 METADATA: Final = "metadata"
-"""In run.json: what is written into every file about sample, people and microscope, by name."""
+"""Key in run.json: facts about sample, people and microscope for every file, by name."""
 LATEST_LINK: Final = "latest"
-"""In the folder of all runs: a link to the newest."""
+"""Link in the folder of all runs, to the newest."""
 LATEST_FILE: Final = "latest.txt"
-"""Where no links can be made: a file with the name of the newest."""
+"""File with the name of the newest run, where links are impossible."""
 
 
 def read_run_json(folder: Path) -> Plain:
-    """Return what run.json in the folder of a run says.
+    """Return the content of run.json in the folder of a run.
 
     Raises:
-        FileError: it is not there, can't be read, or is something else.
+        FileError: it is missing, unreadable, or another kind of file.
     """
     file = folder / RUN_FILE
     try:
@@ -47,7 +47,7 @@ def read_run_json(folder: Path) -> Plain:
 
 
 def run_json_or_empty(folder: Path) -> Plain:
-    """Return the same; empty where nothing can be read."""
+    """Return the content of run.json; empty if it can't be read."""
     try:
         return read_run_json(folder)
     except FileError:
@@ -55,7 +55,7 @@ def run_json_or_empty(folder: Path) -> Plain:
 
 
 def latest_run(runs: Path) -> Path | None:
-    """Return the newest run in the folder of all runs; None: there is none."""
+    """Return the newest run in the folder of all runs; None if there is none."""
     link, file = runs / LATEST_LINK, runs / LATEST_FILE
     if link.is_dir():
         return runs / link.resolve().name
@@ -63,5 +63,5 @@ def latest_run(runs: Path) -> Path | None:
 
 
 def experiment_name(folder: Path, otherwise: str = "") -> str:
-    """Return the name of the experiment that left a folder; `otherwise` if it is not known."""
+    """Return the name of the experiment of a run folder; `otherwise` if it is unknown."""
     return str(run_json_or_empty(folder).get("name") or otherwise)

@@ -1,4 +1,4 @@
-"""The lock that the supervisor of a run holds: it tells whether the run goes on, has ended, or was cut off."""
+"""The lock that the supervisor of a run holds: it shows whether the run goes on, has ended, or was cut off."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ LOCK_FILE = "running"
 
 @contextlib.contextmanager
 def lock_run(folder: Path) -> Iterator[None]:
-    """Hold the lock of a run in the block; the system takes it back from a process that is killed.
+    """Hold the lock of a run in the block; the system releases the lock of a killed process.
 
     Raises:
-        FileError: it goes on already, in another process.
+        FileError: another process runs it already.
     """
     with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
         try:
@@ -32,9 +32,9 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 
 def cut_off_message(folder: Path) -> str:
-    """Return what to tell of a run that was cut off; empty: it goes on, or has ended.
+    """Return a message about a run that was cut off; empty if it goes on, or has ended.
 
-    Only the computer that it ran on can know.
+    Only the computer that ran it can know.
     """
     facts = run_json_or_empty(folder)
     if not facts or facts.get(ENDED) or other_computer(folder) or not _is_left(folder):
@@ -45,7 +45,7 @@ def cut_off_message(folder: Path) -> str:
 
 
 def other_computer(folder: Path) -> str:
-    """Return the name of the computer that a run was started on; empty: this one, or it is not known."""
+    """Return the name of the computer that started a run; empty if that is this one, or unknown."""
     name = str(run_json_or_empty(folder).get(COMPUTER) or "")
     return "" if name == platform.node() else name
 
@@ -56,7 +56,7 @@ def goes_on(folder: Path) -> bool:
 
 
 def describe_state(folder: Path) -> str:
-    """Return the state of a run in words: how it ended, that it was cut off, that it goes on."""
+    """Describe how a run ended, or that it goes on or was cut off."""
     if ended := run_json_or_empty(folder).get(ENDED):
         return str(ended)
     if name := other_computer(folder):
@@ -66,12 +66,11 @@ def describe_state(folder: Path) -> str:
 
 
 def resume_command(folder: PurePath) -> str:
-    """Return the command that resumes a run."""
     return f"`afspm run --resume {quoted(folder)}`"
 
 
 def quoted(path: PurePath) -> str:
-    """Return a path as it may be typed into a shell."""
+    """Quote a path for the shell."""
     if sys.platform != "win32":
         return shlex.quote(str(path))
     from subprocess import list2cmdline
@@ -80,9 +79,9 @@ def quoted(path: PurePath) -> str:
 
 
 def _is_left(folder: Path) -> bool:
-    """Return whether the lock was held, and is not any more."""
     try:
         with (folder / STATE_DIR / LOCK_FILE).open("rb") as file:
+            # shared: concurrent queries must not look like a running supervisor to each other
             lock(file, shared=True)
     except OSError:
         return False

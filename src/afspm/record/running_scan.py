@@ -1,4 +1,4 @@
-"""A scan that is being taken, and how far it is."""
+"""The running scan and its progress."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from afspm.model import Region, ScanLines, ScanParameters
 
 @dataclass(slots=True)
 class ChannelLines:
-    """The rows of one channel that have come, by index."""
+    """The received rows of one channel, by index."""
 
     unit: str
     region: Region
@@ -19,27 +19,27 @@ class ChannelLines:
 
 @dataclass(frozen=True, slots=True)
 class DoneScan:
-    """The duration of a scan, with the parameters that were in force; None if they were not known."""
+    """The duration of a scan, with its parameters; None if they were unknown."""
 
     parameters: ScanParameters | None
     took_ns: int
 
     def resembles(self, other: RunningScan) -> bool:
-        """Return whether both are of the same size and pixels, as far as is known."""
+        """Return whether both have the same size and pixels; unknown parameters count as equal."""
         ours, theirs = _extent(self.parameters), _extent(other.parameters)
         return ours is None or theirs is None or ours == theirs
 
 
 @dataclass(slots=True)
 class RunningScan:
-    """A scan that is being taken.
+    """The running scan.
 
     Attributes:
-        began_ns: None if its beginning was not seen.
-        holder: who was in control when it began.
-        parameters: that were in force then; None if they are not known.
-        setpoint: of the feedback then; None if it was not published.
-        channels: what has come of each, where the microscope delivers lines.
+        began_ns: None if the start was not observed.
+        holder: the component in control at the start.
+        parameters: in force at the start; None if unknown.
+        setpoint: of the feedback at the start; None if it was not published.
+        channels: received lines of each channel, where the microscope delivers lines.
     """
 
     began_ns: int | None
@@ -49,7 +49,6 @@ class RunningScan:
     channels: dict[str, ChannelLines] = field(default_factory=dict)
 
     def take(self, lines: ScanLines) -> None:
-        """Take lines of the scan."""
         if self.began_ns is None:
             self.began_ns = lines.began_ns
         channel = self.channels.get(lines.channel)
@@ -59,17 +58,17 @@ class RunningScan:
 
     @property
     def rows(self) -> tuple[int, int] | None:
-        """(those that have come, all); None where no lines are delivered."""
+        """(received, total) rows; None where no lines are delivered."""
         if not self.channels:
             return None
         lines = max(self.channels.values(), key=lambda one: len(one.rows))
         return len(lines.rows), lines.shape[0]
 
     def progress(self, now_ns: int, expected_ns: int | None = None) -> tuple[float, int] | None:
-        """(the part that is done, 0 to 1, and how many ns remain); None if nothing is known to tell it by.
+        """Return (fraction done, ns remaining); None if it can't be estimated.
 
         Args:
-            expected_ns: how long such a scan takes; None: told by its lines.
+            expected_ns: the duration of such a scan; None: extrapolate from the received lines.
         """
         if self.began_ns is None:
             return None

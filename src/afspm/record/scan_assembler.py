@@ -1,4 +1,4 @@
-"""Packets put together to measurements: the channels of a scan, its lines, how it ended."""
+"""`ScanAssembler`: assembles packets into measurements: the channels of a scan, its lines, its end."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from afspm.model import Packet, Scan, ScanLines, ScopeState, ScopeStatus, Spectr
 
 @dataclass
 class AssembledScan:
-    """A scan that is over.
+    """An ended scan.
 
     Attributes:
-        channels: its packets, with what is in them; of an interrupted one none.
-        lines: packets with lines of it that came before.
-        interrupted_ns: when it was broken off; None: it is whole.
+        channels: its packets with their content; none if it was interrupted.
+        lines: earlier packets with its lines.
+        interrupted_ns: the time of the interruption; None if it is complete.
     """
 
     channels: list[tuple[Packet, Scan]] = field(default_factory=list)
@@ -26,12 +26,12 @@ class AssembledScan:
     interrupted_ns: int | None = None
 
     def packets(self) -> Iterator[Packet]:
-        """All that are kept with it."""
+        """Yield all packets of the scan."""
         yield from (packet for packet, _ in self.lines)
         yield from (packet for packet, _ in self.channels)
 
     def as_seen(self) -> list[Scan]:
-        """Of an interrupted one: what its lines show, one for each channel; rows that were not seen are NaN."""
+        """Return the lines of an interrupted scan, one scan for each channel; missing rows are NaN."""
         pictures: dict[str, NDArray[np.float64]] = {}
         newest: dict[str, ScanLines] = {}
         for _, lines in self.lines:
@@ -54,7 +54,6 @@ class AssembledSpectrum:
     spectrum: Spectrum
 
     def packets(self) -> Iterator[Packet]:
-        """That one."""
         yield self.packet
 
 
@@ -62,10 +61,10 @@ Assembled = AssembledScan | AssembledSpectrum
 
 
 class ScanAssembler:
-    """Gathers what belongs together, from packets in the order in which they were published.
+    """Groups packets by measurement, in the order of publication.
 
     Args:
-        state: the microscope's, as it was told last.
+        state: the last published state of the microscope.
     """
 
     def __init__(self, state: ScopeState = ScopeState.UNDEFINED) -> None:
@@ -73,17 +72,17 @@ class ScanAssembler:
         self._open = AssembledScan()
 
     def copy(self) -> ScanAssembler:
-        """Return a copy, to go back to."""
+        """Return a copy, to roll back to."""
         other = ScanAssembler(self._state)
         other._open = AssembledScan(list(self._open.channels), list(self._open.lines), self._open.interrupted_ns)
         return other
 
     def waiting(self) -> Iterator[Packet]:
-        """Packets that were given and not given back yet."""
+        """Return the packets of the open scan."""
         return self._open.packets()
 
     def scan(self, packet: Packet, scan: Scan) -> list[Assembled]:
-        """A channel of a scan."""
+        """Add a channel of a scan; return the measurements that it ends."""
         over: list[Assembled] = []
         if self._open.channels and not _same(self._open, scan):
             over = self.flush()
@@ -91,7 +90,7 @@ class ScanAssembler:
         return over
 
     def lines(self, packet: Packet, lines: ScanLines) -> list[Assembled]:
-        """Lines of a running scan. A translator that is started anew publishes them from the first row on again."""
+        """Add lines of a running scan; a restarted translator publishes them from the first row again."""
         before = self._open.lines[-1][1] if self._open.lines else None
         over: list[Assembled] = []
         if self._open.channels or (before is not None and (before.region, before.shape) != (lines.region, lines.shape)):
@@ -100,30 +99,31 @@ class ScanAssembler:
         return over
 
     def spectrum(self, packet: Packet, spectrum: Spectrum) -> list[Assembled]:
-        """A spectrum, which is whole."""
+        """Add a spectrum, which is complete at once."""
         return [*self.flush(), AssembledSpectrum(packet, spectrum)]
 
     def status(self, status: ScopeStatus, time_ns: int) -> list[Assembled]:
-        """Take a new state of the microscope."""
+        """Process a new state of the microscope."""
         before, self._state = self._state, status.state
+        # a scan with channels is complete: translators publish none of an interrupted scan
         if status.state is ScopeState.INTERRUPTED and before is ScopeState.SCANNING and not self._open.channels:
             interrupted, self._open = self._open, AssembledScan()
             interrupted.interrupted_ns = time_ns
             return [interrupted]
         if status.state is ScopeState.SCANNING and before is not ScopeState.SCANNING:
             return self.finish(time_ns)
-        # lines alone wait on: there are translators that are free before they publish what they have measured
+        # lines without channels stay open: some translators become free before they publish the scan
         return self.flush() if status.state is ScopeState.FREE else []
 
     def flush(self) -> list[Assembled]:
-        """End the open scan if any of its channels has come."""
+        """End the open scan if a channel of it has arrived."""
         if not self._open.channels:
             return []
         taken, self._open = self._open, AssembledScan()
         return [taken]
 
     def finish(self, time_ns: int) -> list[Assembled]:
-        """End the open scan; without its channels, it was lost on the way and counts as interrupted."""
+        """End the open scan; without channels it counts as interrupted."""
         if not self._open.channels and not self._open.lines:
             return []
         taken, self._open = self._open, AssembledScan()
@@ -133,11 +133,8 @@ class ScanAssembler:
 
 
 def _same(taken: AssembledScan, scan: Scan) -> bool:
-    """Return whether this is another channel of the scan, or one that comes again from a restarted translator.
-
-    Some controllers write a file for each channel: then it is the time that says so, and a channel that is there
-    already out of another file is that of another scan.
-    """
+    # a restarted translator publishes channels again: they count as the same scan. Some controllers write a file for
+    # each channel: their channels share the time, and a channel known from another file belongs to another scan.
     first = taken.channels[0][1]
     if (scan.region, scan.shape, scan.time_ns) != (first.region, first.shape, first.time_ns):
         return False

@@ -1,6 +1,6 @@
-"""Scans to and from sidpy's Datasets, which the programs of the pycroscopy ecosystem work with.
+"""Scans to and from sidpy's Datasets, the format of the pycroscopy ecosystem.
 
-sidpy's images are [x, y]; here they are [y, x]. Install sidpy yourself: it is a gigabyte with all that it needs.
+sidpy's images are [x, y], afspm's are [y, x]. Install sidpy yourself: with its dependencies it takes a gigabyte.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """`RecordStore`: writes the record of a run: the journal, and a file for each scan and spectrum.
 
-What is given in one call is recorded as a whole or not at all, and nothing is there twice, however often it is given:
-files are written aside and renamed before the journal names them, in one transaction.
+Each call is recorded completely or not at all, and a repeated packet is recorded once: files are written under
+temporary names and renamed before the journal names them, in one transaction.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ Image = TypeVar("Image", Scan, ScanLines)
 
 _log = logging.getLogger("afspm.record")
 NOTE = "note"
-"""The kind of a journal entry that is a note."""
+"""The kind of journal entries for notes."""
 _ALL_OF_THEM = (OSError, sqlite3.OperationalError)
-"""What is wrong with the disk, and so with whatever is written next."""
+"""Errors of the disk, which the next write would meet, too."""
 _PROCESS = "SELECT role, condition, since_ns, starts, pid, last_exit FROM processes WHERE name = ? ORDER BY rowid DESC"
 
 
@@ -56,8 +56,8 @@ class RecordSettings:
 
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
-        frame: of the places in what is published.
-        measured: whether scans and spectra are written; else there is the journal alone.
+        frame: of published positions.
+        measured: write scans and spectra; otherwise only the journal.
     """
 
     facts: dict[str, object] = field(default_factory=dict)
@@ -83,7 +83,7 @@ class RecordStore:
         self._journal = journal.open_to_write(folder)
         try:
             self._begin(about)
-        except BaseException as error:
+        except BaseException as error:  # only to close: every error is raised again
             self._journal.close()
             if isinstance(error, sqlite3.DatabaseError) and journal.is_damage(error):
                 raise journal.damaged(folder / journal.JOURNAL_FILE, error) from error
@@ -98,28 +98,28 @@ class RecordStore:
             self.note(name, value)
 
     def waiting(self) -> list[Packet]:
-        """Return the packets that are recorded once others of their scan have come."""
+        """Return the packets that wait for others of their scan."""
         return list(self._gathering.waiting())
 
     def take(self, packets: Iterable[tuple[Packet, str]]) -> None:
-        """Record packets, each with its source, in the order in which they were published.
+        """Record packets, each with its source, in the order of publication.
 
         Raises:
-            OSError, sqlite3.OperationalError: the disk is full …; nothing of these is recorded then.
+            OSError, sqlite3.OperationalError: the disk is full …; then none of them is recorded.
         """
         with self._all_or_nothing():
             for packet, source in packets:
                 self._take(packet, source)
 
     def flush(self) -> None:
-        """End the scan that came last. Raises as `take`."""
+        """End the last scan. Raises as `take`."""
         if not self.waiting():
             return
         with self._all_or_nothing():
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """End every scan, also one of which only lines came. Raises as `take`."""
+        """End every scan, also one with lines only. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
@@ -132,24 +132,25 @@ class RecordStore:
         return row.fetchone() is not None or any(waits)
 
     def note(self, name: str, value: object) -> None:
-        """Note something about the whole run, in JSON's types."""
+        """Record a fact about the whole run, in JSON's types."""
         text = json.dumps(value, ensure_ascii=False)
         self._journal.execute("INSERT OR REPLACE INTO about VALUES (?, ?)", (name, text))
 
     def sync(self) -> None:
-        """Wait until what is recorded is on the disk, so that it outlives a power cut. Raises OSError."""
+        """Sync the record to the disk, so that it survives a power cut. Raises OSError."""
         with suppress(FileNotFoundError), (self._folder / f"{journal.JOURNAL_FILE}-wal").open("rb+") as file:
             sync_file(file.fileno())
+        # a new file survives a power cut only if its folder is synced, too
         sync_folder(self._folder)
 
     def settle(self) -> None:
-        """Make the journal one file that can be read without files beside it."""
+        """Make the journal a single file, readable without its write-ahead log."""
         self._journal.execute("PRAGMA busy_timeout = 1000")
-        with suppress(sqlite3.OperationalError):  # somebody reads it: it stays as it is, which is as good
+        with suppress(sqlite3.OperationalError):  # a reader is open: the write-ahead log stays, which is as safe
             self._journal.execute("PRAGMA journal_mode = DELETE")
 
     def close(self) -> None:
-        """Safe to repeat."""
+        """Close files and journal. Safe to repeat."""
         self._files.close()
         self._journal.close()
 
@@ -159,9 +160,10 @@ class RecordStore:
         self._journal.execute("BEGIN IMMEDIATE")
         try:
             yield
+            # files first: the journal never names a file that a power cut could remove
             self._files.finish()
             self._journal.execute("COMMIT")
-        except BaseException:
+        except BaseException:  # only to roll back: every error is raised again, also KeyboardInterrupt
             self._files.discard()
             self._gathering, self._newest_ns = gathering, newest_ns
             with suppress(sqlite3.Error):  # a full disk may have rolled it back already
@@ -169,6 +171,7 @@ class RecordStore:
             raise
 
     def _take(self, packet: Packet, source: str) -> None:
+        # packets come again after a restart, from the log and from the scheduler's cache
         if self.has(packet):
             return
         message, thing = _read(packet)
@@ -185,7 +188,6 @@ class RecordStore:
             self._newest_ns = max(self._newest_ns, packet.time_ns or 0)
 
     def _add(self, packet: Packet, message: str, source: str, thing: object) -> None:
-        """Add a packet that is kept in the journal alone."""
         payload = without_values(message, packet.payload) if message else bytes(packet.payload)
         insert_packet(self._journal, packet, message, payload, source=source)
         match thing:
@@ -203,24 +205,25 @@ class RecordStore:
 
     def _write(self, taken: Iterable[Assembled]) -> None:
         for one in taken:
+            # a measurement that fails leaves none of its rows in the transaction
             self._journal.execute("SAVEPOINT measured")
             try:
                 self._files.write(one)
             except _ALL_OF_THEM:
                 raise
-            except Exception as error:  # what is wrong with one must not be the end of the record
+            except Exception as error:  # any error of one measurement must not end the record
                 self._journal.execute("ROLLBACK TO measured")
                 self._keep(one)
                 _log.error("no file can be made of what was measured, its packets are kept as they are: %s", error)
             self._journal.execute("RELEASE measured")
 
     def _keep(self, taken: Assembled) -> None:
-        """Insert packets whole, with their values, since no file has them."""
+        # whole packets with their values: no file contains this measurement
         for packet in taken.packets():
             insert_packet(self._journal, packet, wire.message_of(packet.envelope), bytes(packet.payload))
 
     def _placed(self, image: Image) -> Image:
-        """Return it in its frame, which the wire does not say."""
+        # the wire format does not carry the frame
         frame = self._about.frame
         return image if frame is Frame.TIP else replace(image, region=replace(image.region, frame=frame))
 
@@ -250,13 +253,12 @@ class RecordStore:
 
 
 def _is_start(entry: JournalEntry) -> bool:
-    """Return whether a measurement began, or may have."""
+    # without a response the measurement may have started
     may_have_begun = entry.response in (ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE)
     return entry.sent_ns is not None and entry.what in (names.START_SCAN, names.START_SPEC) and may_have_begun
 
 
 def _read(packet: Packet) -> tuple[str, object]:
-    """Return the name of the message and its content; ("", None) if it can't be read."""
     try:
         message = wire.message_of(packet.envelope)
     except WireError:

@@ -30,16 +30,16 @@ class ScanRow:
     """A scan, without its values.
 
     Attributes:
-        number: counts from 1, in the order in which scans were recorded.
-        time_ns: when it was finished, or interrupted; began_ns: None if that was not seen.
+        number: from 1, in the order of recording.
+        time_ns: the end of the scan, or its interruption; began_ns: None if the start was not observed.
         channels: (name, unit) of each.
-        region, shape: None of an interrupted scan of which nothing was seen; shape is (rows, columns).
-        interrupted: only a part of it was taken.
-        holder, mode, problems: who was in control when it began, and how things stood; None: not known.
+        region, shape: None of a scan interrupted before its first line; shape is (rows, columns).
+        interrupted: the scan is incomplete.
+        holder, mode, problems: at the start; None if unknown.
         filename: of the controller; file: of the record, from the run folder, empty if there is none.
-        key: under which it was asked for, `scope.scan(…, key="tile-1")`; empty if it had none.
-        registration: how its position on the sample is known, where drift is corrected; None: it is not.
-        position_sd_m: standard deviation of that position, along the axis where it is largest; None: not known.
+        key: of the request, `scope.scan(…, key="tile-1")`; empty if it had none.
+        registration: how its position on the sample is known; None without drift correction.
+        position_sd_m: standard deviation of that position along its most uncertain axis; None if unknown.
     """
 
     number: int
@@ -82,7 +82,7 @@ class SpectrumRow:
 
 @dataclass(frozen=True, slots=True)
 class ControlRow:
-    """From `time_ns` on it was so."""
+    """Control from `time_ns` on."""
 
     time_ns: int
     state: ControlState
@@ -90,7 +90,7 @@ class ControlRow:
 
 @dataclass(frozen=True, slots=True)
 class ProblemRow:
-    """A problem that was flagged, until it was removed; `cleared_ns` None: it still is. `by`: "" if not known."""
+    """One flag of a problem; `cleared_ns` is None while it is flagged. `by`: "" if unknown."""
 
     name: str
     number: int
@@ -101,7 +101,7 @@ class ProblemRow:
 
 @dataclass(frozen=True, slots=True)
 class ProcessRow:
-    """A change of a process; attributes as of `model.ProcessState`. `time_ns` is when it was told."""
+    """A change of a process; attributes as of `model.ProcessState`. `time_ns` is the time of the report."""
 
     time_ns: int
     name: str
@@ -115,7 +115,7 @@ class ProcessRow:
 
 @dataclass(frozen=True, slots=True)
 class NoteRow:
-    """A note; attributes as of `model.Note`. `scan` is the number of the scan that it belongs to, None: to none."""
+    """A note; attributes as of `model.Note`. `scan` is the number of its scan, or None."""
 
     time_ns: int
     who: str
@@ -127,10 +127,10 @@ class NoteRow:
 class Table(Sequence[T], Generic[T]):
     """Rows of one kind: a sequence, which a notebook shows as a table.
 
-    `to_pandas`, `to_numpy` and `to_xarray` give its columns.
+    `to_pandas`, `to_numpy` and `to_xarray` return its columns.
 
     Args:
-        kind: of the rows: says which columns there are where there are no rows.
+        kind: the class of the rows, which gives the columns of an empty table.
     """
 
     def __init__(self, rows: Iterable[T], kind: type[T]) -> None:
@@ -151,16 +151,16 @@ class Table(Sequence[T], Generic[T]):
         return iter(self._rows)
 
     def where(self, wanted: Callable[[T], bool]) -> Table[T]:
-        """The rows for which it is true."""
+        """Return the rows for which `wanted` returns True."""
         return Table((row for row in self._rows if wanted(row)), self._kind)
 
     def columns(self) -> dict[str, list[Any]]:
-        """Each column by its name, as numbers and texts; places are taken apart (`center_x_m` …), times are ns."""
+        """Return each column by name, as numbers and texts; positions are split (`center_x_m` …), times are ns."""
         taken_apart = [_apart(row) for row in self._rows]
         return {name: [row[name] for row in taken_apart] for name in _names(self._kind)}
 
     def to_numpy(self) -> NDArray[Any]:
-        """A structured array: times as datetime64[ns], numbers that are not known as NaN or -1."""
+        """Return a structured array: times as datetime64[ns], unknown numbers as NaN or -1."""
         import numpy as np
 
         columns = {name: _array(name, values) for name, values in self.columns().items()}
@@ -170,13 +170,13 @@ class Table(Sequence[T], Generic[T]):
         return made
 
     def to_xarray(self) -> xarray.Dataset:
-        """A Dataset over `row` (needs the extra `xarray`)."""
+        """Return a Dataset over `row` (needs the extra `xarray`)."""
         import xarray
 
         return xarray.Dataset({name: ("row", _array(name, values)) for name, values in self.columns().items()})
 
     def to_pandas(self) -> pandas.DataFrame:
-        """A DataFrame with the columns of `to_numpy`, to filter, group and plot (needs the extra `xarray`)."""
+        """Return a DataFrame with the columns of `to_numpy` (needs the extra `xarray`)."""
         try:
             import pandas
         except ImportError:
@@ -200,7 +200,7 @@ _COLUMNS = {
     "translation_m": ("x_m", "y_m"),
     "rate_m_s": ("rate_x_m_s", "rate_y_m_s"),
 }
-"""The columns that some attributes are taken apart into."""
+"""Attributes that are split into several columns."""
 
 
 def _names(kind: type) -> list[str]:
@@ -208,7 +208,6 @@ def _names(kind: type) -> list[str]:
 
 
 def _apart(row: Any) -> dict[str, object]:
-    """Return a row as numbers and texts."""
     made: dict[str, object] = {}
     for field in fields(row):
         name, value = field.name, getattr(row, field.name)
@@ -250,19 +249,19 @@ def _array(name: str, values: list[object]) -> NDArray[Any]:
 
 MOST_ROWS: Final = 60
 _ENDS: Final = 10
-"""Rows that are shown at both ends of a longer table."""
+"""The number of rows shown at both ends of a long table."""
 _UNITS: Final = {"_m_s": "m/s", "_m": "m", "_rad": "rad", "_s": "s"}
 _FIRST: Final = ("number", "key")
 _CELL: Final = 'style="text-align:left;white-space:nowrap;max-width:18em;overflow:hidden;text-overflow:ellipsis"'
 
 
 def table_html(columns: Mapping[str, Sequence[object]], count: int) -> str:
-    """Return columns of `count` rows each; those in which nothing stands are left out."""
+    """Return columns of `count` rows each, without empty columns."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
     columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
-    told = [_column(name, values) for name, values in columns.items() if any(map(_says, values))]
-    head = "".join(f"<th {_CELL}>{escape(name)}</th>" for name, _ in told)
-    body = "".join(_row(told, number) for number in shown)
+    filled = [_column(name, values) for name, values in columns.items() if any(map(_has_content, values))]
+    head = "".join(f"<th {_CELL}>{escape(name)}</th>" for name, _ in filled)
+    body = "".join(_row(filled, number) for number in shown)
     rows = "1 row" if count == 1 else f"{count} rows"
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table><p>{rows}</p>"
 
@@ -286,7 +285,7 @@ def _column(name: str, values: Sequence[Any]) -> tuple[str, list[str]]:
     return f"{plain} / {prefixed}", [_text(None if v is None else v * factor) for v in values]
 
 
-def _says(value: object) -> bool:
+def _has_content(value: object) -> bool:
     return value is not None and value is not False and value != ""
 
 

@@ -1,21 +1,21 @@
-"""Spans of time in which something held, one after the other."""
+"""Successive spans of time."""
 
 from __future__ import annotations
 
-from collections import deque
-from dataclasses import dataclass, replace
+from collections import defaultdict, deque
+from dataclasses import dataclass, field, replace
 
 MOST_SPANS = 20_000
 
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A time in which something held.
+    """A span of time.
 
     Attributes:
-        label: what.
-        start_ns, end_ns: experiment time; an end of None: it still is.
-        by: who brought it about; empty if nobody is known to.
+        label: the state during the span.
+        start_ns, end_ns: experiment time; an end of None: it continues.
+        by: the component or person that caused it; empty if unknown.
     """
 
     label: str
@@ -24,26 +24,25 @@ class Span:
     by: str = ""
 
     def lasted_ns(self, now_ns: int) -> int:
-        """Return how long it held until `now_ns`."""
         end_ns = now_ns if self.end_ns is None else min(self.end_ns, now_ns)
         return max(0, end_ns - self.start_ns)
 
 
 class Timeline:
-    """One thing after the other, with gaps where nothing was. Where there are too many, the oldest are forgotten."""
+    """Successive spans, with gaps. Beyond the limit, the oldest spans are dropped."""
 
     def __init__(self, most: int = MOST_SPANS) -> None:
         self.spans: deque[Span] = deque(maxlen=most)
         self.changed_ns: int | None = None
-        """When it changed last, to something or to nothing."""
+        """The time of the last change, to a span or to a gap."""
 
     @property
     def now(self) -> Span | None:
-        """Return the last span if it has no end."""
+        """The current span, or None."""
         return self.spans[-1] if self.spans and self.spans[-1].end_ns is None else None
 
     def change(self, label: str | None, time_ns: int, by: str = "") -> None:
-        """From `time_ns` on it is `label`; None: nothing. What is older than the last change is left out."""
+        """Start a span of this label at `time_ns`; None: a gap. Changes older than the last are ignored."""
         if self.changed_ns is not None and time_ns < self.changed_ns:
             return
         now = self.now
@@ -56,20 +55,36 @@ class Timeline:
             self.spans.append(Span(label, time_ns, by=by))
 
     def name_last(self, by: str) -> None:
-        """Name the cause of the last span if it was not known yet."""
+        """Set the cause of the last span unless it is known."""
         if self.spans and not self.spans[-1].by:
             self.spans[-1] = replace(self.spans[-1], by=by)
 
     def at(self, time_ns: int) -> Span | None:
-        """Return the span that holds a time."""
+        """Return the span that contains a time."""
         for span in reversed(self.spans):
             if span.start_ns <= time_ns:
                 return span if span.end_ns is None or time_ns < span.end_ns else None
         return None
 
     def lasted_ns(self, now_ns: int) -> dict[str, int]:
-        """Return how long each label held altogether, in the order in which they came."""
+        """Return the total duration of each label, in the order of first occurrence."""
         total: dict[str, int] = {}
         for span in self.spans:
             total[span.label] = total.get(span.label, 0) + span.lasted_ns(now_ns)
         return total
+
+
+@dataclass(slots=True)
+class Timelines:
+    """The timelines of control and microscope.
+
+    Attributes:
+        control: the holders.
+        mode, scope_state: labels in lower case.
+        problems: of each problem, by number.
+    """
+
+    control: Timeline = field(default_factory=Timeline)
+    mode: Timeline = field(default_factory=Timeline)
+    scope_state: Timeline = field(default_factory=Timeline)
+    problems: defaultdict[int, Timeline] = field(default_factory=lambda: defaultdict(Timeline))

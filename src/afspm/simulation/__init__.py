@@ -1,12 +1,12 @@
-"""The one simulated instrument: world, tip, feedback and noise; its driver; and the rig of all emulated controllers.
+"""The simulated instrument: world, tip, feedback and noise; its driver; and the base of all emulated controllers.
 
-**Theory of operation.** A night on it is a function of its settings and its seed. Nothing here has a clock: the
-instrument is asked what it is at a time.
+**Theory of operation.** A simulated night is a function of its settings and its seed. No clock is here: every call
+gets its time.
 
     comes in      settings, a seed, commands with their times, faults on demand
-    state         the sample, its drift, the tip with its history, what is being measured
-    goes out      values of pixels and curves; the truth, which is written beside the record
-    always holds  the same seed and commands give the same values; what is simulated is marked so wherever it is shown
+    state         the sample, its drift, the tip with its history, the present activity
+    goes out      values of pixels and curves; the ground truth, written beside the record
+    always holds  the same seed and commands give the same values; simulated data are marked wherever they are shown
 """
 
 from __future__ import annotations

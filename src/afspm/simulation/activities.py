@@ -17,11 +17,11 @@ from afspm.simulation.scanning import Course, SimulatedScan
 Channels = dict[str, tuple[str, Array]]
 """Channel -> (unit, values [y, x], both ascending)."""
 RETRACE = " Retrace"
-"""What the name of a channel ends with that is recorded on the way back."""
+"""Suffix of the names of retrace channels."""
 
 
 class ScanValues(Protocol):
-    """The values of a scan, the same all along, and which of its rows are there at a time."""
+    """The values of a scan, fixed at its start, and the number of rows available at a time."""
 
     def channels(self, until_s: float | None = None) -> Channels: ...
 
@@ -35,19 +35,18 @@ class Occupied:
     end_s: float
 
     def running(self, now_s: float) -> bool:
-        """True until it has ended."""
         return now_s < self.end_s
 
 
 @dataclass(frozen=True)
 class Move(Occupied):
-    """The probe moves."""
+    """A move of the probe."""
 
     from_m: tuple[float, float]
     to_m: tuple[float, float]
 
     def probe_at(self, now_s: float) -> tuple[float, float]:
-        """Return the position on the way."""
+        """Return the position during the move."""
         part = (now_s - self.start_s) / (self.end_s - self.start_s)
         (x0, y0), (x1, y1) = self.from_m, self.to_m
         return x0 + part * (x1 - x0), y0 + part * (y1 - y0)
@@ -55,16 +54,16 @@ class Move(Occupied):
 
 @dataclass
 class ScanActivity:
-    """A scan that was started: with the values that were in force then, and those of `adjusted`.
+    """A started scan, with the settings in force at its start, and those of `adjusted`.
 
     Attributes:
         number: from 1 on.
         region, shape: of the frame; (rows, columns).
         line_s: of trace and retrace together.
-        upwards: whether its first line is the one with the smallest y.
+        upwards: the first line is the one with the smallest y.
         feedback, bias_v, slope: in force at its start.
         adjusted: changes during the scan, each in force from the next line on.
-        stopped_s: when it was broken off; None unless it was.
+        stopped_s: the time of its interruption; None without.
     """
 
     number: int
@@ -87,24 +86,24 @@ class ScanActivity:
 
     @property
     def course(self) -> Course:
-        """Place and time of the scan. Raises InvalidValue: it cannot be taken."""
+        """Place and time of the scan. Raises InvalidValue: it can't be scanned."""
         return Course(self.region, self.shape, self.line_s, self.start_s, "up" if self.upwards else "down")
 
     def draw(self, values: ScanValues) -> None:
-        """Take the values, for which `channels` waits."""
+        """Set the values, for which `channels` waits."""
         self._drawn.set_result(values)
 
     def wait(self) -> None:
-        """Wait until the values are there."""
+        """Wait for the values."""
         wait([self._drawn])
 
     def redrawn(self, adjusted: tuple[Adjustment, ...]) -> None:
-        """Forget the values, which are computed again with these adjustments."""
+        """Discard the values, which are computed again with these adjustments."""
         self.adjusted, self._whole, self._drawn = adjusted, None, Future()
 
     @property
     def end_s(self) -> float:
-        """End of the last line as far as known: later after a pause, earlier if stopped."""
+        """The expected end of the last line: later after a pause, earlier if stopped."""
         if self.stopped_s is not None:
             return self.stopped_s
         return self.start_s + self.shape[0] * self.line_s + self.paused_s
@@ -115,7 +114,7 @@ class ScanActivity:
 
     @property
     def drawing(self) -> bool:
-        """True while its values are being computed; the scan lasts until then, however fast time passes."""
+        """True while its values are being computed; the scan does not end before, however fast time passes."""
         return not self._drawn.done()
 
     def running(self, now_s: float) -> bool:
@@ -125,13 +124,13 @@ class ScanActivity:
         return self.paused or now_s < self.end_s or self.drawing
 
     def lines_done(self, now_s: float) -> int:
-        """Count the complete lines."""
+        """Return the number of complete lines."""
         done = int((self._scanned_until_s(now_s) - self.start_s) / self.line_s + 1e-9)
         rows = self.shape[0]
         return max(0, min(done, rows - 1 if self.drawing and done >= rows else rows))
 
     def passes(self, now_s: float) -> int:
-        """Count the complete passes, forward and backward separately."""
+        """Return the number of complete passes, forward and backward separately."""
         return int((self._scanned_until_s(now_s) - self.start_s) / (self.line_s / 2) + 1e-9)
 
     def tip_m(self, now_s: float) -> tuple[float, float]:
@@ -146,9 +145,9 @@ class ScanActivity:
         return float(cx + cos * x - sin * y), float(cy + sin * x + cos * y)
 
     def channels(self, until_s: float | None = None) -> Channels:
-        """Channel -> (unit, values [y, x]), both ascending; lines not complete at `until_s` are NaN.
+        """Return channel -> (unit, values [y, x]), both ascending; lines not complete at `until_s` are NaN.
 
-        None for the whole, also of what was stopped. Waits for values that are still being worked out.
+        None returns all lines, also of a stopped scan. Waits for values that are being computed.
         """
         drawn = self._drawn.result()
         return drawn.channels(None if until_s is None else self._scanned_until_s(until_s))
@@ -176,24 +175,21 @@ class ScanActivity:
         return {name: float(values[row, column]) for name, (_, values) in shown.items()}
 
     def pause(self, now_s: float) -> None:
-        """Stay on the line until `resume`."""
+        """Hold the current line until `resume`."""
         if not self.paused and self.running(now_s):
             self.paused_since_s = now_s
 
     def resume(self, now_s: float) -> None:
-        """Go on."""
         if self.paused_since_s is not None:
             self.paused_s += now_s - self.paused_since_s
             self.paused_since_s = None
 
     def stop(self, now_s: float) -> None:
-        """Break it off."""
         if self.running(now_s):
             self.resume(now_s)
             self.stopped_s = now_s
 
     def _scanned_until_s(self, now_s: float) -> float:
-        """The time at which an undisturbed scan would have got as far."""
         until_s = now_s if self.stopped_s is None else min(now_s, self.stopped_s)
         if self.paused_since_s is not None:
             until_s = min(until_s, self.paused_since_s)
@@ -202,10 +198,10 @@ class ScanActivity:
 
 @dataclass(frozen=True)
 class SpectrumActivity:
-    """A curve that was started.
+    """A started curve.
 
     Attributes:
-        values: [n_points, n_variables], all of them from the start on: hand them out after `end_s`.
+        values: [n_points, n_variables], complete from the start on; the caller must not publish them before `end_s`.
     """
 
     number: int
@@ -220,13 +216,10 @@ class SpectrumActivity:
     what = "spectrum"
 
     def running(self, now_s: float) -> bool:
-        """True until it has ended."""
         return now_s < self.end_s
 
     def both_ways(self) -> tuple[Channels, Channels]:
-        """Return the variables there and back, in the order in which they were measured; one that has no way back of
-        its own has the same values there.
-        """
+        """Return the variables forward and backward; one without a backward sweep has equal values."""
         table = dict(zip(self.names, zip(self.units, self.values.T, strict=True), strict=True))
         there = {name: data for name, data in table.items() if not name.endswith(RETRACE)}
         back = {
@@ -263,13 +256,12 @@ class ValuesInAir:
 
 @dataclass(frozen=True)
 class NoValues:
-    """A scan that could not be simulated: not one line."""
+    """A scan that could not be simulated: no line is available."""
 
     units: Mapping[str, str]
     shape: tuple[int, int]
 
     def channels(self, until_s: float | None = None) -> Channels:
-        """NaN."""
         return {name: (unit, np.full(self.shape, np.nan)) for name, unit in self.units.items()}
 
 

@@ -1,7 +1,7 @@
-"""Chance that is a function: the same seed and the same whole numbers give the same draw, in any order.
+"""Random numbers as a function: the same seed and the same whole numbers give the same draw, in any order.
 
-A surface without bounds and a drift that can be asked for at any time need this: what lies at (i, j) is hashed from
-(seed, i, j), not drawn from a sequence. The hash is the finaliser of splitmix64 (Steele, Lea & Flood 2014).
+An unbounded surface and a drift defined at any time need this: the content of cell (i, j) is hashed from (seed, i, j),
+not drawn from a sequence. The hash is the finaliser of splitmix64 (Steele, Lea & Flood 2014).
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 
 
 def subseed(seed: int, name: str) -> int:
-    """A seed of its own for a part of the world, so that one part drawing more leaves the others alone."""
+    """Return a separate seed for a part of the world, so that draws of one part don't affect others."""
     return int(hashes(seed, zlib.crc32(name.encode()))[()])
 
 
 def hashes(seed: int, *keys: ArrayLike) -> Hashes:
-    """64 mixed bits for each combination (broadcast) of whole numbers."""
-    with np.errstate(over="ignore"):  # arithmetic modulo 2**64 is what is meant
+    """Return 64 mixed bits for each combination (broadcast) of whole numbers."""
+    with np.errstate(over="ignore"):  # overflow is intended: arithmetic modulo 2**64
         state = _mix(np.asarray(seed % 2**64, dtype=np.uint64))
         for key in keys:
             state = _with(state, key)
@@ -30,12 +30,12 @@ def hashes(seed: int, *keys: ArrayLike) -> Hashes:
 
 
 def uniform(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
-    """Uniform in [0, 1), shaped as the keys broadcast."""
+    """Return uniform numbers in [0, 1), shaped as the keys broadcast."""
     return _fraction(hashes(seed, *keys))
 
 
 def normal(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
-    """Standard normal (Box and Muller), shaped as the keys broadcast."""
+    """Return standard normal numbers (Box and Muller), shaped as the keys broadcast."""
     state = hashes(seed, *keys)
     with np.errstate(over="ignore"):
         first, second = 1.0 - _fraction(_with(state, 0)), _fraction(_with(state, 1))
@@ -44,12 +44,12 @@ def normal(seed: int, *keys: ArrayLike) -> NDArray[np.float64]:
 
 
 def whole(seed: int, low: int, high: int, *keys: ArrayLike) -> NDArray[np.int64]:
-    """Uniform whole numbers in [low, high]."""
+    """Return uniform whole numbers in [low, high]."""
     return low + (uniform(seed, *keys) * (high - low + 1)).astype(np.int64)
 
 
 def generator(seed: int, *keys: int) -> np.random.Generator:
-    """A generator for what is drawn in sequence within one call, chosen by seed and whole numbers."""
+    """Return a generator for draws in sequence within one call, selected by seed and whole numbers."""
     return np.random.Generator(np.random.PCG64(int(hashes(seed, *keys)[()])))
 
 
@@ -58,7 +58,6 @@ def _fraction(values: Hashes) -> NDArray[np.float64]:
 
 
 def _with(state: Hashes, key: ArrayLike) -> Hashes:
-    """The hashes of one more number."""
     whole = np.asarray(key).astype(np.int64).astype(np.uint64)
     return _mix((whole + np.uint64(1)) * _GOLDEN ^ state)
 

@@ -1,8 +1,8 @@
-"""Thermal drift: how the sample wanders, turns and expands under the tip.
+"""Thermal drift: translation, rotation and expansion of the sample under the tip.
 
-The sign, once and for all: drift is the displacement of the sample, so a feature that was at `x_sample` when the
-experiment started is found at `x_tip = x_sample + drift(t)`. On a sample that turns or expands about a place, that
-holds for this place, and for any other `x_tip = turned(x_sample, t) + drift(t)`.
+The sign convention: drift is the displacement of the sample, so a feature that was at `x_sample` when the experiment
+started is found at `x_tip = x_sample + drift(t)`. On a sample that turns or expands this holds at the fixed point
+`about_m`; elsewhere `x_tip = turned(x_sample, t) + drift(t)`.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from afspm.simulation import chance
 from afspm.simulation.fields import Array
 from afspm.simulation.settings import check
 
-_LONGEST_S = 2.0**20  # twelve days: the random walk's coarsest interval
-_LEVELS = 22  # halvings of it; finer than a quarter of a second the walk is a straight line
-_FASTEST_M_PER_S = 1e-6  # a thousand times what a bad evening has: a slip of the unit, 60 um/s for 60 nm/min
-_FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and twelve days of it are still a number
+_LONGEST_S = 2.0**20  # twelve days: the coarsest interval of the random walk
+_LEVELS = 22  # halvings of it: below a quarter of a second the walk is linear
+_FASTEST_M_PER_S = 1e-6  # a thousand times a bad evening's drift: finds slips of the unit, 60 um/s for 60 nm/min
+_FASTEST_EXPANSION_PER_S = 1e-4  # beyond any sample, and still finite after twelve days
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Relaxation:
 
 @dataclass(frozen=True)
 class DriftSettings:
-    """The sum of all contributions, as (x, y, z) unless said otherwise.
+    """The sum of all contributions, each as (x, y, z) unless noted.
 
     Attributes:
         velocity_m_per_s: constant drift, at most 1e-6 m/s along each axis.
@@ -72,7 +72,7 @@ class DriftSettings:
 
 
 class Drift:
-    """A function of time: asked at any time, in any order, it gives the same."""
+    """The drift as a function of time; the order of calls does not matter."""
 
     def __init__(self, settings: DriftSettings, seed: int, start_s: float) -> None:
         self._settings = settings
@@ -80,7 +80,7 @@ class Drift:
         self._start_s = start_s
 
     def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
-        """(x, y, z) in m at experiment times, shape t.shape + (3,); zero at the start.
+        """Return (x, y, z) in m at experiment times, shape t.shape + (3,); zero at the start.
 
         Raises:
             InvalidValue: a time before the start.
@@ -107,17 +107,17 @@ class Drift:
         return np.asarray(np.exp(rate * self._since_s(t_s)))
 
     def turned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Turn and expand places (x, y) of the sample up to times, which are broadcast with x and y."""
+        """Rotate and expand positions (x, y) of the sample up to given times, which broadcast with x and y."""
         return self._about(x_m, y_m, self.turn(t_s))
 
     def unturned(self, x_m: Array, y_m: Array, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Undo `turned`."""
+        """Invert `turned`."""
         return self._about(x_m, y_m, 1.0 / self.turn(t_s))
 
     def _about(self, x_m: Array, y_m: Array, factor: NDArray[np.complex128]) -> tuple[Array, Array]:
         s = self._settings
         if s.rotation_rad_per_s == s.expansion_per_s == 0.0:
-            return x_m, y_m  # to the last digit
+            return x_m, y_m  # exactly, without rounding
         pivot = complex(*s.about_m)
         moved = pivot + factor * (x_m + 1j * y_m - pivot)
         return moved.real, moved.imag
@@ -130,16 +130,16 @@ class Drift:
 
 
 class ScannerCompensation:
-    """By how much a scanner has followed the sample by itself, with velocities that it was told from time to time."""
+    """The displacement of a scanner that follows the sample by itself, at velocities set from time to time."""
 
     def __init__(self, turns: Iterable[tuple[float, float, float, float, float]] = ()) -> None:
-        self.turns = list(turns)  # time, (x, y) by then, velocity from then on
+        self.turns = list(turns)  # (time, x, y at that time, velocity from then on)
 
     def set(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
-        """From a time on, the scanner moves along with a velocity.
+        """Set the velocity of the scanner from a time on.
 
         Raises:
-            InvalidValue: before the time of the velocity that it has.
+            InvalidValue: a time before the last change of velocity.
         """
         if self.turns and t_s < self.turns[-1][0]:
             raise InvalidValue(f"a velocity from {t_s:g} s on, after one from {self.turns[-1][0]:g} s on")
@@ -148,10 +148,10 @@ class ScannerCompensation:
         self.turns.append((t_s, float(x), float(y), float(velocity_x), float(velocity_y)))
 
     def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
-        """(x, y, z) in m at experiment times, shape t.shape + (3,); z is not followed."""
+        """Return (x, y, z) in m at experiment times, shape t.shape + (3,); z is not followed."""
         t = np.asarray(t_s, dtype=np.float64)
         followed = np.zeros((*t.shape, 3))
-        # in a long night there are thousands, and asked for is what was last
+        # a long night has thousands of velocities, and mostly the last is needed
         first = bisect_right(self.turns, t.min(initial=math.inf), key=lambda turn: turn[0]) - 1
         for since_s, x, y, velocity_x, velocity_y in self.turns[max(first, 0) :]:
             later = t >= since_s
@@ -161,7 +161,7 @@ class ScannerCompensation:
 
 
 def random_walk(seed: int, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A Brownian path of unit variance a second, zero at zero, at any times t >= 0.
+    """Return a Brownian path of unit variance a second, zero at zero, at any times t >= 0.
 
     Lévy's construction: the ends of a long interval first, then midpoints between midpoints, each drawn by
     its index; so a value needs no history.

@@ -1,4 +1,4 @@
-"""Fault injection: which faults strike a simulated microscope or an emulated controller, and when."""
+"""Fault injection: kinds and times of faults of a simulated microscope or an emulated controller."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INSTRUMENT_FAULTS: Final[Mapping[str, str]] = {
     "late-file": "a file appears only after the duration",
     "half-file": "the second half of a file appears only after the duration",
 }
-"""The faults of any microscope, apart from those of the way to it."""
+"""The faults of any microscope, except those of its connection."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Fault:
     """One fault.
 
     Attributes:
-        kind: one that the microscope or the emulator has.
+        kind: a kind of the microscope or the emulator.
         at_s: experiment seconds after the start, from which on it strikes.
-        count: how many times.
-        duration_s: how long it lasts, for kinds that last (experiment seconds).
+        count: the number of strikes.
+        duration_s: for kinds with a duration (experiment seconds).
     """
 
     kind: str
@@ -48,7 +48,7 @@ class Fault:
         """Parse `KIND[@SECONDS][,count=N][,duration=SECONDS]` of the command line; count=every for each time.
 
         Raises:
-            ConfigError: it is not of that form.
+            ConfigError: the text has another form.
         """
         head, *settings = text.split(",")
         kind, _, at = head.partition("@")
@@ -70,7 +70,7 @@ class Fault:
 
     @classmethod
     def of(cls, given: str | PlainMapping | Fault) -> Fault:
-        """Make a fault from a text as on the command line, or from a table of the experiment file."""
+        """Create a fault from a text as on the command line, or from a table of the experiment file."""
         if isinstance(given, Fault):
             return given
         if isinstance(given, str):
@@ -86,9 +86,9 @@ class Faults:
 
     Args:
         faults: in any order.
-        known: the kinds that there are, with the effect of each.
-        start_s: experiment time that `Fault.at_s` counts from.
-        kept: JSON-able, and lasts: the faults that are left, where they outlive a restart (a crash comes once).
+        known: all kinds, with the effect of each.
+        start_s: the experiment time from which `Fault.at_s` counts.
+        kept: JSON-able storage for the remaining faults, where they outlive a restart (a crash strikes once).
 
     Raises:
         ConfigError: an unknown kind.
@@ -108,7 +108,7 @@ class Faults:
         self._keep()
 
     def demand(self, fault: Fault, now_s: float) -> None:
-        """One more, its time counted from now."""
+        """Add a fault; its time counts from now."""
         self._check(fault.kind)
         self._left.append(replace(fault, at_s=now_s - self._start_s + fault.at_s))
         self._keep()
@@ -116,7 +116,7 @@ class Faults:
     def strikes(self, kind: str, now_s: float) -> Fault | None:
         """Return the fault if one of this kind strikes now, and count it.
 
-        Ask once at the point where this kind would show: each time uses up one of `count`.
+        Call it once at the point where this kind would show: each call uses up one of `count`.
         """
         self._check(kind)
         for i, fault in enumerate(self._left):
@@ -130,7 +130,7 @@ class Faults:
         return None
 
     def lasts(self, kind: str, now_s: float) -> bool:
-        """True while a fault of this kind lasts: from its time on for its duration."""
+        """Return whether a fault of this kind lasts: from its time on for its duration."""
         self._check(kind)
         begun = ((self._start_s + fault.at_s, fault.duration_s) for fault in self._left if fault.kind == kind)
         return any(at_s <= now_s < at_s + duration_s for at_s, duration_s in begun)

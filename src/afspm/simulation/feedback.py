@@ -22,15 +22,15 @@ from afspm.simulation.settings import check, one_of
 
 @dataclass(frozen=True)
 class SensorSettings:
-    """The sensor of the mode "frequency-shift": it oscillates near the sample, whose attraction shifts its resonance.
+    """The sensor of the mode "frequency-shift": the attraction of the sample shifts its resonance.
 
-    Of a sphere that is attracted by van der Waals forces, with any amplitude A, a distance d from the sample at the
-    nearest point of its way: shift = -f H R / (6 k (d (d + 2 A))^(3/2)) (Giessibl 1997).
+    For a sphere with van der Waals attraction, any amplitude A, and the distance d from the sample at the lower turning
+    point: shift = -f H R / (6 k (d (d + 2 A))^(3/2)) (Giessibl 1997).
 
     Attributes:
         resonance_hz: far from the sample.
         oscillation_m: amplitude, kept constant.
-        radius_m: of the apex that is attracted.
+        radius_m: of the attracted apex.
         hamaker_j: of the attraction.
         contact_m: the shift stays constant below this distance.
     """
@@ -51,18 +51,18 @@ class SensorSettings:
         return np.asarray(-self._strength / (nearest * (nearest + 2.0 * self.oscillation_m)) ** 1.5)
 
     def distance_m(self, shift_hz: float) -> float:
-        """Return the distance at which the resonance is shifted so far; `shift_hz` is negative."""
+        """Return the distance at which the resonance shifts by `shift_hz`, which is negative."""
         squared = (self._strength / -shift_hz) ** (2.0 / 3.0)
         return math.sqrt(self.oscillation_m**2 + squared) - self.oscillation_m
 
     def slope_hz_per_m(self, distance_m: float) -> float:
-        """Return how much the shift changes with the distance: positive."""
+        """Return the derivative of the shift by the distance: positive."""
         both = distance_m + 2.0 * self.oscillation_m
         return float(1.5 * self._strength * (distance_m + both) / (distance_m * both) ** 2.5)
 
     @property
     def largest_hz(self) -> float:
-        """The shift in contact, which no other is below."""
+        """The shift in contact, the lowest possible one."""
         return float(self.shift_hz(np.zeros(())))
 
     @property
@@ -72,9 +72,9 @@ class SensorSettings:
 
 MODES = ("amplitude", "current", "frequency-shift")
 _ONE_ATOM_S = 77.48e-6  # conductance of a contact of one atom, 2 e^2 / h
-_GENTLE = 0.3  # share of the free amplitude that a gentle setpoint takes away
-_GENTLE_M = 1e-9  # distance of a sensor that a gentle frequency shift is met at
-_GROWN = 10.0  # e-foldings in one step, after which nothing is left but the saturated oscillation
+_GENTLE = 0.3  # reduction of the free amplitude at a gentle setpoint
+_GENTLE_M = 1e-9  # distance of a sensor at a gentle frequency shift
+_GROWN = 10.0  # e-foldings in one step, after which the saturated oscillation dominates
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class FeedbackSettings:
             raise ConfigError(refusal, where="setpoint")
 
     def refusal_of(self, setpoint: float) -> str:
-        """Return why there can be no such setpoint in this mode; empty if there can."""
+        """Return why a setpoint is impossible in this mode; empty if it is possible."""
         if self.mode != "frequency-shift":
             return "" if 0 < setpoint < math.inf else f"a setpoint is above zero, not {setpoint:g}"
         largest = self.sensor.largest_hz
@@ -129,7 +129,7 @@ class FeedbackSettings:
 
 @dataclass(frozen=True)
 class Loop:
-    """The feedback as it is in force for one scan."""
+    """The feedback in force during one scan."""
 
     settings: FeedbackSettings
     on: bool
@@ -139,10 +139,10 @@ class Loop:
 
     @classmethod
     def of(cls, settings: FeedbackSettings, feedback: Feedback | None) -> Loop:
-        """The settings with what `feedback` says instead.
+        """Return the settings, overridden by the fields of `feedback`.
 
         Raises:
-            InvalidValue: a gain below zero, a setpoint that there can't be in this mode, or what is not finite.
+            InvalidValue: a negative gain, an impossible setpoint of this mode, or a value that is not finite.
         """
         said = feedback or Feedback()
         on = settings.on if said.on is None else said.on
@@ -158,12 +158,12 @@ class Loop:
 
     @property
     def engages(self) -> bool:
-        """True if the setpoint can be met at all: an amplitude above the free one never is."""
+        """Whether the setpoint can be reached: an amplitude above the free one can't."""
         return self.settings.mode != "amplitude" or self.setpoint < self.settings.free_amplitude_v
 
     @property
     def force(self) -> float:
-        """The force with which tip and sample press on each other; 1 at a gentle setpoint, 0 when they never touch."""
+        """The relative force between tip and sample; 1 at a gentle setpoint, 0 without contact."""
         s = self.settings
         if s.mode == "current":
             return math.log1p(self.setpoint / 50e-12) / math.log(2.0)
@@ -174,14 +174,14 @@ class Loop:
     def tunnelling_distance_m(self, bias_v: float) -> float:
         """Return the distance from the sample at which the tunnelling current is the setpoint.
 
-        The conductance falls by e over each `decay_m`, from that of a contact of one atom.
+        The conductance falls by e over each `decay_m`, from the conductance of a one-atom contact.
         """
         conductance_s = self.setpoint / max(abs(bias_v), 1e-6)
         return self.settings.decay_m * math.log(max(_ONE_ATOM_S / conductance_s, 1.0))
 
     @property
     def error_limits_m(self) -> tuple[float, float]:
-        """Largest errors that the detector can show: (tip too high, tip too low), both positive."""
+        """The largest errors that the detector can show: (tip too high, tip too low), both positive."""
         s = self.settings
         if s.mode == "current":
             below = math.log(max(self.setpoint / s.current_floor_a, math.e)) * s.decay_m
@@ -192,11 +192,11 @@ class Loop:
         return (s.free_amplitude_v - self.setpoint) * s.sensitivity_m_per_v, self.setpoint * s.sensitivity_m_per_v
 
     def follow(self, height_m: Array, step_s: float, start_v: Array) -> Array:
-        """z along paths, one a column.
+        """Return z along paths, one a column.
 
         Args:
-            height_m: at which the setpoint would be met, shape (steps, paths), `step_s` apart, straight between.
-            start_v: speed of z at the start, one a path; what an oscillating loop starts from.
+            height_m: at which the setpoint would be reached, shape (steps, paths), `step_s` apart, linear in between.
+            start_v: speed of z at the start, one a path; from it an oscillation of the loop grows.
         """
         splits = self._splits(step_s)
         dt = step_s / splits
@@ -205,7 +205,7 @@ class Loop:
         rate = self.integral_gain + self.proportional_gain / self.settings.lag_s
         down, up = np.float64(rate * too_high), np.float64(rate * too_low)
         v = start_v.copy()
-        # The swing of an oscillating loop begins anywhere: half of what it has, besides its speed, is in z.
+        # An oscillation starts at any phase: besides the speed, half of its amplitude is in z.
         z = height_m[0] + (np.roll(start_v, 1) / self._omega if self.oscillates else 0.0)
         result = np.empty_like(height_m)
         result[0] = z
@@ -224,18 +224,18 @@ class Loop:
         return result
 
     def amplitude_v(self, gap_m: Array) -> Array:
-        """Return what the detector shows; gap is z less the height at which the setpoint is met."""
+        """Return the detector's amplitude; gap is z minus the height at which the setpoint is reached."""
         s = self.settings
         return np.clip(self.setpoint + gap_m / s.sensitivity_m_per_v, 0.0, s.free_amplitude_v)
 
     def frequency_shift_hz(self, gap_m: Array) -> Array:
-        """Return the shift that the sensor shows; gap as of `amplitude_v`."""
+        """Return the sensor's frequency shift; gap as of `amplitude_v`."""
         sensor = self.settings.sensor
         return sensor.shift_hz(sensor.distance_m(self.setpoint) + gap_m)
 
     @property
     def oscillates(self) -> bool:
-        """True if the gains are beyond the limit of stability."""
+        """Whether the gains are beyond the limit of stability."""
         return self._damping <= 0.0 or self._inertia <= 0.0
 
     @property
@@ -248,20 +248,18 @@ class Loop:
 
     @property
     def _omega(self) -> float:
-        """Of the oscillation, in 1/s: a quarter of its period is no shorter than the loop's delay."""
+        # angular frequency in 1/s; a quarter of the period is not shorter than the delay of the loop
         linear = math.sqrt(max(self.integral_gain, 1.0) / max(self._inertia, 0.1 * self.settings.lag_s))
         return min(linear, math.pi / (2.0 * self.settings.delay_s))
 
     def _splits(self, step_s: float) -> int:
-        """Parts of a step: one is exact as long as nothing saturates, ringing is better seen with a few."""
+        # a step is exact unless the detector saturates; several parts resolve ringing better
         ringing = self._damping**2 < 2.0 * max(self._inertia, 0.1 * self.settings.lag_s) * self.integral_gain
         return min(4, max(1, math.ceil(step_s / self.settings.lag_s / 3.0))) if ringing else 1
 
     def _limited(self, z: Array, v: Array, h: Array) -> tuple[Array, Array]:
-        """An oscillation grows until the saturated detector gives no more gain than the loop can bear.
-
-        For a sine that saturates, the gain falls about as 4 / pi * limit / amplitude (its describing function).
-        """
+        # An oscillation grows until the saturated detector reduces the gain to the limit of stability. For a saturating
+        # sine the gain falls about as 4 / pi * limit / amplitude (its describing function).
         excess = self.integral_gain * self.settings.delay_s / (1.0 + self.proportional_gain)
         most_m = min(self.error_limits_m) * 4.0 / math.pi * max(excess, 1.0)
         y = z - h
@@ -269,14 +267,14 @@ class Loop:
         return h + share * y, share * v
 
     def _propagator(self, dt: float) -> NDArray[np.float64]:
-        """Exact over dt: rows give the change of z and the new v from (z - h, v, change of h during dt)."""
+        # exact over dt; rows give the change of z and the new v from (z - h, v, change of h during dt)
         inertia = self._inertia
         limit = 0.1 * self.settings.lag_s
         damping = self._damping if inertia > limit else min(self._damping, -0.5)  # a P gain alone may be too high
         inertia = max(inertia, limit)
         ki, drive = self.integral_gain, self.proportional_gain - self.integral_gain * self.settings.delay_s
         growth = -damping * dt / (2.0 * inertia)
-        # Past the second bound the equation runs away without turning, which no loop with a delay does.
+        # Beyond the second bound the equation diverges without oscillating, unlike any loop with a delay.
         if growth > _GROWN or (growth > 0.0 and damping**2 >= 4.0 * inertia * ki):
             return self._turned(dt, min(growth, _GROWN))
         # state (z - h0, v, h - h0, h'), with time in units of dt
@@ -289,14 +287,14 @@ class Loop:
         return np.array([[e[0, 0] - 1.0, e[0, 1] * dt, e[0, 3]], [e[1, 0] / dt, e[1, 1], e[1, 3] / dt]])
 
     def _turned(self, dt: float, growth: float) -> NDArray[np.float64]:
-        """The same of an oscillation that soon saturates, whatever the surface: its phase goes on, and it grows."""
+        # the propagator of an oscillation that soon saturates: it grows, its phase advances, the surface has no effect
         omega, grown = self._omega, math.exp(growth)
         sine, cosine = grown * math.sin(omega * dt), grown * math.cos(omega * dt)
         return np.array([[cosine - 1.0, sine / omega, 0.0], [-omega * sine, cosine, 0.0]])
 
 
 def _exponential(a: NDArray[np.float64]) -> NDArray[np.float64]:
-    """exp(a) by scaling and squaring, rows beyond what a float holds cut off (an unstable loop saturates anyway)."""
+    # exp(a) by scaling and squaring; values beyond a float's range are clipped (an unstable loop saturates anyway)
     halvings = max(0, math.ceil(math.log2(max(float(np.abs(a).max()), 1e-9))) + 3)
     small = a / 2.0**halvings
     term = total = np.eye(len(a))

@@ -1,7 +1,7 @@
-"""Smooth random fields on the whole plane, the stuff that meandering, roughness and patches are made of.
+"""Smooth random fields on the whole plane, used for meandering, roughness and patches.
 
-A field is a cubic B-spline whose coefficients, one a lattice point, are hashed from the point's indices: defined
-everywhere, without period, the same however finely it is looked at.
+A field is a cubic B-spline whose coefficients, one for each lattice point, are hashed from the point's indices: defined
+everywhere, without period, and independent of the sampling.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from afspm.simulation import chance
 
 Array = NDArray[np.float64]
-_MATMUL_LATTICE = 48  # up to here a dense product beats gathering
+_MATMUL_LATTICE = 48  # up to this size a dense product is faster than gathering
 # The rms of a B-spline field of unit coefficients, averaged over positions: (sum of w^2)^(1/2) each axis.
 _SPLINE_RMS = 151.0 / 315.0
 
 
 def is_separable(x_m: Array, y_m: Array) -> bool:
-    """True if x is one row and y one column: a grid along the axes, which is much faster to fill."""
+    """Return whether x is one row and y one column: a grid along the axes, which is much faster to fill."""
     return x_m.ndim == 2 and y_m.ndim == 2 and x_m.shape[0] == 1 and y_m.shape[1] == 1
 
 
 def bspline_weights(fraction: Array) -> tuple[Array, Array, Array, Array]:
-    """Weights of the lattice points at -1, 0, 1, 2 for a position at `fraction` in [0, 1) after point 0."""
+    """Return weights of the lattice points at -1, 0, 1, 2 for a position at `fraction` in [0, 1) after point 0."""
     rest = 1.0 - fraction
     square, rest_square = fraction * fraction, rest * rest
     return (
@@ -37,13 +37,13 @@ def bspline_weights(fraction: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def smooth_field(seed: int, x_m: Array, y_m: Array, spacing_m: float) -> Array:
-    """A random field of zero mean and unit rms whose features are about two spacings wide.
+    """Return a random field of zero mean and unit rms with features about two spacings wide.
 
     Args:
         x_m, y_m: positions, broadcast against each other; one row and one column are fastest.
         spacing_m: of the lattice.
     """
-    # A shift of its own keeps the lattices of the octaves from lining up at the origin.
+    # A random shift, so that the lattices of the octaves don't align at the origin.
     shift = chance.uniform(seed, np.arange(2)) * 64.0
     u, v = x_m / spacing_m + shift[0], y_m / spacing_m + shift[1]
     field = _on_grid(seed, u[0], v[:, 0]) if is_separable(x_m, y_m) else _at_points(seed, u, v)
@@ -53,9 +53,9 @@ def smooth_field(seed: int, x_m: Array, y_m: Array, spacing_m: float) -> Array:
 def rough_field(
     seed: int, x_m: Array, y_m: Array, *, largest_m: float, smallest_m: float, hurst: float, resolution_m: float
 ) -> Array:
-    """A self-affine field of unit rms: octaves from `largest_m` down, amplitudes as wavelength**hurst.
+    """Return a self-affine field of unit rms: octaves from `largest_m` down, amplitudes as wavelength**hurst.
 
-    Octaves finer than `resolution_m` fade out: what cannot be seen at that resolution is not drawn.
+    Octaves finer than `resolution_m` fade out, since they can't be resolved.
     """
     octaves = max(1, 1 + math.floor(math.log2(largest_m / smallest_m)))
     amplitudes = [2.0 ** (-hurst * octave) for octave in range(octaves)]
@@ -86,7 +86,7 @@ def _at_points(seed: int, u: Array, v: Array) -> Array:
 
 
 def _on_grid(seed: int, u: Array, v: Array) -> Array:
-    """The same on the grid of v (rows) and u (columns), one axis after the other."""
+    # v gives the rows and u the columns; one axis after the other
     (row, v_weights), (column, u_weights) = _axis(v), _axis(u)
     rows = np.arange(row.min() - 1, row.max() + 3)
     columns = np.arange(column.min() - 1, column.max() + 3)
@@ -101,7 +101,7 @@ def _axis(positions: Array) -> tuple[NDArray[np.int64], tuple[Array, Array, Arra
 
 
 def _spline_axis(lattice: Array, first: NDArray[np.int64], weights: tuple[Array, ...]) -> Array:
-    """Spline along axis 0: sample i is made of lattice rows first[i] to first[i] + 3."""
+    # sample i is a weighted sum of the lattice rows first[i] to first[i] + 3
     if lattice.shape[0] <= _MATMUL_LATTICE:
         matrix = np.zeros((len(first), lattice.shape[0]))
         for k, weight in enumerate(weights):

@@ -22,7 +22,7 @@ _SPLINE_VARIANCE = 1.0 / 3.0  # of the cubic B-spline as a blur, in samples squa
 
 @dataclass(frozen=True)
 class SampleGrid:
-    """Points on which the sample is drawn, finer than the scan, along the axes of the sample.
+    """Points at which the sample is computed, finer than the scan, along the axes of the sample.
 
     Attributes:
         x0_m, y0_m: the first point.
@@ -38,28 +38,27 @@ class SampleGrid:
 
     @classmethod
     def covering(cls, x_m: Array, y_m: Array, step_m: tuple[float, float], margin_m: float) -> SampleGrid:
-        """Around all positions, with room for a tip that reaches over by the margin."""
-        # On multiples of the step, so that the same place is drawn alike by every scan of that resolution.
+        """Return a grid around all positions, with a margin for the reach of the tip."""
+        # On multiples of the step, so that every scan of that resolution computes a position alike.
         first = [math.floor((a.min() - margin_m) / d) - 8 for a, d in zip((x_m, y_m), step_m, strict=True)]
         last = [math.ceil((a.max() + margin_m) / d) + 8 for a, d in zip((x_m, y_m), step_m, strict=True)]
         shape = (last[1] - first[1] + 1, last[0] - first[0] + 1)
         return cls(first[0] * step_m[0], first[1] * step_m[1], *step_m, shape)
 
     def axes_m(self) -> tuple[Array, Array]:
-        """x as one row, y as one column."""
+        """Return x as one row, y as one column."""
         ny, nx = self.shape
         x: Array = self.x0_m + self.dx_m * np.arange(nx, dtype=np.float64)
         y: Array = self.y0_m + self.dy_m * np.arange(ny, dtype=np.float64)
         return x[None, :], y[:, None]
 
     def rows(self, start: int, stop: int) -> SampleGrid:
-        """Only these rows."""
         return SampleGrid(self.x0_m, self.y0_m + start * self.dy_m, self.dx_m, self.dy_m, (stop - start, self.shape[1]))
 
 
 @dataclass
 class Sampler:
-    """Positions on a grid, prepared so that several pictures on that grid can be read at them."""
+    """Positions on a grid, prepared for reading several images at them."""
 
     grid: SampleGrid
     x_m: Array
@@ -76,7 +75,7 @@ class Sampler:
         self._u, self._v = u - column, v - row
 
     def spline(self, picture: Single) -> Array:
-        """The cubic B-spline with the picture as coefficients: smooth, and a slight blur of its own."""
+        """Return the cubic B-spline with the image as coefficients: smooth, with a slight blur."""
         flat, width = np.ravel(picture), self.grid.shape[1]
         total = np.zeros(self._u.shape)
         u_weights = bspline_weights(self._u)
@@ -90,7 +89,7 @@ class Sampler:
         return total
 
     def linear(self, picture: Array) -> Array:
-        """Between the four points around each position."""
+        """Interpolate between the four points around each position."""
         flat, width = np.ravel(picture), self.grid.shape[1]
         lower = flat.take(self._index) * (1 - self._u) + flat.take(self._index + 1) * self._u
         upper = flat.take(self._index + width) * (1 - self._u) + flat.take(self._index + width + 1) * self._u
@@ -98,13 +97,13 @@ class Sampler:
 
 
 def across_m(tip: TipShape, height_range_m: float) -> float:
-    """Return how far beside its apex the round part of a tip can touch a surface of that range of heights."""
-    corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, it is the cone that touches
+    """Return the lateral reach of the round part of a tip on a surface with this range of heights."""
+    corner = tip.imaging_radius_m / math.tan(math.radians(tip.half_angle_deg))  # beyond, the cone touches
     return min(math.sqrt(2.0 * tip.imaging_radius_m * height_range_m), corner)
 
 
 def reach_m(tip: TipShape, height_range_m: float) -> float:
-    """Return how far beside its apex a tip can touch a surface of that range of heights."""
+    """Return the lateral reach of a tip on a surface with this range of heights."""
     across = across_m(tip, height_range_m)
     beyond = max(0.0, height_range_m - across**2 / (2.0 * tip.imaging_radius_m))
     reach = across + beyond * math.tan(math.radians(tip.half_angle_deg))
@@ -112,13 +111,13 @@ def reach_m(tip: TipShape, height_range_m: float) -> float:
 
 
 def felt(height_m: Array, grid: SampleGrid, tip: TipShape, blur_steps: tuple[float, float]) -> tuple[Single, float]:
-    """The apex's path over a surface, on the same grid, band limited.
+    """Return the apex's path over a surface, on the same grid, band limited.
 
     Args:
-        blur_steps: standard deviation of the whole blur (y, x) in grid steps, that of `Sampler.spline` included.
+        blur_steps: standard deviation of the whole blur (y, x) in grid steps, including the blur of `Sampler.spline`.
 
     Returns:
-        The path less an offset (single precision is then plenty), and the offset in m.
+        The path minus an offset (single precision then suffices), and the offset in m.
     """
     offset = float(height_m.mean())
     surface = (height_m - offset).astype(np.float32)
@@ -155,7 +154,7 @@ def _under_parabola(surface: Single, axis: int, step_m: float, radius_m: float, 
 
 
 def _under_cone(surface: Single, grid: SampleGrid, slope: float, reach_m: float) -> Single:
-    """An eight-sided pyramid: lines of that slope along both axes and both diagonals, by doubling the stride."""
+    # an eight-sided pyramid: lines of that slope along axes and diagonals, by doubling the stride
     directions = ((1, 0), (0, 1), (1, 1), (1, -1))
     for rows, columns in directions:
         length = math.hypot(rows * grid.dy_m, columns * grid.dx_m)
@@ -170,7 +169,7 @@ def _under_cone(surface: Single, grid: SampleGrid, slope: float, reach_m: float)
 
 
 def _raise_to(result: Single, other: Single, offset: tuple[int, int]) -> None:
-    """result[p] = max(result[p], other[p + offset]) where that exists."""
+    # result[p] = max(result[p], other[p + offset]) where that exists
     here, there = [], []
     for shift, size in zip(offset, result.shape, strict=True):
         here.append(slice(max(-shift, 0), size - max(shift, 0)))
@@ -180,7 +179,7 @@ def _raise_to(result: Single, other: Single, offset: tuple[int, int]) -> None:
 
 
 def _shifted(picture: Single, columns: float, rows: float) -> Single:
-    """picture at (row + rows, column + columns), linear between points; the border is repeated."""
+    # picture at (row + rows, column + columns), linear between points; the border is repeated
     for axis, shift in ((0, rows), (1, columns)):
         size = picture.shape[axis]
         position = np.clip(np.arange(size) + shift, 0, size - 1)
@@ -192,7 +191,7 @@ def _shifted(picture: Single, columns: float, rows: float) -> Single:
 
 
 def _blurred(picture: Single, sigma: float, axis: int) -> Single:
-    """Gaussian along one axis; the border is repeated."""
+    # Gaussian; the border is repeated
     if sigma < 0.1:
         return picture
     taps = math.ceil(3.0 * sigma)

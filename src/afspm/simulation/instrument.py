@@ -1,8 +1,8 @@
 """`Instrument`: the one simulated instrument, behind the Simulator's driver and behind every emulated controller.
 
-Theory of operation. A driver or a maker's protocol puts values in force (`setup`), begins one activity after the other,
-and asks how far it is. The instrument has no clock and no threads: every call gets the time (experiment seconds), and
-the work of drawing a scan is handed to `run`, which may do it in a thread.
+**Theory of operation.** A driver or a maker's protocol changes the settings (`setup`), starts one activity after
+the other, and polls its progress. The instrument has no clock and no threads: every call gets the time (experiment
+seconds), and the computation of a scan is handed to `run`, which may use a thread.
 
 | | |
 | --- | --- |
@@ -10,9 +10,9 @@ the work of drawing a scan is handed to `run`, which may do it in a thread.
 | state | the world (tip, sample, drift), one activity, the probe's position |
 | goes out | activities with their values, a `note` of each event |
 
-What always holds: one activity at a time; the world is touched by the drawing of a scan or by the caller, never by both
+Invariants: one activity at a time; the world is touched by the computation of a scan or by the caller, never by both
 (`ScanDrawing.wait`); the same seed and the same commands at the same times give the same values; `state` at any moment
-is enough to go on after a kill: a running scan is drawn again from the world as it was at its start.
+suffices to continue after a kill: a running scan is computed again from the world at its start.
 
 Lengths in m in tip coordinates, angles in rad counter-clockwise, times in experiment seconds.
 """
@@ -38,15 +38,15 @@ from afspm.simulation.world import World
 
 Doing = ScanActivity | SpectrumActivity | Occupied
 Note = Callable[[float, str, Mapping[str, object]], None]
-"""Takes the time of an event, its name, and facts of it."""
-_MOST_AVERAGED = 32  # of more sweeps the noise is no less
+"""Called with the time of an event, its name, and its facts."""
+_MOST_AVERAGED = 32  # more sweeps reduce the noise no further
 _FASTEST_DRIFT_M_S = 1e-6
-_FEW = (2, 2)  # pixels: enough to see which channels there are
+_FEW = (2, 2)  # pixels: enough to find the channels
 _STATE_VERSION = 1
 
 
 class InstrumentBusy(AfspmError):
-    """The instrument does something else, which must end or be stopped first."""
+    """Another activity is running; it must end or be stopped first."""
 
     code = "instrument-busy"
 
@@ -55,8 +55,8 @@ class InstrumentSetup:
     """The settings in force.
 
     Attributes:
-        region, shape, line_s, upwards: of the next scan: the frame, (rows, columns), seconds of a line there and back,
-            and whether it begins with the smallest y.
+        region, shape, line_s, upwards: of the next scan: the frame, (rows, columns), seconds of trace and retrace, and
+            whether it begins with the smallest y.
         slope: compensation of tilt, (x, y).
         move_speed_m_s: of the probe outside of scans.
         approach_s: duration of an approach or a withdrawal.
@@ -76,7 +76,7 @@ class InstrumentSetup:
 
 @dataclass(frozen=True)
 class InstrumentState:
-    """All of an instrument that outlives a kill, besides its world and its `setup`; at most one activity is there."""
+    """The saved state of an instrument, except its world and its `setup`; at most one activity is set."""
 
     engaged: bool
     probe_m: tuple[float, float]
@@ -89,20 +89,20 @@ class InstrumentState:
 
 
 class Instrument:
-    """A simulated instrument, which does one thing at a time. For one thread at a time.
+    """A simulated instrument with one activity at a time. For one thread at a time.
 
     Args:
         world_settings: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
-        seed: everything that is left to chance follows from it.
-        start_s: the first time that the instrument is called with.
-        run: runs the drawing of scans; by default at once.
-        note: gets each event, for the ground truth.
+        seed: of all random numbers.
+        start_s: the first time of any call.
+        run: runs the computation of scans; by default at once.
+        note: called with each event, for the ground truth.
 
     Attributes:
         setup: the settings in force.
         drawing: of scans.
-        engaged: whether the tip is at the sample; if not, all that is measured is noise.
-        scan, spectrum: the last one that was started, also when it is over; None before the first.
+        engaged: the tip is at the sample; otherwise all channels show noise.
+        scan, spectrum: the last started one, also after its end; None before the first.
         world: the physics, with its ground truth (`world.truth`).
     """
 
@@ -135,7 +135,7 @@ class Instrument:
 
     @cached_property
     def channels(self) -> Mapping[str, str]:
-        """The channels of every scan, with their units: of a few pixels of a world that nothing happens to."""
+        """The channels of every scan, with their units: from a scan of a few pixels in a new world."""
         few = World.from_settings(self._world_settings, self.seed, 0.0)
         scan = few.scan(Region((0.0, 0.0), (1e-9, 1e-9)), _FEW, 1.0, 0.0)
         return {name: unit for name, (unit, _) in scan.channels().items()}
@@ -145,24 +145,23 @@ class Instrument:
         return self._doing.what if self._doing is not None and self._doing.running(now_s) else ""
 
     def busy(self, now_s: float) -> bool:
-        """True while something is going on."""
         return bool(self.doing(now_s))
 
     @property
     def ends_s(self) -> float | None:
-        """The end of the last activity until `ended` has returned it; None if free, paused or still being drawn."""
+        """The end of the last activity until `ended` has returned it; None if free, paused or being computed."""
         doing = self._doing
         if doing is None or (isinstance(doing, ScanActivity) and (doing.paused or doing.drawing)):
             return None
         return doing.end_s
 
     def next_change_s(self, now_s: float) -> float | None:
-        """Return when it will be free; None if it is free or paused, or if `drawing.wake` will be called."""
+        """Return the time at which it becomes free; None if free or paused, or if `drawing.wake` will be called."""
         ends_s = self.ends_s
         return None if ends_s is None or ends_s <= now_s else ends_s
 
     def ended(self, now_s: float) -> Doing | None:
-        """Return the activity that has ended since the last call; None if none has."""
+        """Return an activity that has ended since the last call, or None."""
         doing = self._doing
         if doing is None or doing.running(now_s):
             return None
@@ -184,7 +183,7 @@ class Instrument:
         if not self.engaged:
             return self._noise_alone()
         if scan is not None and scan.drawing and self._signals:
-            return self._signals  # the world is one thread's at a time
+            return self._signals  # the world belongs to one thread at a time
         self.drawing.wait()
         if scan is not None and scan is self._doing and scan.running(now_s):
             self._signals = scan.signals(now_s)
@@ -193,7 +192,7 @@ class Instrument:
                 self._signals = self.world.at_rest(
                     place, now_s, self.setup.feedback, self.setup.bias_v, slope=self.setup.slope, random=self._noise
                 )
-            except InvalidValue:  # nothing is met with such a feedback
+            except InvalidValue:  # with an invalid feedback the tip meets no surface
                 self._signals = self._noise_alone()
         return self._signals
 
@@ -203,7 +202,7 @@ class Instrument:
 
     @property
     def probe_m(self) -> tuple[float, float]:
-        """The target of the last move, (x, y), at which spectra, pulses and crashes happen."""
+        """The target of the last move, (x, y), the position of spectra, pulses and crashes."""
         return self._probe_m
 
     # -- scans
@@ -212,7 +211,7 @@ class Instrument:
         """Scan the frame.
 
         Raises:
-            InstrumentBusy. InvalidValue: no scan is possible with the setup.
+            InstrumentBusy. InvalidValue: the setup allows no scan.
         """
         self._check_free(now_s)
         setup = self.setup
@@ -236,13 +235,13 @@ class Instrument:
         return scan
 
     def stop_scan(self, now_s: float) -> None:
-        """Break the scan off, if one is running. What it has of lines stays to be had from `scan`."""
+        """Interrupt a running scan; its lines remain available from `scan`."""
         if self.scan is not None and self.scan is self._doing and self.scan.running(now_s):
             self.scan.stop(now_s)
             self.note(now_s, "scan stopped", {})
 
     def adjust(self, now_s: float) -> None:
-        """Take the rest of a running scan with the feedback and the bias that are in force now."""
+        """Continue a running scan with the present feedback and bias."""
         if self._scans and self.scan is not None and self.scan.running(now_s):
             self.drawing.wait()
             self.world.restore(self._before)
@@ -261,7 +260,7 @@ class Instrument:
     # -- spectra
 
     def start_spectrum(self, kind: str, now_s: float, sweeps: int = 1) -> SpectrumActivity:
-        """Take a curve of a kind ("IV", "force") where the probe is, the mean of `sweeps`.
+        """Take a curve of a kind ("IV", "force") at the probe's position, the mean of `sweeps`.
 
         Raises:
             InstrumentBusy. InvalidValue: there is no such kind.
@@ -276,7 +275,7 @@ class Instrument:
         self._counts["spectrum"] = number = self._counts["spectrum"] + 1
         if not self.engaged:
             random = np.random.default_rng((self.seed, 2, number))
-            for column, unit in list(enumerate(units))[1:]:  # the first is what is swept
+            for column, unit in list(enumerate(units))[1:]:  # the first column is the sweep
                 values[:, column] = noise_in_air(random, values.shape[:1], unit)
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
@@ -285,7 +284,7 @@ class Instrument:
         return self.spectrum
 
     def stop_spectrum(self, now_s: float) -> None:
-        """Break the spectrum off, if one is running: it is gone."""
+        """Interrupt and discard a running spectrum."""
         if isinstance(self._doing, SpectrumActivity) and self._doing.running(now_s):
             self._doing = self.spectrum = None
             self.note(now_s, "spectrum stopped", {})
@@ -293,13 +292,13 @@ class Instrument:
     # -- moves
 
     def move_probe(self, xy_m: tuple[float, float], now_s: float, *, way_m: float = 0.0) -> None:
-        """Move the tip; the way takes its time. A move under way is turned to the new place.
+        """Move the tip at the move speed. A running move is redirected to the new position.
 
         Args:
-            way_m: way of the frame, where that is moved at the same time.
+            way_m: path length of the frame, if it moves at the same time.
 
         Raises:
-            InstrumentBusy: with something else than a move. InvalidValue: no place.
+            InstrumentBusy: with another activity. InvalidValue: the position is not finite.
         """
         _finite("the position of the probe", *xy_m)
         if self.doing(now_s) != "move":
@@ -309,15 +308,15 @@ class Instrument:
         self._doing = Move("move", now_s, end_s, from_m, self._probe_m)
 
     def stop_move(self, now_s: float) -> None:
-        """Stay where the tip is on its way."""
+        """Stop the tip at its present position."""
         if self.doing(now_s) == "move":
             self._probe_m, self._doing = self.probe_at(now_s), None
 
     def shift_sample(self, by_m: tuple[float, float], lasts_s: float, now_s: float) -> None:
-        """Move the sample with a coarse stage, so that the tip is over another place of it, (x, y) further.
+        """Move the sample with a coarse stage, so that the tip is over another position of it, (x, y) further.
 
         Raises:
-            InstrumentBusy. InvalidValue: no distance or duration.
+            InstrumentBusy. InvalidValue: distance or duration is not finite.
         """
         _finite("the way of the stage", *by_m)
         self.occupy("stage", lasts_s, now_s)
@@ -326,7 +325,7 @@ class Instrument:
             self.world.compensate((0.0, 0.0), now_s + lasts_s)
 
     def follow(self, velocity_m_per_s: tuple[float, float], now_s: float) -> None:
-        """Move the scanner with this velocity (x, y) from now on, to follow the sample; a running scan, too.
+        """Move the scanner at this velocity (x, y) from now on, also during a running scan, to follow the sample.
 
         Raises:
             InvalidValue: faster than any drift.
@@ -342,21 +341,21 @@ class Instrument:
             self.world.compensate(velocity_m_per_s, now_s)
 
     def hold(self, z_m: float) -> None:
-        """Leave z there while the feedback is off. Raises InvalidValue."""
+        """Set z while the feedback is off. Raises InvalidValue."""
         self.drawing.wait()
         self.world.hold(z_m)
 
     # -- the tip
 
     def pulse(self, voltage_v: float, duration_s: float, now_s: float) -> str:
-        """A bias pulse where the probe is: "cured", "worsened" or "unchanged"."""
+        """Pulse the bias at the probe's position; return "cured", "worsened" or "unchanged"."""
         self._check_free(now_s)
         outcome = self.pulsed(voltage_v, duration_s, now_s)
         self.occupy("pulse", duration_s, now_s)
         return outcome
 
     def pulsed(self, voltage_v: float, duration_s: float, now_s: float) -> str:
-        """As `pulse`, of one that is over: the bias was set, and put back."""
+        """Apply the effect of a finished pulse: the bias was set and restored by the caller."""
         self.drawing.wait()
         if not self.engaged or duration_s <= 0.0:
             return "unchanged"
@@ -367,7 +366,7 @@ class Instrument:
         return outcome
 
     def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
-        """Drive the tip into the sample where the probe is, and out again: as `pulse`."""
+        """Drive the tip into the sample at the probe's position, and out again; return as `pulse`."""
         if not min(depth_m, speed_m_s) > 0.0:
             raise InvalidValue(f"a crash {depth_m} m deep with {speed_m_s} m/s", hint="depth and speed must be above 0")
         self._check_free(now_s)
@@ -380,13 +379,13 @@ class Instrument:
         return outcome
 
     def engage(self, now_s: float) -> None:
-        """Bring the tip to the sample."""
+        """Approach the sample."""
         self._check_free(now_s)
         self.engaged = True
         self.occupy("approach", self.setup.approach_s, now_s)
 
     def withdraw(self, now_s: float) -> None:
-        """End the activity, and take the tip away from the sample."""
+        """End the activity, and withdraw the tip."""
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
         self._doing, self.engaged = None, False
@@ -395,25 +394,25 @@ class Instrument:
     # -- anything else
 
     def occupy(self, what: str, lasts_s: float, now_s: float) -> None:
-        """Be busy with anything else for so long. Raises InstrumentBusy, InvalidValue."""
+        """Start another activity of this duration. Raises InstrumentBusy, InvalidValue."""
         _finite("the duration", lasts_s)
         self._check_free(now_s)
         self._doing = Occupied(what, now_s, now_s + lasts_s)
 
     def stop(self, what: str, now_s: float) -> None:
-        """Be free, if it is busy with the activity that `occupy` was called with."""
+        """End an activity started by `occupy`."""
         if self.doing(now_s) == what:
             self._doing = None
 
     def abandon(self, now_s: float) -> None:
-        """Give the activity up; the lines that a scan has stay."""
+        """Drop the activity; complete lines of a scan remain."""
         self.stop_scan(now_s)
         self._doing = None
 
     # -- after a kill
 
     def state(self) -> Plain:
-        """Return all that `restore` needs, JSON-able; during a scan with the world of its start."""
+        """Return the state for `restore`, JSON-able; during a scan with the world at its start."""
         doing = self._doing
         world = self._before if self._scans or self.drawing.goes_on else self.world.state()
         state = InstrumentState(
@@ -429,7 +428,7 @@ class Instrument:
         return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
 
     def restore(self, kept: PlainMapping) -> None:
-        """Become the instrument that `state` was taken from, whose settings are put in force by the caller.
+        """Restore the instrument from `state`; the caller restores the settings in `setup`.
 
         Raises:
             InvalidValue: a state of another world or version, or a damaged one.
@@ -446,13 +445,12 @@ class Instrument:
     # -- inside
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
-        """Note an event with the ground truth, unless the world belongs to the drawing of a scan."""
+        """Record an event with the ground truth, unless the world is in use by the computation of a scan."""
         if self._note is not None:
             truth = {} if self.drawing.goes_on else {"truth": self.world.truth(time_s)}
             self._note(time_s, event, {**facts, **truth})
 
     def _check_free(self, now_s: float) -> None:
-        """Raises InstrumentBusy; waits for the drawing of a scan that was stopped."""
         doing = self.doing(now_s)
         if doing:
             raise InstrumentBusy(f"the instrument is busy with a {doing}")
@@ -460,6 +458,5 @@ class Instrument:
 
 
 def _finite(what: str, *values: float) -> None:
-    """Raises InvalidValue unless all are."""
     if not all(map(math.isfinite, values)):
         raise InvalidValue(f"{what}: {', '.join(map(str, values))}", hint="must be finite")

@@ -46,9 +46,9 @@ class SignalSettings:
 
 
 def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material: Array, slope: Array) -> Array:
-    """Phase of the cantilever behind its drive: sin(phase) = A / A0 * (1 + dissipation) (Cleveland et al. 1998).
+    """Return the phase lag of the cantilever: sin(phase) = A / A0 * (1 + dissipation) (Cleveland et al. 1998).
 
-    Free it lags by 90 degrees; on a slope the flank of the tip touches more of the sample and dissipates more.
+    The free cantilever lags by 90 degrees; on a slope the tip's flank touches more of the sample and dissipates more.
     """
     share = amplitude_v / loop.settings.free_amplitude_v
     lost = settings.dissipation + settings.dissipation_contrast * (material - 0.5)
@@ -57,10 +57,10 @@ def phase_deg(settings: SignalSettings, loop: Loop, amplitude_v: Array, material
 
 
 def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Array, bias_v: float) -> Array:
-    """Exponential in the gap; tunnelling at the setpoint's current, tapping at the conductance of the contact."""
+    """Return the current, exponential in the gap; tunnelling at the setpoint, tapping at the contact's conductance."""
     contrast = settings.conductance_contrast * (material - 0.5)
     if loop.settings.mode == "current":
-        # The feedback holds the current, so a better conductor shows in the height; what is left is the error.
+        # The feedback keeps the current constant, so conductance shows in the height; the current shows the error.
         mean = np.copysign(loop.setpoint, bias_v)
         exponent = -gap_m / loop.settings.decay_m
     else:
@@ -71,11 +71,11 @@ def current_a(settings: SignalSettings, loop: Loop, gap_m: Array, material: Arra
 
 
 def attraction_hz(loop: Loop, tip: TipShape, sharp_m: float, gap_m: Array, bias_v: float) -> Array:
-    """Return the frequency shift of an oscillating sensor whose tip tunnels; a blunt or double tip is attracted more.
+    """Return the frequency shift of an oscillating, tunnelling tip; a blunt or double tip is attracted more.
 
     Args:
-        sharp_m: radius of the sharp tip, for which the sensor has its `radius_m`.
-        gap_m: z less the height at which the setpoint is met.
+        sharp_m: radius of the sharp tip, which corresponds to the sensor's `radius_m`.
+        gap_m: z minus the height at which the setpoint is reached.
     """
     sensor, distance_m = loop.settings.sensor, loop.tunnelling_distance_m(bias_v) + gap_m
     of_radius = sensor.radius_m / sharp_m
@@ -88,28 +88,29 @@ def attraction_hz(loop: Loop, tip: TipShape, sharp_m: float, gap_m: Array, bias_
 
 Channels = dict[str, tuple[str, Array]]
 TipTimes = Sequence[tuple[float, TipShape]]
-"""(since when, tip), the first not later than the scan's start."""
+"""(start time, tip), the first not later than the scan's start."""
 
-_POINTS = 1_400_000  # of the grid, if oversampling is left to us
+_POINTS = 1_400_000  # of the grid, with automatic oversampling
 _MOST_POINTS = 4_000_000  # of the grid in any case
 _FLICKER_M = 0.02e-9  # of debris at rest: a third of the current, up or down
-_MOST_TAPS = 160  # grid steps that a tip may reach aside: one that reaches further sees no finer detail
+# lateral reach of a tip in grid steps: beyond, the grid gets coarser, since a blunt tip resolves no detail
+_MOST_TAPS = 160
 
 
 @dataclass(frozen=True)
 class Setup:
-    """The conditions that stay the same during a scan.
+    """The constant conditions of a scan.
 
     Attributes:
-        sample: relief of the sample as it is now, from (x, y, resolution_m).
+        sample: returns the relief of the sample at present, from (x, y, resolution_m).
         drift_m: (x, y, z) at times.
         turn: rotation and scale of the sample at times, as complex factors.
-        unturned: (x, y) with those undone, from (x, y, times).
-        held_z_m: where z stands if the feedback is off.
+        unturned: (x, y) without rotation and scale, from (x, y, times).
+        held_z_m: z while the feedback is off.
         slope: (x, y) compensation of tilt set on the instrument, m/m.
         sharp_m: radius of the sharp tip.
-        origin_m: (x, y) about which tilt and slope turn.
-        offset_m: (x, y) by which the scanner is not yet where it should be (creep), at times.
+        origin_m: the fixed point (x, y) of tilt and slope.
+        offset_m: (x, y) remaining distance of the scanner to its target (creep), at times.
     """
 
     sample: Callable[[Array, Array, float], Relief]
@@ -129,7 +130,7 @@ class Setup:
 
 @dataclass(frozen=True)
 class Felt:
-    """The surface as the tip feels it along the lines, by row index, x ascending.
+    """The surface under the tip along the lines, by row index, x ascending.
 
     Attributes:
         height_m: (trace, retrace), each [y, x].
@@ -142,14 +143,14 @@ class Felt:
 
 @dataclass(frozen=True)
 class Measured:
-    """The channels, and what the scan did: z at its end, and the mean depth the tip was pressed in by errors."""
+    """The channels of a scan, z at its end, and the mean indentation by errors of the feedback."""
 
     channels: Channels
     last_z_m: float
     pressed_m: float
 
     def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return it with these rows of another one, which ends it."""
+        """Return the measurement with these rows of a later one, which continues it."""
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()
@@ -160,7 +161,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class Adjustment:
-    """A change during a scan: when, and what is set from then on."""
+    """A change during a scan: its time, and the settings from then on."""
 
     t_s: float
     feedback: Feedback | None
@@ -168,7 +169,7 @@ class Adjustment:
 
 
 def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Generator) -> Measured:
-    """Scans."""
+    """Compute the channels of a scan."""
     heights = feel(course, tips, setup)
     tilt = _tilt(course, (setup.scanner.tilt_x, setup.scanner.tilt_y))
     order = course.order
@@ -198,7 +199,7 @@ def measure(course: Course, tips: TipTimes, setup: Setup, random: np.random.Gene
 
 
 def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: np.random.Generator) -> dict[str, float]:
-    """Measure at the single pixel of a course, where the tip stands and the feedback has settled.
+    """Measure at the single pixel of a course: the tip stands still and the feedback has settled.
 
     Debris on a contaminated tip never settles: the tunnelling current flickers.
     """
@@ -217,7 +218,7 @@ def at_rest(course: Course, felt_m: Felt, tip: TipShape, setup: Setup, random: n
 
 
 def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
-    """The surface as the tips of the scan feel it at every pixel, without feedback and noise."""
+    """Return the surface under the tip at every pixel, without feedback and noise."""
     trace, retrace = (_sample_positions(course, setup, part) for part in (0.25, 0.75))
     x = np.stack([trace[0], retrace[0]])
     y = np.stack([trace[1], retrace[1]])
@@ -244,7 +245,7 @@ def feel(course: Course, tips: TipTimes, setup: Setup) -> Felt:
 
 
 def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array, Array]:
-    """Where on the sample the tip is at each pixel, with the drift of its row."""
+    # the drift is constant within a row
     x, y = course.region.pixels_m(course.shape)
     times = course.row_times_s(part)
     away = setup.drift_m(times)[:, :2] + setup.offset_m(times)
@@ -255,7 +256,7 @@ def _sample_positions(course: Course, setup: Setup, part: float) -> tuple[Array,
 
 
 def _pixel_times_s(course: Course) -> Array:
-    """When each pixel is taken, shape (2, ny, nx): trace and retrace."""
+    # shape (2, ny, nx): trace and retrace
     nx = course.shape[1]
     start = course.row_times_s(0.0)[:, None]
     along = (np.arange(nx) + 0.5) / nx * (course.line_s / 2)
@@ -263,15 +264,15 @@ def _pixel_times_s(course: Course) -> Array:
 
 
 def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> tuple[SampleGrid, tuple[float, float]]:
-    """A grid that is fine enough and not too large, and the blur (y, x) in its steps."""
+    # the blur (y, x) is in steps of the grid; accuracy asks for small steps, memory for few points
     turn = complex(setup.turn(course.start_s))
     pixel = (course.pixel_m[0] / abs(turn), course.pixel_m[1] / abs(turn))
     angle_rad = course.region.angle_rad - cmath.phase(turn)  # on the sample
     if angle_rad % (math.pi / 2) > 1e-9:
-        pixel = (min(pixel), min(pixel))  # the grid does not turn with the scan
+        pixel = (min(pixel), min(pixel))  # the grid is along the sample's axes, not the scan's
     elif angle_rad % math.pi > 1e-9:
         pixel = (pixel[1], pixel[0])
-    # A first look at coarse steps tells how high the sample is, thus how far the tip can touch beside its apex.
+    # A coarse grid gives the range of heights, and with it the lateral reach of the tip.
     extent = (float(np.ptp(x)) or pixel[0], float(np.ptp(y)) or pixel[1])
     look = SampleGrid.covering(x, y, (max(extent[0] / 48, pixel[0]), max(extent[1] / 48, pixel[1])), 0.0)
     rise = 1.2 * float(np.ptp(setup.sample(*look.axes_m(), max(look.dx_m, look.dy_m)).height_m))
@@ -288,21 +289,20 @@ def _grid(course: Course, setup: Setup, x: Array, y: Array, tips: TipTimes) -> t
 
 
 def _rows_of_grid(grid: SampleGrid, y: Array, margin_m: float) -> tuple[SampleGrid, int, int]:
-    """The part of the grid that a tip touches while it is at those y."""
+    # only the rows in reach of the tip at these y
     start = max(0, math.floor((y.min() - margin_m - grid.y0_m) / grid.dy_m) - 7)
     stop = min(grid.shape[0], math.ceil((y.max() + margin_m - grid.y0_m) / grid.dy_m) + 8)
     return grid.rows(start, stop), start, stop
 
 
 def _tip_of_lines(course: Course, tips: TipTimes) -> list[TipShape]:
-    """The tip at the start of each line, in the order of time."""
     starts = course.start_s + np.arange(course.shape[0]) * course.line_s
     index = np.searchsorted([since for since, _ in tips], starts, side="right") - 1
     return [tips[int(i)][1] for i in np.maximum(index, 0)]
 
 
 def _tilt(course: Course, slope: tuple[float, float]) -> Array | float:
-    """A plane through the origin of the tip's coordinates, at the pixels."""
+    # a plane through the origin of tip coordinates
     if slope == (0.0, 0.0):
         return 0.0
     x, y = course.region.pixels_m(course.shape)
@@ -310,7 +310,7 @@ def _tilt(course: Course, slope: tuple[float, float]) -> Array | float:
 
 
 def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) -> Array:
-    """z along the lines (in time, trace then retrace), led in by the end of the retrace before."""
+    # z along the lines in time, trace then retrace; each starts from the end of the previous retrace
     loop = setup.loop
     if not loop.on:
         return np.full(lines.shape, lines.max() if setup.held_z_m is None else setup.held_z_m)
@@ -319,7 +319,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
     nx = course.shape[1]
     lead = min(nx, 6 + nx // 16)
     path: Array = np.concatenate([lines[:, lead:0:-1] if nx > 1 else lines[:, :1], lines], axis=1).T
-    # An oscillation grows out of whatever there is; a quiet loop starts at rest.
+    # An oscillation grows from any disturbance; a stable loop starts at rest.
     start_v: Array = (1e-6 if loop.oscillates else 0.0) * random.standard_normal((path.shape[1],))
     z: Array = loop.follow(np.ascontiguousarray(path), course.line_s / (2 * nx), start_v)
     return z[-2 * nx :].T
@@ -328,7 +328,7 @@ def _z(lines: Array, course: Course, setup: Setup, random: np.random.Generator) 
 def _signals(
     gap_m: Array, heights: Felt, tips: NDArray[np.object_], course: Course, setup: Setup, random: np.random.Generator
 ) -> Channels:
-    """Amplitude and phase (when tapping), frequency shift (of an oscillating sensor) and current, of the trace."""
+    # of the trace: amplitude and phase in tapping mode, frequency shift of an oscillating sensor, and current
     loop, noise, material = setup.loop, setup.noise, heights.material[0]
     ny, nx = course.shape
 

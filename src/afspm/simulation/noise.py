@@ -1,4 +1,4 @@
-"""The noise that the instrument adds to the signals, and the line flattening that it may take away again."""
+"""The instrument's noise, and the line flattening that it may apply."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from afspm.simulation.tip import TipShape
 
 @dataclass(frozen=True)
 class NoiseSettings:
-    """Root mean squares, unless it says otherwise.
+    """Root mean squares, unless noted.
 
     Attributes:
         white_m: of the height, independent for each pixel.
         one_over_f_m: of the height, a time series over the whole scan, power as 1 / frequency.
         line_offset_m: of the height, independent for each line, the same in trace and retrace.
-        scar_probability: that a line has a disturbed stretch.
-        scar_m: by how much.
+        scar_probability: probability of a disturbed interval in a line.
+        scar_m: height of the disturbance.
         hum_m, hum_hz: amplitude and frequency of the mains in the height.
-        debris_jumps_per_s: how often debris on a contaminated tip moves.
+        debris_jumps_per_s: rate of jumps of debris on a contaminated tip.
         amplitude_v, phase_deg, current_a, frequency_hz: white, in those channels.
     """
 
@@ -53,7 +53,7 @@ def disturbances(
         tips: of each line, in the order of time.
 
     Returns:
-        Added height, shape (lines, 2 nx): trace, then retrace as time runs; None when nothing happens.
+        Added height, shape (lines, 2 nx): trace, then retrace in the order of time; None without disturbances.
     """
     series = np.zeros((len(tips), 2 * nx))
     scarred = np.nonzero(random.random(len(tips)) < settings.scar_probability)[0]
@@ -75,7 +75,7 @@ def disturbances(
 def height_noise(
     settings: NoiseSettings, lines: int, nx: int, line_s: float, start_s: float, random: np.random.Generator
 ) -> Array:
-    """Noise of the height signal in the order of time, shape (lines, 2 nx)."""
+    """Return the noise of the height signal in the order of time, shape (lines, 2 nx)."""
     series = settings.white_m * random.standard_normal((lines, 2 * nx), dtype=np.float32).astype(np.float64)
     if settings.one_over_f_m:
         series += settings.one_over_f_m * one_over_f(lines * 2 * nx, random).reshape(lines, 2 * nx)
@@ -88,19 +88,19 @@ def height_noise(
 
 
 def one_over_f(count: int, random: np.random.Generator) -> Array:
-    """A time series of unit rms (on average) and zero mean with a power spectrum as 1 / frequency."""
+    """Return a time series of unit rms (on average) and zero mean with a power spectrum as 1 / frequency."""
     size = 1 << max(4, (count - 1).bit_length())
     amplitude = 1.0 / np.sqrt(np.arange(1, size // 2 + 1, dtype=np.float32))
     shape = (2, len(amplitude))
     parts = random.standard_normal(shape, dtype=np.float32) * amplitude
     spectrum = np.concatenate([np.zeros(1, np.complex64), parts[0] + 1j * parts[1]])
     series = np.fft.irfft(spectrum, size)[:count]
-    # Each frequency brings a variance of (2 amplitude / size)^2.
+    # Each frequency contributes a variance of (2 amplitude / size)^2.
     return np.asarray(series * (size / (2.0 * np.sqrt(np.sum(amplitude.astype(np.float64) ** 2)))), dtype=np.float64)
 
 
 def flattened(values: Array, how: str) -> Array:
-    """Each line less its mean ("offset") or less the straight line fitted to it ("line", Flatten1)."""
+    """Subtract from each line its mean ("offset") or the straight line fitted to it ("line", Flatten1)."""
     if how == "none":
         return values
     level: Array = values - values.mean(axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""The sample: its surface, the marks that the tip has left on it, and where it is under the tip."""
+"""The sample: its surface, marks left by the tip, and its position under the tip."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class SurfaceMark:
 
     Attributes:
         sample_xy_m: its centre, in sample coordinates.
-        depth_m, radius_m: of the hole.
-        t_s: since when it is there.
+        depth_m, radius_m: of the crater.
+        t_s: the time of its creation.
         kind: "crash" or "pulse".
     """
 
@@ -36,7 +36,6 @@ class SurfaceMark:
 
 
 def _draw(mark: SurfaceMark, relief: Relief, x_m: Array, y_m: Array) -> None:
-    """Changes the relief at positions (x, y) in place."""
     reach = 3.0 * mark.radius_m
     for index, dx, dy in around(x_m, y_m, *mark.sample_xy_m, reach):
         r = np.hypot(dx, dy) / mark.radius_m
@@ -51,9 +50,9 @@ class Sample:
     """A surface that drifts under the tip.
 
     Attributes:
-        table: that the surface was made from.
-        marks: craters of crashes and what pulses left behind.
-        compensation: by how much the scanner has followed the drift by itself.
+        table: the settings of the surface.
+        marks: craters of crashes and mounds of pulses.
+        compensation: displacement of the scanner by its own drift compensation.
     """
 
     def __init__(self, surface: object, drift: DriftSettings, seed: int, start_s: float) -> None:
@@ -66,25 +65,25 @@ class Sample:
         self._about_m = drift.about_m
 
     def seen_drift_m(self, t_s: ArrayLike) -> Array:
-        """Return the drift as far as the scanner does not follow it by itself; shape t.shape + (3,)."""
+        """Return the drift minus the scanner's own compensation; shape t.shape + (3,)."""
         return self.drift.at(t_s) - self.compensation.at(t_s)
 
     def to_sample(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Map positions (..., 2) at experiment times (...) from the tip's coordinates to the sample's.
+        """Map positions (..., 2) at experiment times (...) from tip to sample coordinates.
 
-        The tip's are those of a scanner that does not follow drift by itself.
+        Tip coordinates are those of a scanner without its own drift compensation.
         """
         at = np.asarray(xy_m, dtype=np.float64) - self.drift.at(t_s)[..., :2]
         return np.stack(self.drift.unturned(at[..., 0], at[..., 1], t_s), axis=-1)
 
     def to_tip(self, xy_m: ArrayLike, t_s: ArrayLike) -> Array:
-        """Undo `to_sample`."""
+        """Invert `to_sample`."""
         at = np.asarray(xy_m, dtype=np.float64)
         turned = np.stack(self.drift.turned(at[..., 0], at[..., 1], t_s), axis=-1)
         return np.asarray(turned + self.drift.at(t_s)[..., :2])
 
     def under(self, position_m: tuple[float, float], t_s: float) -> tuple[float, float]:
-        """Return what is under a position of the scanner, in sample coordinates."""
+        """Return the sample coordinates under a position of the scanner."""
         x, y = self.to_sample(np.add(position_m, self.compensation.at(t_s)[:2]), t_s)
         return float(x), float(y)
 

@@ -1,4 +1,4 @@
-"""Computing the values of a scan: at its start, or beside everything else while the scan lasts."""
+"""Computation of the values of a scan, before it starts or in parallel to it."""
 
 from __future__ import annotations
 
@@ -19,20 +19,19 @@ Draw = Callable[[], ScanValues]
 
 
 def run_at_once(work: Callable[[], None]) -> None:
-    """Run a function before anything else."""
     work()
 
 
 class ScanDrawing:
-    """Draws one scan at a time; the world belongs to that work meanwhile.
+    """Computes one scan at a time, with exclusive use of the world meanwhile.
 
     Args:
-        units: gives the unit of each channel.
-        run: runs the work.
+        units: returns the unit of each channel.
+        run: runs the computation.
 
     Attributes:
-        wake: called from the thread of the work when a scan is drawn.
-        log: for errors that no check foresaw.
+        wake: called from the thread of the computation when a scan is ready.
+        log: for unexpected errors.
     """
 
     def __init__(self, world: World, units: Callable[[], Mapping[str, str]], seed: int, run: RunWork) -> None:
@@ -42,12 +41,12 @@ class ScanDrawing:
         self.log = logging.getLogger(__name__)
 
     def start(self, scan: ScanActivity, draw: Draw) -> None:
-        """Begin to draw a scan that was `prepared`."""
+        """Start to compute a scan that was `prepared`."""
 
         def work() -> None:
             try:
                 drawn = draw()
-            except Exception:  # whatever the world made of a scan, the instrument goes on without it
+            except Exception:  # in a worker thread: any error costs this scan only, the instrument goes on
                 self.log.exception("scan %d can't be simulated and was stopped", scan.number)
                 drawn, scan.stopped_s = NoValues(self._units(), scan.shape), scan.start_s
             scan.draw(drawn)
@@ -58,16 +57,16 @@ class ScanDrawing:
 
     @property
     def goes_on(self) -> bool:
-        """True while a scan is being drawn, also one that was stopped."""
+        """True while a scan is being computed, also a stopped one."""
         return self._newest is not None and self._newest.drawing
 
     def wait(self) -> None:
-        """Wait until the newest scan is drawn, since the world is one thread's at a time."""
+        """Wait until the newest scan is computed, since the world belongs to one thread at a time."""
         if self._newest is not None:
             self._newest.wait()
 
     def prepared(self, scan: ScanActivity, *, engaged: bool) -> Draw:
-        """Return the work of drawing a scan. Raises InvalidValue: it can't be simulated."""
+        """Return the computation of a scan. Raises InvalidValue: it can't be simulated."""
         _check_scannable(scan)
         if not all(map(math.isfinite, (scan.bias_v, *scan.slope))):
             raise InvalidValue(f"bias and slope: {scan.bias_v}, {scan.slope}", hint="finite")
@@ -90,7 +89,7 @@ class ScanDrawing:
 
 
 def _check_scannable(scan: ScanActivity) -> None:
-    """Raises InvalidValue: no scanner has such a frame; simulating it takes minutes, or more memory than there is."""
+    # no scanner has such a frame; simulating it would take minutes, or more memory than a computer has
     pixels = [size_m / count for size_m, count in zip(scan.region.size_m, scan.shape[::-1], strict=True)]
     reach = all(_SMALLEST_M <= size_m <= _LARGEST_M for size_m in scan.region.size_m)
     if not (reach and max(pixels) <= _LONGEST_PIXEL * min(pixels)):

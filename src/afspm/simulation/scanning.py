@@ -1,4 +1,4 @@
-"""One scan: where and when each pixel is taken, and what comes of it.
+"""One scan: position and time of each pixel, and the computed channels.
 
 Time: a line lasts `line_s`, its first half the trace (x upwards), its second the retrace. Lines follow each other from
 small y to large y, or the other way round when scanning down.
@@ -30,10 +30,10 @@ class ScannerSettings:
     Attributes:
         flatten: levelling of height lines before they are delivered: "none", "offset" or "line" (Flatten1).
         band_limit_px: standard deviation of the blur of every signal.
-        oversampling: grid points per pixel and axis at which tip and sample meet; 0: as many as the scan allows.
+        oversampling: grid points per pixel and axis for the contact of tip and sample; 0: as many as the scan allows.
         tilt_x, tilt_y: slope of the sample in its holder, m/m.
-        creep: part of a move that is still missing after 1 s; it vanishes as 1 - log10(t); 0: none.
-        backlash_m: how far the retrace lags behind in x.
+        creep: remaining fraction of a move after 1 s; it vanishes as 1 - log10(t); 0: none.
+        backlash_m: lag of the retrace in x.
     """
 
     flatten: str = "none"
@@ -79,46 +79,46 @@ class Course:
 
     @property
     def end_s(self) -> float:
-        """When the last retrace is done."""
+        """The end of the last retrace."""
         return self.start_s + self.shape[0] * self.line_s
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """Row indices in the order they are taken."""
+        """The row indices in the order of time."""
         rows = np.arange(self.shape[0])
         return rows if self.direction == "up" else rows[::-1]
 
     def row_times_s(self, part: float) -> Array:
-        """When each row (by index) is at that part of its line: 0.25 mid-trace, 0.75 mid-retrace, 1 done."""
+        """Return the time of each row (by index) at a fraction of its line: 0.25 mid-trace, 0.75 mid-retrace, 1 end."""
         times = np.empty(self.shape[0])
         times[self.order] = self.start_s + (np.arange(self.shape[0]) + part) * self.line_s
         return times
 
     def rows_taken(self, until_s: float | None) -> NDArray[np.bool_]:
-        """Which rows are complete at a time."""
+        """Return which rows are complete at a time."""
         if until_s is None:
             return np.ones(self.shape[0], dtype=bool)
         return np.asarray(self.row_times_s(1.0) <= until_s + 1e-9 * self.line_s)
 
     @property
     def pixel_m(self) -> tuple[float, float]:
-        """Distance of pixels (x, y)."""
+        """The distance of pixels (x, y)."""
         ny, nx = self.shape
         width, height = self.region.size_m
         return (width / (nx - 1) if nx > 1 else width, height / (ny - 1) if ny > 1 else height)
 
     @property
     def length_m(self) -> float:
-        """Of all lines, trace and retrace."""
+        """The length of all lines, trace and retrace."""
         return 2.0 * self.shape[0] * self.region.size_m[0]
 
 
 class ScannerPlace:
-    """Where the piezo was sent, and how far it still is from there.
+    """The target of the piezo, and its remaining creep.
 
     Attributes:
-        at_m: (x, y) where it was sent last.
-        came_from_m, came_s: where it was before, and when it was sent.
+        at_m: (x, y) of the last target.
+        came_from_m, came_s: the previous target, and the time of the last move.
     """
 
     def __init__(self, creep: float, start_s: float) -> None:
@@ -126,12 +126,12 @@ class ScannerPlace:
         self.at_m, self.came_from_m, self.came_s = (0.0, 0.0), (0.0, 0.0), start_s
 
     def move_to(self, position_m: tuple[float, float], t_s: float) -> None:
-        """Send it to a position, unless it is there."""
+        """Move to a position, unless it is the target already."""
         if position_m != self.at_m:
             self.came_from_m, self.came_s, self.at_m = self.at_m, t_s, position_m
 
     def creep_m(self, t_s: Array) -> Array:
-        """Return what is missing of the last move at times, (n, 2)."""
+        """Return the remaining part of the last move at times, (n, 2)."""
         move = np.subtract(self.at_m, self.came_from_m)
         since = np.maximum(np.asarray(t_s) - self.came_s, 0.0) + 1.0
         left = self._creep * np.maximum(1.0 - np.log10(since) / 4.0, 0.0)
@@ -140,12 +140,12 @@ class ScannerPlace:
 
 @dataclass(frozen=True)
 class SimulatedScan:
-    """A scan, computed when it starts; what the caller hands out of it before its end is up to the caller.
+    """A scan, computed when it starts; the caller decides how much of it is visible before its end.
 
     Attributes:
         course: place and time.
         drift_m: (x, y, z) at the middle of each row's trace, by row index.
-        truth: what went into it, JSON-able.
+        truth: the parameters of the simulation, JSON-able.
     """
 
     course: Course
@@ -162,7 +162,7 @@ class SimulatedScan:
         return self.course.end_s
 
     def channels(self, until_s: float | None = None) -> dict[str, tuple[str, Array]]:
-        """Channel -> (unit, values [y, x]); rows that are not complete at `until_s` are NaN."""
+        """Return channel -> (unit, values [y, x]); rows that are not complete at `until_s` are NaN."""
         taken = self.course.rows_taken(until_s)
         if taken.all():
             return {name: (unit, values.copy()) for name, (unit, values) in self._channels.items()}

@@ -1,6 +1,6 @@
-"""Settings of the simulated physics: frozen dataclasses made from plain tables, refused when they make no sense.
+"""Settings of the simulated physics: frozen dataclasses created from plain tables; invalid values are refused.
 
-Every setting carries its unit in its name. A table may hold a table (another dataclass) or a list (a tuple).
+Every setting carries its unit in its name. A table may contain a table (another dataclass) or a list (a tuple).
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ T = TypeVar("T")
 
 
 def build(cls: type[T], settings: object, where: str) -> T:
-    """An instance of the frozen dataclass `cls` from a table.
+    """Return an instance of the frozen dataclass `cls` from a table.
 
     Raises:
-        ConfigError: an unknown key (the nearest name is offered), a value of the wrong type, or one that
-            the dataclass itself refuses; all of them at once (`ConfigErrors`) where there are several.
+        ConfigError: an unknown key (the nearest name is offered), a value of the wrong type, or a refusal of the
+            dataclass itself; several errors together as `ConfigErrors`.
     """
     if not isinstance(settings, Mapping):
         raise ConfigError(f"expected a table, got {settings!r}", where=where)
@@ -43,7 +43,7 @@ def build(cls: type[T], settings: object, where: str) -> T:
         made = cls(**values)
     except ConfigError as error:
         for one in individual_errors(error):
-            if known or one.where in values:  # else it may be about what was left out above
+            if known or one.where in values:  # an error about a field omitted above is a consequence, not a cause
                 errors.add(ConfigError(one.what, where=f"{where}.{one.where}" if one.where else where, hint=one.hint))
     except TypeError:
         if known:
@@ -54,14 +54,14 @@ def build(cls: type[T], settings: object, where: str) -> T:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """A hint: the name that was probably meant, else all there are."""
+    """Return a hint: the most similar name, else all names."""
     names = list(names)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     return f"did you mean {close[0]!r}?" if close else "there are " + ", ".join(names)
 
 
 def one_of(value: str, choices: Iterable[str], where: str) -> str:
-    """`value` if it is one of `choices`; ConfigError otherwise."""
+    """Return `value` if it is one of `choices`. Raises ConfigError otherwise."""
     choices = list(choices)
     if value not in choices:
         raise ConfigError(f"unknown: {value!r}", where=where, hint=nearest(value, choices))
@@ -69,7 +69,7 @@ def one_of(value: str, choices: Iterable[str], where: str) -> str:
 
 
 def check(settings: object, *, above_zero: str = "", from_zero: str = "", fraction: str = "") -> None:
-    """Checks the named attributes (separated by spaces) of a dataclass in its `__post_init__`.
+    """Check the named attributes (separated by spaces) of a dataclass in its `__post_init__`.
 
     A fraction lies in [0, 1]. Raises ConfigError with the attribute as `where`, for all of them at once.
     """
@@ -103,7 +103,7 @@ def _convert(hint: Any, value: object, where: str) -> object:
             return None
         return _convert(next(a for a in arguments if a is not type(None)), value, where)
     if origin is dict:
-        hint = dict  # of anything
+        hint = dict  # a table of any values
     if origin is tuple:
         return _sequence(arguments, value, where)
     if dataclasses.is_dataclass(hint):

@@ -25,8 +25,8 @@ class IVSettings:
 
     Attributes:
         range_v: from -range to +range.
-        set_bias_v, set_current_a: the current that flows at this bias before the feedback is opened (tunnelling:
-            the setpoint at the bias in force).
+        set_bias_v, set_current_a: the current at this bias before the feedback is opened (tunnelling: the setpoint at
+            the bias in force).
         gap_ev: band gap of material 0; material 1 is a metal.
         band_offset_ev: of the gap's middle against the Fermi level (doping).
         noise_a: white; `relative_noise` adds a share of the current.
@@ -81,7 +81,7 @@ class ForceSettings:
 def current_voltage(
     settings: IVSettings, tip: TipShape, material: float, bias_v: float, loop: Loop, random: np.random.Generator
 ) -> Curves:
-    """I(V), forth and back, and dI/dV as a lock-in shows it.
+    """Return I(V), forward and backward, and dI/dV as a lock-in amplifier shows it.
 
     The current is the integral of the sample's density of states times the tip's times the barrier's transmission,
     scaled to the current that the feedback had held.
@@ -90,7 +90,7 @@ def current_voltage(
     energy = np.linspace(-settings.range_v - 0.5, settings.range_v + 0.5, 1201)
     density = _sample_density(settings, energy, material) * _tip_density(tip, energy)
     # Transmission rises with the energy above the mean barrier; the bias tilts it: currents at positive and
-    # negative bias differ, more for a tip that is not what it should be.
+    # negative bias differ, more for a flawed tip.
     tilt = 0.25 + (0.35 if tip.debris_m else 0.0)
     density = density * np.exp(tilt * energy / math.sqrt(settings.barrier_ev))
     step = energy[1] - energy[0]
@@ -109,10 +109,10 @@ def current_voltage(
 
 
 def force_distance(settings: ForceSettings, tip: TipShape, material: float, random: np.random.Generator) -> Curves:
-    """Deflection and force against the piezo's extension, approach and retract, zero where the tip first touches.
+    """Return deflection and force against the piezo's extension, approach and retract, zero at the first contact.
 
     Contact after Derjaguin, Muller and Toporov, van der Waals attraction before it. Quasi-static: the cantilever
-    follows the branch it is on until that ends, then jumps (snap-in, pull-off), so both ways differ.
+    follows its branch until that ends, then jumps (snap-in, pull-off), so both directions differ.
     """
     modulus = _mix(settings.modulus_pa, material, logarithmic=True)
     adhesion = _mix(settings.adhesion_j_per_m2, material) * (1.4 if tip.debris_m else 1.0)
@@ -137,7 +137,7 @@ def force_distance(settings: ForceSettings, tip: TipShape, material: float, rand
 
 
 def _sample_density(settings: IVSettings, energy: Array, material: float) -> Array:
-    """Between that of a semiconductor (0) and of a metal (1)."""
+    # `material` from 0 (semiconductor) to 1 (metal)
     gap = settings.gap_ev * (1.0 - 0.3 * material)
     outside = np.abs(energy - settings.band_offset_ev) - gap / 2
     bands = np.sqrt(np.log1p(np.exp(np.clip(outside / (2 * _KT_EV), -60, 60))) * 2 * _KT_EV)
@@ -147,7 +147,7 @@ def _sample_density(settings: IVSettings, energy: Array, material: float) -> Arr
 
 
 def _tip_density(tip: TipShape, energy: Array) -> Array:
-    """Flat for a clean metal; a state of its own where something sticks to it, a slope where it is deformed."""
+    # flat for a clean metal; debris adds a state of its own, a deformed tip a slope
     density = np.ones_like(energy)
     if tip.debris_m:
         density += 1.6 * np.exp(-(((energy - 0.62) / 0.09) ** 2))
@@ -170,7 +170,7 @@ def _mix(pair: tuple[float, float], material: float, *, logarithmic: bool = Fals
 
 
 def _force_n(distance: Array, radius: float, modulus: float, pull_off: float, hamaker: float) -> Array:
-    """Positive pushes the tip away. The attraction levels off at contact to what must be pulled."""
+    # positive repels; the attraction levels off at contact, at the pull-off force
     contact = math.sqrt(hamaker * radius / (6.0 * pull_off)) if pull_off else 0.3e-9
     attraction = -hamaker * radius / (6.0 * (np.maximum(distance, 0.0) + contact) ** 2)
     pressed = 4.0 / 3.0 * modulus * math.sqrt(radius) * np.maximum(-distance, 0.0) ** 1.5
@@ -178,7 +178,7 @@ def _force_n(distance: Array, radius: float, modulus: float, pull_off: float, ha
 
 
 def _followed(z: Array, distance: Array, force: Array, spring: float, *, approaching: bool) -> Array:
-    """Force at each z on the branch that the cantilever is on, coming from afar or from contact."""
+    # the branch depends on history: approaching from afar, or retracting from contact
     # In equilibrium z = distance - deflection; where that is not monotonic the branch ends.
     extension = distance - force / spring
     if approaching:

@@ -1,4 +1,4 @@
-"""The tip: its shape, what goes wrong with it, and what may cure it."""
+"""The tip: its shape, its changes, and the effects of repairs."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class TipShape:
     """One shape of the tip.
 
     Attributes:
-        radius_m: of the apex, debris not counted.
-        half_angle_deg: of the cone that the apex turns into.
+        radius_m: of the apex, without debris.
+        half_angle_deg: of the cone behind the apex.
         second_apex_m: (x, y, height) of a second apex beside the first, height (negative) below it; None without.
-        debris_m: size of what sticks to the tip and jumps; 0 for a clean one.
-        length_m: against the first tip; a change makes the height jump.
-        flaws: which of FLAWS it has.
+        debris_m: size of debris that sticks to the tip and jumps; 0 for a clean one.
+        length_m: relative to the first tip; a change makes the height jump.
+        flaws: a subset of FLAWS.
     """
 
     radius_m: float
@@ -41,12 +41,11 @@ class TipShape:
 
     @property
     def is_sharp(self) -> bool:
-        """Without any flaw."""
         return not self.flaws
 
     @property
     def imaging_radius_m(self) -> float:
-        """Of what touches the sample: apex or debris."""
+        """The radius of the part that touches the sample: apex with debris."""
         return self.radius_m + self.debris_m
 
 
@@ -56,7 +55,7 @@ class TipSettings:
 
     Attributes:
         condition: at the start: "sharp", "blunt", "double" or "contaminated".
-        spread: relative scatter of every size that is drawn.
+        spread: relative scatter of every random size.
     """
 
     radius_m: float = 8e-9
@@ -80,9 +79,9 @@ class TipRepairSettings:
     """The repairs of `TipChangeSettings`.
 
     Attributes:
-        pulse_threshold_v: below, a pulse does nothing.
+        pulse_threshold_v: a pulse below has no effect.
         pulse_cures, pulse_worsens: probability for a pulse far above the threshold that lasts `pulse_duration_s`.
-        pulse_duration_s: a longer pulse does more, up to the effect of two; a shorter one does less.
+        pulse_duration_s: a longer pulse has more effect, up to twice; a shorter one has less.
         crash_cures, crash_worsens: probability for a crash `crash_depth_m` deep.
         crash_depth_m: an n times deeper crash has n chances of an effect.
         crash_speed_m_per_s: slower crashes are less likely to have an effect, in proportion.
@@ -106,15 +105,15 @@ class TipRepairSettings:
 class TipChangeSettings(TipRepairSettings):
     """Spontaneous tip changes, and the effect of repairs.
 
-    The chances of a repair are made up, so that one is seen to take some trying. How they grow is a simple picture and
-    no theory: a crash takes material from the apex, or leaves some there, all along its way in; a pulse moves by its
-    field what it can, most of it soon.
+    The probabilities of a repair are made up, so that a repair typically takes several attempts. Their growth is a
+    simple picture and no theory: a crash removes material from the apex, or leaves some there, all along its way in;
+    the field of a pulse moves atoms, most of them soon.
 
     Attributes:
         per_hour: mean number of changes per hour of scanning at a gentle setpoint.
         per_metre: mean number of changes per metre of scanned line.
         hardness_exponent: both rates grow as (force / force at a gentle setpoint) to this power.
-        blunt_weight, double_weight, contaminated_weight: how likely each is.
+        blunt_weight, double_weight, contaminated_weight: relative probabilities of the flaws.
         schedule: pairs of seconds after the start and a condition: changes at fixed times.
         wear_m_per_m: growth of the radius per metre scanned at a gentle setpoint.
     """
@@ -139,7 +138,7 @@ class TipChangeSettings(TipRepairSettings):
 
 @dataclass(frozen=True)
 class TipChange:
-    """From t_s on the tip is `tip`; cause is "start", "chance", "schedule", "pulse", "crash" or "wear"."""
+    """A change: the tip is `tip` from t_s on; cause is "start", "chance", "schedule", "pulse", "crash" or "wear"."""
 
     t_s: float
     cause: str
@@ -147,18 +146,18 @@ class TipChange:
 
 
 class TipMaker:
-    """Draws tips: sharp ones, and what becomes of them."""
+    """Draws random tips: sharp ones, and changed ones."""
 
     def __init__(self, settings: TipSettings) -> None:
         self._s = settings
 
     def first(self, random: np.random.Generator) -> TipShape:
-        """The tip that the experiment starts with: as in the settings, exactly, and perhaps with a flaw."""
+        """Return the first tip: exactly as in the settings, and possibly with a flaw."""
         sharp = TipShape(self._s.radius_m, self._s.half_angle_deg)
         return sharp if self._s.condition == "sharp" else self.changed(sharp, self._s.condition, random)
 
     def changed(self, tip: TipShape, condition: str, random: np.random.Generator) -> TipShape:
-        """The tip after it became sharp, blunt, double or contaminated; flaws it had stay unless it is sharp now."""
+        """Return the tip after a change of condition; other flaws stay unless it becomes sharp."""
         s, radius = self._s, self._s.radius_m
         length = tip.length_m + s.length_jump_radii * radius * float(random.normal())
         if condition == "sharp":
@@ -175,7 +174,7 @@ class TipMaker:
         return replace(worse, debris_m=s.debris_radii * radius * self._about(1.0, random))
 
     def _about(self, share: float, random: np.random.Generator) -> float:
-        """A factor near one, scattered by that share of the spread."""
+        # a random factor near 1; `share` is its part of the spread
         return math.exp(share * self._s.spread * float(random.normal()))
 
 
@@ -187,7 +186,7 @@ class Chances:
     worsens: float
 
     def of_times(self, times: float) -> Chances:
-        """Of so many treatments, not necessarily a whole number, of which the first that does anything is the last.
+        """Return the probabilities for `times` treatments (any number), which end with the first effect.
 
         Both grow with the number; their ratio stays, and their sum is 1 at most.
         """
@@ -199,40 +198,40 @@ class Chances:
         return Chances(ever * cures / once, ever * (once - cures) / once)
 
     def weakened(self, share: float) -> Chances:
-        """With both smaller by a factor."""
+        """Return both probabilities multiplied by a factor."""
         return Chances(share * self.cures, share * self.worsens)
 
 
 def pulse_times(settings: TipChangeSettings, duration_s: float) -> float:
-    """As many pulses of the usual duration as one of `duration_s` is worth: from 0 to 2, 1 for the usual.
+    """Return the equivalent number of pulses of the usual duration: from 0 to 2, 1 for the usual.
 
-    Simulated, without a source: it is the field that moves atoms of the apex, so the voltage matters most; those that
-    it can move go soon, and the longer it lasts, the fewer are left. Half of them are gone after the usual duration.
+    Simulated, without a source: the field moves atoms of the apex, so the voltage matters most; movable atoms go soon,
+    and the longer the pulse lasts, the fewer remain. Half of them are gone after the usual duration.
     """
     return 2.0 * duration_s / (duration_s + settings.pulse_duration_s)
 
 
 def crash_times(settings: TipChangeSettings, depth_m: float) -> float:
-    """As many crashes of the usual depth as one `depth_m` deep is worth.
+    """Return the number of crashes of the usual depth equivalent to one `depth_m` deep.
 
-    Simulated, without a source: material is taken from the apex, or left there, all along the way in, so each further
-    stretch of the way has the chance that the one before it had.
+    Simulated, without a source: material is removed from the apex, or left there, all along the way in, so each further
+    interval of depth has the same chance as the one before.
     """
     return depth_m / settings.crash_depth_m
 
 
 def indented_m(tip: TipShape, depth_m: float) -> float:
-    """Return how deep a tip gets into the sample when it is driven `depth_m` beyond the surface.
+    """Return the indentation of the sample by a tip that is driven `depth_m` beyond the surface.
 
-    Simulated, without a source: at first the sample gives way, by as much as was asked for. The deeper, the more it is
-    the apex that gives way, and blunts; beyond some three of its radii nothing more is gained. A blunt apex is stiffer.
+    Simulated, without a source: at first the sample yields by the whole depth. The deeper, the more the apex yields,
+    and blunts; the limit is three of its radii. A blunt apex is stiffer.
     """
     most_m = 3.0 * tip.imaging_radius_m
     return -most_m * math.expm1(-depth_m / most_m)
 
 
 def drawn_flaw(settings: TipChangeSettings, random: np.random.Generator) -> str | None:
-    """Return the next flaw; None when all weights are zero."""
+    """Return the next random flaw; None when all weights are zero."""
     weights = np.array([settings.blunt_weight, settings.double_weight, settings.contaminated_weight])
     return str(random.choice(FLAWS, p=weights / weights.sum())) if weights.sum() else None
 
@@ -240,7 +239,7 @@ def drawn_flaw(settings: TipChangeSettings, random: np.random.Generator) -> str 
 def chance_changes(
     settings: TipChangeSettings, start_s: float, end_s: float, rate_per_s: float, seed: int, call: int
 ) -> list[tuple[float, str]]:
-    """Times and flaws of the changes that come by chance in a scan: a Poisson process."""
+    """Return times and flaws of random changes during a scan: a Poisson process."""
     random = chance.generator(seed, call)
     t, found = start_s, []
     while rate_per_s > 0:
@@ -253,13 +252,13 @@ def chance_changes(
 
 
 class SimulatedTip:
-    """The tip through the night: every shape it has had, by time, and what changes it.
+    """The tip through the night: every shape by time, and the causes of its changes.
 
-    What is foreseen (the rest of a scan that was stopped: changes, wear) can be taken back.
+    Predicted changes (tip changes and wear in the rest of a stopped scan) can be revoked.
 
     Attributes:
-        history: in the order of time; the first is that of the start.
-        scheduled_until_s: up to when the changes of the schedule have happened.
+        history: in the order of time; the first entry is the start.
+        scheduled_until_s: the time up to which scheduled changes have happened.
     """
 
     def __init__(self, settings: TipSettings, changes: TipChangeSettings, seed: int, start_s: float) -> None:
@@ -278,13 +277,13 @@ class SimulatedTip:
         return [change for change in self.history if start_s < change.t_s <= end_s]
 
     def begin(self, t_s: float) -> None:
-        """Go to a time, and take back what was to come after it."""
+        """Go to a time, and revoke later changes."""
         self.history = [c for c in self.history if c.t_s <= t_s or c.cause == "start"]
         self.scheduled_until_s = min(self.scheduled_until_s, t_s)
         self.advance(t_s)
 
     def advance(self, until_s: float) -> None:
-        """Let the scheduled changes up to a time happen."""
+        """Apply the scheduled changes up to a time."""
         for number, (after_s, condition) in enumerate(self._settings.schedule):
             t_s = self._start_s + after_s
             if self.scheduled_until_s < t_s <= until_s or (t_s == until_s == self._start_s):
@@ -292,7 +291,7 @@ class SimulatedTip:
         self.scheduled_until_s = max(self.scheduled_until_s, until_s)
 
     def foresee(self, course: Course, loop: Loop, call: int) -> None:
-        """Add the changes that will come during a scan: scheduled ones, and by chance."""
+        """Add the scheduled and random changes during a scan."""
         s, start_s, end_s = self._settings, course.start_s, course.end_s
         hardness = loop.force**s.hardness_exponent if loop.on and loop.engages else float(not loop.on)
         rate = (s.per_hour / 3600.0 + s.per_metre * course.length_m / (end_s - start_s)) * hardness
@@ -303,14 +302,14 @@ class SimulatedTip:
         self.advance(end_s)
 
     def wear(self, course: Course, loop: Loop) -> None:
-        """Let the apex grow by what a scan has rubbed off."""
+        """Increase the radius by the wear of a scan."""
         s, tip = self._settings, self.history[-1].tip
         if s.wear_m_per_m and loop.engages:
             worn_m = s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent
             self._add(TipChange(course.end_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
 
     def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
-        """Return what a bias pulse did; see `_treat`. It depends on the voltage above all."""
+        """Return the effect of a bias pulse, which depends mostly on the voltage; see `_treat`."""
         s = self._settings
         strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
         if strength == 0.0:
@@ -320,14 +319,13 @@ class SimulatedTip:
         return self._treat("pulse", t_s, chances, random)
 
     def crash(self, depth_m: float, speed_m_s: float, t_s: float, random: np.random.Generator) -> str:
-        """Return what a crash did; see `_treat`."""
+        """Return the effect of a crash; see `_treat`."""
         s = self._settings
         effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
         chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
         return self._treat("crash", t_s, chances, random)
 
     def _treat(self, cause: str, t_s: float, chances: Chances, random: np.random.Generator) -> str:
-        """Return what a treatment did: "cured", "worsened" or "unchanged"."""
         draw = random.random()
         if draw < chances.cures:
             self._change(t_s, cause, "sharp", random)

@@ -1,4 +1,4 @@
-"""The truth, for judging afterwards: `truth.jsonl` in the folder of the run, never on the wire."""
+"""The ground truth, for later evaluation: `truth.jsonl` in the run folder, never published."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from afspm.storage.disk import DiskThread, DiskTimeout
 
 
 class Truth:
-    """Appends one JSON object a line: `n`, `time_s` (experiment), `event` and what belongs to it.
+    """Appends one JSON object a line: `n`, `time_s` (experiment), `event` and its facts.
 
-    A disk that hangs gets the lines later: the microscope does not wait for it.
+    A hanging disk gets the lines later: the microscope does not wait for it.
 
     Args:
-        kept: where the number of the last line is kept, if it is to outlive a kill. The last event may then be written
+        kept: storage for the number of the last line, so that it survives a kill. The last event may then be written
             again, under the same `n`.
     """
 
@@ -29,7 +29,7 @@ class Truth:
         self._disk = DiskThread()
 
     def note(self, time_s: float, event: str, facts: Mapping[str, object]) -> None:
-        """Write down what happened."""
+        """Append an event."""
         self._kept["truth_lines"] = number = int(self._kept.get("truth_lines", 0)) + 1
         line = json.dumps({"n": number, "time_s": time_s, "event": event, **facts}, default=_plain)
         with contextlib.suppress(DiskTimeout):

@@ -1,8 +1,8 @@
 """The simulated world: a sample, a tip and an instrument, in experiment time.
 
-`World` holds what lasts from one measurement to the next: the tip and its history, marks on the sample, where the tip
-stands. A measurement is asked for at a time; what had been foreseen after that time (the rest of a scan that was
-stopped: tip changes, wear) is taken back. The same seed and the same calls give the same world.
+`World` keeps the state between measurements: the tip and its history, marks on the sample, the position of the tip. A
+measurement is called with its time; predictions beyond that time (tip changes and wear in the rest of a stopped scan)
+are revoked. The same seed and the same calls give the same world.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from afspm.simulation.tip import (
     indented_m,
 )
 
-# What suits a sample better than the general defaults; the user's settings go on top.
+# Defaults for a kind of sample; the user's settings override them.
 _FITTING: dict[str, dict[str, dict[str, object]]] = {
-    # Atoms are seen by the foremost atom of the tip, not by its apex as a whole.
+    # Atoms are imaged by the foremost atom of the tip, not by its whole apex.
     "lattice": {
         "tip": {"radius_m": 0.12e-9, "half_angle_deg": 35.0},
         "noise": {"white_m": 3e-12, "one_over_f_m": 3e-12, "line_offset_m": 3e-12, "scar_m": 0.05e-9},
@@ -46,7 +46,7 @@ _FITTING: dict[str, dict[str, dict[str, object]]] = {
     },
     "steps": {"tip": {"second_below_radii": 0.015, "debris_radii": 1.0, "length_jump_radii": 0.1}},
     "stamper": {
-        # Bumps this large only show what is wrong with a tip when that is large as well.
+        # Only a large flaw of the tip is visible on bumps of this size.
         "tip": {"blunt_radii": 18.0, "second_distance_radii": 30.0, "second_below_radii": 2.0, "debris_radii": 4.0},
         "noise": {"white_m": 0.3e-9, "one_over_f_m": 0.5e-9, "line_offset_m": 0.5e-9, "scar_m": 8e-9},
     },
@@ -56,7 +56,7 @@ _FITTING: dict[str, dict[str, dict[str, object]]] = {
 
 @dataclass(frozen=True)
 class WorldSettings:
-    """All but the surface, which has settings of its kind."""
+    """All settings but the surface, whose kind determines its own."""
 
     tip: TipSettings = field(default_factory=TipSettings)
     tip_changes: TipChangeSettings = field(default_factory=TipChangeSettings)
@@ -70,10 +70,10 @@ class WorldSettings:
 
 
 def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings]:
-    """The surface's table and the rest, from one table of all.
+    """Return the surface's table and the other settings, from one table.
 
     Raises:
-        ConfigError: unknown names or values without sense, of all tables at once; FileError: the surface's file.
+        ConfigError: unknown names or invalid values, of all tables at once; FileError: the surface's file.
     """
     tables = dict(settings)
     names = ["surface", *WorldSettings.__dataclass_fields__]
@@ -89,7 +89,7 @@ def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings
     with errors:
         built = build(WorldSettings, tables, "simulation")
     if errors.errors:
-        with errors:  # else it is made later
+        with errors:  # built here only to report its errors together with the others
             surface_from(surface)
     errors.raise_all()
     return surface, built
@@ -102,7 +102,7 @@ _SAME_PLACE_M = 20e-12
 
 @dataclass(frozen=True)
 class WorldState:
-    """All that a world needs to go on as if nothing had happened; see `World`, `SimulatedTip` and `Sample`."""
+    """The saved state of a world, which continues without a difference; see `World`, `SimulatedTip` and `Sample`."""
 
     seed: int
     start_s: float
@@ -118,7 +118,7 @@ class WorldState:
 
 
 class World:
-    """See the module. All times are experiment seconds, all positions tip coordinates unless they say sample."""
+    """The simulated world. All times are experiment seconds, all positions tip coordinates unless named sample."""
 
     def __init__(
         self, surface: object = "steps", settings: WorldSettings | None = None, *, seed: int = 0, start_s: float = 0.0
@@ -134,10 +134,10 @@ class World:
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object], seed: int, start_s: float) -> World:
-        """Return the world that tables ask for: `surface`, and the fields of `WorldSettings`.
+        """Return the world of tables: `surface`, and the fields of `WorldSettings`.
 
         Raises:
-            ConfigError: unknown names or values without sense. FileError: the surface's file.
+            ConfigError: unknown names or invalid values. FileError: the surface's file.
         """
         surface, built = read_settings(settings)
         return cls(surface, built, seed=seed, start_s=start_s)
@@ -161,13 +161,13 @@ class World:
             region: in tip coordinates.
             shape: (ny, nx).
             line_s: of trace and retrace together.
-            feedback: what it says overrides the settings.
+            feedback: its fields override the settings.
             direction: of the slow axis, "up" (small y first) or "down".
             slope: compensation of the sample's tilt, (x, y) in m/m.
-            adjusted: what was set during the scan; it holds from the next line on.
+            adjusted: changes during the scan, each in force from the next line on.
 
         Raises:
-            InvalidValue: what cannot be scanned, or feedback without sense.
+            InvalidValue: an impossible scan, or invalid feedback.
         """
         course = Course(region, shape, line_s, start_s, direction)
         loop = Loop.of(self.settings.feedback, feedback)
@@ -179,7 +179,8 @@ class World:
         tips += [(change.t_s, change.tip) for change in self._tip.between(start_s, course.end_s)]
         setup = self._setup(loop, bias_v, slope, start_s)
         measured = measure(course, tips, setup, chance.generator(self.seed, 2, call))
-        for one in adjusted:  # each line as if the whole scan had been taken so, with the same noise
+        # the whole scan is computed with each adjustment and the same noise; then its lines are taken over
+        for one in adjusted:
             setup = self._setup(Loop.of(self.settings.feedback, one.feedback), one.bias_v, slope, start_s)
             anew = measure(course, tips, setup, chance.generator(self.seed, 2, call))
             measured = measured.continued(anew, course.row_times_s(0.0) >= one.t_s)
@@ -199,15 +200,15 @@ class World:
         slope: tuple[float, float] = (0.0, 0.0),
         random: np.random.Generator,
     ) -> dict[str, float]:
-        """Return what each channel shows while the tip stands at a place: nothing comes of having looked.
+        """Return the value of each channel while the tip stands still, without any effect on the world.
 
-        With the feedback off, z is where `hold` or the last scan has left it.
+        With the feedback off, z is the one of `hold` or of the end of the last scan.
 
         Args:
-            random: for the noise, so that what is measured otherwise stays the same.
+            random: for the noise, so that other measurements stay the same.
 
         Raises:
-            InvalidValue: feedback without sense, or what is not finite.
+            InvalidValue: invalid feedback, or a value that is not finite.
         """
         if not all(map(math.isfinite, (bias_v, *slope, *position_m))):
             raise InvalidValue(f"bias {bias_v} V, slope {slope} and position {position_m} must be finite")
@@ -223,10 +224,10 @@ class World:
         return at_rest(course, self._felt_at_rest[1], tip, setup, random)
 
     def hold(self, z_m: float) -> None:
-        """Leave z there while the feedback is off.
+        """Set z while the feedback is off.
 
         Raises:
-            InvalidValue: no place.
+            InvalidValue: z is not finite.
         """
         if not math.isfinite(z_m):
             raise InvalidValue(f"z can't be held at {z_m} m")
@@ -243,7 +244,7 @@ class World:
         """Return a curve at a position: (names, units, values [n_points, n_variables]). Kinds are "IV" and "force".
 
         Raises:
-            InvalidValue: an unknown kind, or feedback without sense.
+            InvalidValue: an unknown kind, or invalid feedback.
         """
         if kind not in spectra.KINDS:
             raise InvalidValue(f"no spectrum of kind {kind!r}", hint=nearest(kind, spectra.KINDS))
@@ -261,14 +262,13 @@ class World:
         return spectra.force_distance(self.settings.force, tip, material, random)
 
     def spectrum_s(self, kind: str) -> float:
-        """Return the duration of such a curve."""
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
-        """From a time on, the scanner moves along with the sample by itself, with this velocity (x, y).
+        """Set the velocity (x, y) at which the scanner follows the sample by itself, from a time on.
 
         Raises:
-            InvalidValue: before the time of the velocity that it has.
+            InvalidValue: a time before the last change of velocity.
         """
         if not all(map(math.isfinite, (*velocity_m_per_s, t_s))):
             raise InvalidValue(f"a velocity of {velocity_m_per_s} m/s from {t_s} s on")
@@ -279,10 +279,10 @@ class World:
     def pulse(
         self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None
     ) -> str:
-        """Pulse the bias: may cure or worsen the tip (`tip.pulse_times`), and leaves a little mound.
+        """Pulse the bias: it may cure or worsen the tip (`tip.pulse_times`), and leaves a small mound.
 
         Args:
-            position_m: where the tip was moved to; None: where it measured last.
+            position_m: the position of the tip; None: as at the last measurement.
 
         Returns:
             "cured", "worsened" or "unchanged".
@@ -298,7 +298,7 @@ class World:
         return outcome
 
     def crash(self, position_m: tuple[float, float], depth_m: float, speed_m_s: float, t_s: float) -> str:
-        """Drive the tip into the sample: may cure or worsen it (`tip.crash_times`), and leaves a crater.
+        """Drive the tip into the sample: it may cure or worsen it (`tip.crash_times`), and leaves a crater.
 
         A part of its depth (`tip.indented_m`) springs back. Simulated: material is pushed aside over three times the
         radius of contact, about as far as plastic flow reaches around an indenter.
@@ -323,19 +323,19 @@ class World:
         return outcome
 
     def drift_m(self, t_s: ArrayLike) -> Array:
-        """Return (x, y, z) by which the sample is displaced: x_tip = x_sample + drift. Shape t.shape + (3,).
+        """Return the displacement (x, y, z) of the sample: x_tip = x_sample + drift. Shape t.shape + (3,).
 
-        On a sample that turns or expands that is so at the place that it does about: see `to_sample` and `to_tip`.
+        On a sample that turns or expands this holds at the fixed point only: see `to_sample` and `to_tip`.
         """
         return self.sample.drift.at(t_s)
 
     @property
     def tip(self) -> TipShape:
-        """The tip after all that has been asked for so far."""
+        """The tip after all calls so far."""
         return self._tip.history[-1].tip
 
     def truth(self, t_s: float) -> dict[str, object]:
-        """Return what nobody on the wire is told, JSON-able: drift, tip, what happened to it, marks on the sample."""
+        """Return the ground truth, which is never published, JSON-able: drift, tip, its changes, marks."""
         return {
             "t_s": t_s,
             "seed": self.seed,
@@ -351,7 +351,7 @@ class World:
     # -- being killed and coming back
 
     def state(self) -> dict[str, object]:
-        """Return all that `restore` needs to go on as if nothing had happened, JSON-able."""
+        """Return the state for `restore`, JSON-able."""
         state = WorldState(
             seed=self.seed,
             start_s=self.start_s,
@@ -368,10 +368,10 @@ class World:
         return snapshot(state, "world", STATE_VERSION)
 
     def restore(self, state: Mapping[str, object]) -> None:
-        """Become the world that `state` was taken from; its settings must be the same.
+        """Restore the world from `state`; its settings must be the same.
 
         Raises:
-            InvalidValue: a state of another world or version, or a damaged one; nothing has changed then.
+            InvalidValue: a state of another world or version, or a damaged one; then nothing has changed.
         """
         found = restored(WorldState, state, "world", STATE_VERSION)
         for name in ("seed", "start_s"):
@@ -386,7 +386,6 @@ class World:
     # -- inside
 
     def _begin(self, t_s: float, position_m: tuple[float, float]) -> int:
-        """Go to a time and a place; return the number of this call."""
         if not (math.isfinite(t_s) and t_s >= self.start_s - 1e-6):
             raise InvalidValue(f"the world starts at {self.start_s:g} s, nothing can be done at {t_s:g} s")
         self.sample.marks = [mark for mark in self.sample.marks if mark.t_s <= t_s]

@@ -1,4 +1,4 @@
-"""For those who write drivers, components and clients: conformance suites, commissioning, skeletons.
+"""Conformance suites, commissioning and skeletons, for authors of drivers, components and clients.
 
 No process of a run imports this room.
 """

@@ -1,10 +1,10 @@
 """The conformance kernel: checks of a translator, a client or a controller, done one after the other.
 
-Theory of operation. A `Suite` collects the checks of one kind of program, in order. A `Check` contains a function of
-the suite's fixture, which raises a `CheckEnded` unless the program passes. `attempt` makes a `CheckResult` of a check,
-and `SuiteReport.run` of several. The surroundings of a check differ from suite to suite (a question to a person, a new
-experiment after a failure): they are in the fixture's `perform` and `explain`. Each wait within a check has a time
-limit of its own, so that a check ends even if the program does not answer.
+**Theory of operation.** A `Suite` collects the checks of one kind of program, in order. A `Check` contains a function
+of the suite's fixture, which raises a `CheckEnded` unless the program passes. `attempt` runs a check and returns a
+`CheckResult`; `SuiteReport.run` runs several. The surroundings of a check differ from suite to suite (a question to a
+person, a new experiment after a failure): they are in the fixture's `perform` and `explain`. Each wait within a check
+has its own time limit, so that a check ends even if the program does not answer.
 
 | raised | because | outcome | then |
 | --- | --- | --- | --- |
@@ -40,7 +40,7 @@ REPORT_FILE = "report.json"
 
 
 class CheckOutcome(Enum):
-    """The outcome of one check; `BLOCKED` if it needs another one that has not passed."""
+    """The outcome of one check; `BLOCKED` if it needs another check that has not passed."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -51,16 +51,16 @@ class CheckOutcome(Enum):
 
 
 class CheckEnded(Exception):
-    """A check ends without having passed; the text is the line of its result."""
+    """Ends a check that has not passed; the text is the line of its result."""
 
     outcome: ClassVar[CheckOutcome]
 
 
 class Failed(CheckEnded, AssertionError):
-    """The program under test does not do what it should.
+    """The program under test behaves differently from the requirement.
 
     Args:
-        expected, came: in words of a physicist, without a full stop.
+        expected, came: in a physicist's words, without a full stop.
     """
 
     outcome = CheckOutcome.FAILED
@@ -70,13 +70,13 @@ class Failed(CheckEnded, AssertionError):
 
 
 class Skipped(CheckEnded):
-    """It can't be checked here; the text says why."""
+    """The check is impossible here; the text gives the reason."""
 
     outcome = CheckOutcome.SKIPPED
 
 
 class Unsupported(CheckEnded):
-    """The program does not have what the check needs; the text names it."""
+    """The program lacks a feature that the check needs; the text names it."""
 
     outcome = CheckOutcome.UNSUPPORTED
 
@@ -88,16 +88,16 @@ class Declined(CheckEnded):
 
 
 class Lost(Exception):
-    """Nothing more can be checked: a process has ended, or control was taken away."""
+    """No further check is possible: a process has ended, or control was taken away."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """One check.
+    """The result of one check.
 
     Attributes:
-        line: what was expected and what came, or why it was skipped.
-        complaints: of a failed check, the evidence: warnings and errors logged meanwhile, the remedy.
+        line: expectation and observation, or the reason for skipping.
+        complaints: the evidence of a failed check: warnings and errors logged meanwhile, the remedy.
         real_s: its duration.
     """
 
@@ -110,13 +110,12 @@ class CheckResult:
 
 
 def expect(holds: object, expected: str, came: str) -> None:
-    """Raises Failed unless it holds."""
     if not holds:
         raise Failed(expected, came)
 
 
 def near(a: float, b: float, relative: float = 1e-3, absolute: float = 0.0) -> bool:
-    """True if two numbers are the same to a controller's precision."""
+    """Return whether two numbers agree to a controller's precision."""
     return math.isclose(a, b, rel_tol=relative, abs_tol=absolute)
 
 
@@ -127,8 +126,8 @@ class Check:
     Attributes:
         name: "scan/cancel": the subject, and the requirement.
         title: a sentence that is true of a program that passes.
-        do: takes the suite's fixture; raises a CheckEnded, or returns a line worth knowing though all is well.
-        needs: actions and parameters without which there is nothing to check.
+        do: takes the suite's fixture; raises a CheckEnded, or returns a remark on a pass.
+        needs: actions and parameters required by the check.
         remedy: what to do if it fails.
     """
 
@@ -152,8 +151,8 @@ class Suite(Generic[K]):
     """The checks of one kind of program, in order.
 
     Args:
-        command: the command that does them.
-        package: contains the modules with the checks, which are imported when the checks are first asked for.
+        command: the command that runs them.
+        package: contains the modules with the checks, which are imported on first use.
         modules: their names, in order.
     """
 
@@ -163,7 +162,7 @@ class Suite(Generic[K]):
         self._checks: list[K] = []
 
     def add(self, check: K) -> None:
-        """Add a check; the checks of a module are done in the order of their addition."""
+        """Add a check; the checks of a module are run in the order of their addition."""
         self._checks.append(check)
 
     def checks(self, only: Collection[str] = ()) -> tuple[K, ...]:
@@ -174,7 +173,7 @@ class Suite(Generic[K]):
         """
         for module in self._modules:
             import_module(module)
-        # any module may have been imported first, by a test or by its neighbour
+        # modules may have been imported in any order, by a test or by each other
         ordered = sorted(self._checks, key=lambda one: self._modules.index(one.do.__module__))
         found = tuple(one for one in ordered if not only or any(part in one.name for part in only))
         if not found:
@@ -183,29 +182,29 @@ class Suite(Generic[K]):
 
 
 class Fixture(Protocol[K_contra]):
-    """All that the checks of a suite work with."""
+    """The environment of the checks of a suite."""
 
     @property
     def clock(self) -> Clock:
-        """The clock by which a check's duration is measured."""
+        """The clock for the durations of checks."""
 
     def perform(self, check: K_contra) -> str | None:
-        """Do a check, unless something prevents it. Raises CheckEnded, Lost."""
+        """Run a check, unless it is impossible. Raises CheckEnded, Lost."""
 
     def explain(self, check: K_contra, failure: Failed) -> tuple[str, ...]:
-        """Return the evidence of a failure, and get ready for the next check.
+        """Return the evidence of a failure, and prepare the next check.
 
         Raises:
-            Skipped: it is not the program's fault.
+            Skipped: the program is not at fault.
             Lost: there can be no next check.
         """
 
 
 def attempt(check: K, fixture: Fixture[K]) -> CheckResult:
-    """Do one check.
+    """Run one check.
 
     Raises:
-        Lost: nothing more can be checked.
+        Lost: no further check is possible.
     """
     began_s = fixture.clock.monotonic_s()
     outcome, line = CheckOutcome.PASSED, ""
@@ -227,7 +226,7 @@ class SuiteReport:
 
     Attributes:
         lost: why the checks could not be finished; empty if they were.
-        folder: of this run, with its log and files; empty before it is made.
+        folder: of this run, with its log and files; empty before it is created.
     """
 
     folder: str = ""
@@ -238,7 +237,7 @@ class SuiteReport:
 
     @property
     def passed(self) -> bool:
-        """True if nothing was wrong; an unsupported action is no fault."""
+        """True if no check failed; an unsupported action is no fault."""
         return bool(self.results) and not (self.failed or self.lost)
 
     @property
@@ -268,7 +267,7 @@ class SuiteReport:
         return json.dumps(facts, indent=2, ensure_ascii=False) + "\n"
 
     def to_junit(self) -> str:
-        """Return the report as JUnit's XML, for services that run tests."""
+        """Return the report as JUnit's XML, for test services."""
         suite = ElementTree.Element("testsuite", name="afspm", timestamp=self.began, tests=str(len(self.results)))
         for result in self.results:
             group, _, name = result.name.rpartition("/")
@@ -291,7 +290,7 @@ class SuiteReport:
 
     @contextmanager
     def written(self) -> Iterator[None]:
-        """Write `report.json` into the folder at the end of the block, and note why the block was left early."""
+        """Write `report.json` into the folder at the end of the block, with the reason of an early end."""
         try:
             yield
         except Lost as lost:
@@ -306,7 +305,7 @@ class SuiteReport:
     def run(
         self, checks: Iterable[K], fixture: Fixture[K], done: Callable[[CheckResult], None] = lambda result: None
     ) -> None:
-        """Do checks one after the other; `done` gets each result. Raises Lost."""
+        """Run checks in order; `done` is called with each result. Raises Lost."""
         for check in checks:
             result = attempt(check, fixture)
             self.results.append(result)
@@ -337,7 +336,7 @@ def show_result(result: CheckResult, console: Console) -> None:
 
 
 def show_verdict(report: SuiteReport, verdict: str, console: Console) -> None:
-    """Print how a run of checks ended, in a line, and its folder."""
+    """Print the verdict of all checks in a line, and the run's folder."""
     if report.lost:
         console.print(Text(f"not completed: {report.lost}", "bold red"), soft_wrap=True)
     line = f"{report.counts or 'nothing checked'}{verdict}"

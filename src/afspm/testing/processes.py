@@ -19,12 +19,12 @@ ASKED_S, KILLED_S = 5.0, 3.0
 
 
 class Processes:
-    """Running processes of which none may end by itself.
+    """Running processes; the end of one without a request is an error.
 
     Args:
-        log: gets what they print.
-        woken: called, from any thread, when one of them has ended.
-        complaints: gets the warnings and errors that they tell, each with the name of its process.
+        log: receives their output.
+        woken: called, from any thread, after one of them has ended.
+        complaints: receives their warnings and errors, each with the name of its process.
     """
 
     def __init__(self, log: RunLog, clock: Clock, woken: Callable[[], None], complaints: list[str]) -> None:
@@ -37,40 +37,40 @@ class Processes:
         self._starts: dict[str, ProcessStart] = {}
 
     def start(self, starts: Sequence[ProcessStart]) -> None:
-        """Start these.
+        """Start processes.
 
         Raises:
-            AfspmError: one can't be started.
+            AfspmError: a process can't be started.
         """
         self._readers |= {start.launch.name: LineReader() for start in starts}
         self._starts |= {start.launch.name: start for start in starts}
         for start in starts:
             task = from_start(start)
-            self._running[task.name] = ChildProcess(task, self._tell)
+            self._running[task.name] = ChildProcess(task, self._handle_event)
 
     def kill(self, name: str) -> None:
-        """Kill one, and wait until it has ended."""
+        """Kill a process, and wait for its end."""
         self._running[name].kill()
         self._await(KILLED_S, lambda: name in self._ended)
 
     def start_again(self, name: str) -> None:
-        """Start one that has ended. Raises AfspmError: it can't be started."""
+        """Start a process that has ended. Raises AfspmError: it can't be started."""
         del self._ended[name]
         self.start([self._starts[name]])
 
     @property
     def ended(self) -> str:
-        """Which of them have ended, and how; empty while all run."""
+        """A text about all ended processes; empty while all run."""
         return "; ".join(f"the process {name} {how}" for name, how in self._ended.items())
 
     @property
     def errors(self) -> str:
-        """The last error that each of them has told."""
-        said = {name: reader.last_error for name, reader in self._readers.items()}
-        return "; ".join(f"{name} said: {error}" for name, error in said.items() if error)
+        """The last logged error of each process."""
+        errors = {name: reader.last_error for name, reader in self._readers.items()}
+        return "; ".join(f"{name}: {error}" for name, error in errors.items() if error)
 
     def close(self) -> None:
-        """End all that still run: they are asked first, and killed if that does not help."""
+        """Ask all running processes to end, and kill the remaining ones."""
         for process in self._running.values():
             process.close_stdin()
         self._await(ASKED_S, self._all_ended)
@@ -89,17 +89,17 @@ class Processes:
             with contextlib.suppress(Empty):
                 self._exits.get(timeout=left_s)
 
-    def _tell(self, event: ChildEvent) -> None:
-        """Called in the threads of the processes."""
+    def _handle_event(self, event: ChildEvent) -> None:
+        # runs in the threads of the processes
         match event:
             case OutputLine():
                 level, text = self._readers[event.name].read(event.stream, event.line)
                 self._write(event.name, level, text)
                 if level >= logging.WARNING:
-                    self._complaints.append(f"{event.name} said: {text}")
+                    self._complaints.append(f"{event.name}: {text}")
             case Exited():
-                said = self._readers[event.name].last_error
-                self._ended[event.name] = f"{describe_exit(event.code)}{f' ({said})' if said else ''}"
+                error = self._readers[event.name].last_error
+                self._ended[event.name] = f"{describe_exit(event.code)}{f' ({error})' if error else ''}"
                 self._exits.put(event)
                 self._woken()
 

@@ -56,17 +56,20 @@ def test_the_past_is_what_was_recorded(tmp_path: Path) -> None:
     past = Archive(tmp_path).past(ProblemNames({"drop-on-the-table": 9}))
     store.close()
     assert past is not None
-    assert [(span.label, span.start_ns // S) for span in past.process_timelines["series"].spans] == [
+    assert [(span.label, span.start_ns // S) for span in past.process_history.timelines["series"].spans] == [
         ("alive", 3), ("ended", 6),
     ]  # fmt: skip
-    assert [span.label for span in past.states.spans] == ["scanning", "free"]
+    assert [span.label for span in past.timelines.scope_state.spans] == ["scanning", "free"]
     assert [(scan.channel, scan.holder) for scan in past.scans] == [("Height", "series")]
     assert past.problems["drop-on-the-table"] == 9
     watch = Watch(ExperimentClock.real(), past=past)
     watch.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), 5 * S)  # which the scheduler has kept
     watch.take("ControlState", ControlState(ControlMode.AUTOMATED, None), 8 * S)
-    assert [(span.label, span.start_ns // S) for span in watch.overview.states.spans] == [("scanning", 2), ("free", 5)]
-    assert watch.overview.controls.now is None
+    assert [(span.label, span.start_ns // S) for span in watch.overview.timelines.scope_state.spans] == [
+        ("scanning", 2),
+        ("free", 5),
+    ]
+    assert watch.overview.timelines.control.now is None
 
 
 def test_of_a_run_without_a_record_and_of_a_replay_no_past_is_known(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def test_forth_and_back_is_the_same(night: Night) -> None:
         watch.go(START + at_s * S)
     straight.go(START + 22 * S)
     assert watch.overview.scans == straight.overview.scans
-    assert watch.overview.controls.spans == straight.overview.controls.spans
+    assert watch.overview.timelines.control.spans == straight.overview.timelines.control.spans
 
 
 def test_the_page_is_made_of_the_moment(night: Night) -> None:

@@ -1,5 +1,8 @@
-"""A disk that hangs, in a real process: nothing below HANGING_FOLDER is opened, written or synced while `<it>.hangs` is
-there. Python imports this by itself at its start, where its folder is in PYTHONPATH."""
+"""A disk that hangs, in a real process.
+
+No file below HANGING_FOLDER is opened, written or synced while `<folder>.hangs` exists. Python imports this module at
+its start if its folder is in PYTHONPATH.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ def wait_for_disk(of: Any) -> None:
 
 
 class SlowFile(io.FileIO):
-    """A file that is written as its disk allows."""
+    """A file whose writes wait for its disk."""
 
     def write(self, data: Any) -> int:
         wait_for_disk(self.fileno())
@@ -31,7 +34,7 @@ class SlowFile(io.FileIO):
 
 
 def slow(call: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of the system that takes the disk of its first argument."""
+    """Wrap a system function so that it waits for the disk of its first argument."""
 
     def called(of: Any, *arguments: Any, **options: Any) -> Any:
         wait_for_disk(of)

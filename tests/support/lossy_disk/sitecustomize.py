@@ -1,8 +1,9 @@
-"""What a disk has for sure, in real processes: each file as it was synced last, under the names that its folder had
-when that was synced last. `restore` makes a folder so, as a power cut would. Python imports this by itself at its
-start, where its folder is in PYTHONPATH.
+"""The guaranteed state of a disk, in real processes: files as last synced, under the last synced names of a folder.
 
-SQLite syncs by itself, which is not seen here: its main file is taken as it is when its write-ahead log is synced.
+`restore` sets a folder to that state, as a power cut would. Python imports this module at its start if its folder is in
+PYTHONPATH.
+
+SQLite's own syncs are invisible here: its main file counts as synced when its write-ahead log is.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _fsync, _unlink, _replace, _rename = os.fsync, os.unlink, os.replace, os.rename
 
 
 class Shadow:
-    """What is on the disk for sure, kept beside the folder: contents by file, and names by folder."""
+    """The synced state, kept beside the folder: contents by file, and names by folder."""
 
     def __init__(self, folder: str) -> None:
         self._folder = folder
@@ -35,7 +36,7 @@ class Shadow:
             each.mkdir(parents=True, exist_ok=True)
 
     def sync(self, descriptor: int) -> None:
-        """A file or a folder was synced."""
+        """Record the sync of a file or a folder."""
         path = str(Path(f"/proc/self/fd/{descriptor}").readlink())
         if not f"{path}/".startswith(f"{self._folder}/"):
             return
@@ -50,7 +51,7 @@ class Shadow:
 
     @contextlib.contextmanager
     def syncing(self) -> Iterator[None]:
-        """Note that a sync is under way: here a sync copies the whole file, which takes far longer than a disk."""
+        """Record a running sync: a copy of the whole file here, which takes far longer than on a disk."""
         mark = self._under_way / str(uuid.uuid4())
         mark.write_text(str(time.monotonic()))
         try:
@@ -59,7 +60,7 @@ class Shadow:
             _unlink(mark)
 
     def longest_under_way_s(self) -> float:
-        """Return for how long the oldest sync that was not finished had been under way, and forget them."""
+        """Return the age of the oldest unfinished sync, and forget all."""
         now_s, longest_s = time.monotonic(), 0.0
         for mark in self._under_way.iterdir():
             began = mark.read_text()
@@ -79,7 +80,7 @@ class Shadow:
         return ""
 
     def _named(self, number: int) -> str:
-        """Give the content of a file a name; where another thread or process is quicker, it is theirs."""
+        # another thread or process may be quicker: then its name counts
         name = str(uuid.uuid4())
         aside = self._files / f".{name}"
         aside.write_text(name)
@@ -102,14 +103,14 @@ class Shadow:
         _replace(aside, self._names / path.replace("/", "%"))
 
     def forget(self, path: Any) -> None:
-        """The file of this name is no longer one of that name: its number may be given to another."""
+        """Forget the file of this name: its inode number may be reused."""
         with contextlib.suppress(OSError):
             found = os.lstat(path)
             if str(path).startswith(self._folder) and stat.S_ISREG(found.st_mode):
                 _unlink(self._files / str(found.st_ino))
 
     def restore(self) -> None:
-        """Make the folder what it is after a power cut."""
+        """Set the folder to its state after a power cut."""
         for path in [*Path(self._folder).rglob("*")]:
             if path.is_file() and not path.is_symlink():
                 _unlink(path)
@@ -119,7 +120,7 @@ class Shadow:
             (self._files / str(path.stat().st_ino)).write_text(content)
 
     def copy(self, into: Path) -> list[tuple[Path, str]]:
-        """What the folder would be after a power cut, in another; returns each file with the name of its content."""
+        """Write the state after a power cut to another folder; return each file with the name of its content."""
         copied = []
         for known in [known for known in self._names.iterdir() if not known.name.startswith(".")]:
             told = json.loads(known.read_text())
@@ -133,7 +134,7 @@ class Shadow:
 
 
 def watch(shadow: Shadow) -> None:
-    """Have it see what this process syncs and removes."""
+    """Record the syncs and removals of this process."""
 
     def syncing(call: Callable[[int], None]) -> Callable[[int], None]:
         def called(descriptor: int) -> None:

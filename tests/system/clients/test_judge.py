@@ -72,7 +72,7 @@ def test_the_command_prints_a_table_and_writes_a_report(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, [*options, "--", *PROGRAM, "echoes"])
     assert result.exit_code == 1
     assert "✗ wire/decode" in result.output
-    assert "→ Compile `proto/` anew." in result.output
+    assert "→ Compile `proto/` again." in result.output
     assert "1 passed, 1 failed: the client does not do what it should" in result.output
     report = json.loads(file.read_text(encoding="utf-8"))
     assert not report["passed"]

@@ -1,4 +1,4 @@
-"""A controller that says back what it is told, for one client at a time."""
+"""A controller that echoes lines, for one client at a time."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Echo(Emulator):
         with self._listener.accept()[0] as client:
             asked = client.recv(1000).decode()
             if self.faults.strikes("crash", self.clock.now_s()):
-                raise Crashed("as it was told to")
+                raise Crashed("on request")
             told = str(self.clock.now_s()) if asked == "time" else f"{self.greeting} {asked}, seed {self.seed}"
             client.sendall(told.encode())
 
@@ -38,7 +38,7 @@ class Echo(Emulator):
 
 
 class Late(Echo):
-    """Begins when the experiment is over."""
+    """Starts only after the end of the experiment."""
 
     def run(self, *arguments: Any) -> None:
         for thread in threading.enumerate():

@@ -51,7 +51,7 @@ def ask(address: str, line: str) -> str:
 
 
 @can_interrupt
-def test_from_the_command_line_it_says_where_it_listens_and_ends_on_ctrl_c(tmp_path: Path) -> None:
+def test_emulate_prints_its_address_and_ends_on_ctrl_c(tmp_path: Path) -> None:
     arguments = ("afspm", "emulate", "echo.Echo", "greeting=good day", "--port", "0", "--seed", "7", "-o", "files")
     with started(*arguments, cwd=tmp_path) as process:
         assert process.stdout is not None
@@ -64,7 +64,7 @@ def test_from_the_command_line_it_says_where_it_listens_and_ends_on_ctrl_c(tmp_p
     assert (tmp_path / "files").is_dir()
 
 
-def test_a_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
+def test_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
     with started("afspm", "emulate", "echo.Echo", "--port", "0", "--fault", "crash", cwd=tmp_path) as process:
         assert process.stdout is not None
         assert ask(process.stdout.readline().split(" at ")[1].split(",")[0], "x") == ""
@@ -72,7 +72,7 @@ def test_a_crash_on_the_command_line_ends_with_1(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("vendor", sorted(MAKERS))
-def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Path) -> None:
+def test_taken_port_is_reported_in_one_sentence(vendor: str, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = str(taken.getsockname()[1])
         with started("afspm", "emulate", vendor, "--port", port, cwd=tmp_path) as process:
@@ -83,7 +83,7 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(vendor: str, tmp_path: Pat
     assert "Traceback" not in said
 
 
-def test_a_fault_that_it_does_not_have_is_refused_before_it_listens(tmp_path: Path) -> None:
+def test_unknown_fault_is_refused_before_listening(tmp_path: Path) -> None:
     with started("afspm", "emulate", "echo.Echo", "--fault", "crush", cwd=tmp_path) as process:
         out, err = process.communicate(timeout=DEADLINE_S)
     assert process.returncode == 1
@@ -108,7 +108,7 @@ def launched(settings: dict[str, object], subscribe: str, run_dir: Path, class_:
 def beginning(
     settings: dict[str, object], tmp_path: Path, class_: str = "echo.Echo"
 ) -> Iterator[tuple[subprocess.Popen[str], zmq.Socket[bytes]]]:
-    """The process, told how to begin, and the scheduler that it subscribes to."""
+    """Start the process with its launch line; yield it with the scheduler that it subscribes to."""
     with zmq.Context() as context, context.socket(zmq.XPUB) as scheduler:
         scheduler.setsockopt(zmq.LINGER, 0)
         port = scheduler.bind_to_random_port("tcp://127.0.0.1")
@@ -130,7 +130,7 @@ def in_an_experiment(
         yield process, line.split(WORDS)[1].strip(), scheduler
 
 
-def test_an_experiment_that_ends_before_it_listens_is_heard_of_too(tmp_path: Path) -> None:
+def test_end_of_the_experiment_before_listening_ends_the_emulator(tmp_path: Path) -> None:
     with beginning({}, tmp_path, "echo.Late") as (process, scheduler):
         assert scheduler.poll(int(DEADLINE_S * 1000))
         scheduler.send(b"KILL")
@@ -139,7 +139,7 @@ def test_an_experiment_that_ends_before_it_listens_is_heard_of_too(tmp_path: Pat
         assert "Traceback" not in process.stderr.read()
 
 
-def test_in_an_experiment_it_has_its_clock_and_ends_with_it(tmp_path: Path) -> None:
+def test_emulator_in_an_experiment_uses_its_clock_and_ends_with_it(tmp_path: Path) -> None:
     with in_an_experiment({"greeting": "hello"}, tmp_path) as (process, address, scheduler):
         assert ask(address, "x") == "hello x, seed 1"
         assert 0.0 < float(ask(address, "time")) < 3600.0
@@ -149,14 +149,14 @@ def test_in_an_experiment_it_has_its_clock_and_ends_with_it(tmp_path: Path) -> N
         assert process.wait(DEADLINE_S) == ExitCode.ENDED
 
 
-def test_in_an_experiment_it_ends_when_its_parent_lets_it_go(tmp_path: Path) -> None:
+def test_emulator_in_an_experiment_ends_with_its_parent(tmp_path: Path) -> None:
     with in_an_experiment({}, tmp_path) as (process, _, _):
         assert process.stdin is not None
         process.stdin.close()
         assert process.wait(DEADLINE_S) == ExitCode.ORPHAN
 
 
-def test_in_an_experiment_a_crash_is_one_for_the_supervisor(tmp_path: Path) -> None:
+def test_crash_in_an_experiment_has_its_exit_code(tmp_path: Path) -> None:
     with in_an_experiment({"faults": ["crash"]}, tmp_path) as (process, address, _):
         assert ask(address, "x") == ""
         assert process.wait(DEADLINE_S) == ExitCode.CRASHED

@@ -1,4 +1,4 @@
-"""A trace of an experiment, played back: the same experiment measures the same, and another one is found out."""
+"""The trace of an experiment, played back: an equal experiment measures the same, a different one is reported."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def recorded(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     return vendor, trace, file
 
 
-def test_a_trace_has_every_question_and_the_files(recorded: tuple[str, Path, Path]) -> None:
+def test_trace_has_every_question_and_the_files(recorded: tuple[str, Path, Path]) -> None:
     _, trace, _ = recorded
     lines = read_trace(trace)
     exchanges = [line for line in lines if isinstance(line, TracedExchange)]
@@ -111,7 +111,7 @@ def test_a_trace_has_every_question_and_the_files(recorded: tuple[str, Path, Pat
     assert [line for line in lines if isinstance(line, TracedFile)]
 
 
-def test_a_trace_has_no_secret(recorded: tuple[str, Path, Path]) -> None:
+def test_trace_has_no_secret(recorded: tuple[str, Path, Path]) -> None:
     vendor, trace, _ = recorded
     secret = Path("~/.afspm/gxsm-bridge-secret").expanduser()
     if vendor != "gxsm":
@@ -119,7 +119,7 @@ def test_a_trace_has_no_secret(recorded: tuple[str, Path, Path]) -> None:
     assert secret.read_text(encoding="utf-8").strip() not in trace.read_text(encoding="utf-8")
 
 
-def test_the_same_experiment_measures_the_same_again(recorded: tuple[str, Path, Path], tmp_path: Path) -> None:
+def test_same_experiment_measures_the_same_again(recorded: tuple[str, Path, Path], tmp_path: Path) -> None:
     _, _, file = recorded
     done, ran = run(tmp_path, "run", FILES / "experiment.toml", file)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -129,7 +129,7 @@ def test_the_same_experiment_measures_the_same_again(recorded: tuple[str, Path, 
     assert run_json_or_empty(ran)["simulated"] is True
 
 
-def test_another_experiment_is_found_out_where_it_first_differs(
+def test_different_experiment_is_reported_at_the_first_difference(
     recorded: tuple[str, Path, Path], tmp_path: Path
 ) -> None:
     _, trace, file = recorded

@@ -1,9 +1,9 @@
-"""`python power_cut.py [--cuts N] [--seed S] [--killed]`: a power cut in the middle of an experiment, again and again.
+"""`python power_cut.py [--cuts N] [--seed S] [--killed]`: power cuts in the middle of an experiment.
 
 A simulated experiment of scans, spectra and problems loses its power (every process is killed, at moments drawn from
-a seed, and what was not synced is gone) and is resumed. A plain subscriber of version 1 writes down what was published;
-in the end the record has to have all of it, bit by bit, but for the last moment before each cut, and each measurement
-once. With `--killed` the processes are killed alone: then nothing at all may be missing.
+a seed, and unsynced data are lost) and is resumed. A plain subscriber of version 1 records all publications; in the end
+the record must contain all of them, bit by bit, except the last moment before each cut, and each measurement once.
+With `--killed` only the processes are killed: then nothing may be missing.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from afspm.wire import KILL, decode_packet
 CLOCK = ExperimentClock.real()
 DEADLINE_S = 60.0
 LOSS_S = 1.5
-"""What was published so short a time before a power cut may be lost. It is a tenth of a second that is promised; the
-others are for a busy machine. A sync that was under way adds its time: it copies whole files here."""
+"""Packets published in this time before a power cut may be lost. A tenth of a second is guaranteed; the
+rest is for a busy machine. A running sync adds its time: it copies whole files here."""
 LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 LONGEST_LIFE_S = 2.5
-"""From the first scan of a life to the cut; of every fourth, from its first line."""
+"""From the first scan of a life to the cut; in every fourth life, from its first line."""
 COMMAND = (sys.executable, "-m", "afspm", "run", "--no-report")
 
 EXPERIMENT = """
@@ -122,7 +122,7 @@ class Witness:
         self._thread.start()
 
     def attend(self, address: str) -> None:
-        """Listen to this scheduler from now on."""
+        """Subscribe to this scheduler from now on."""
         with self._lock:
             if self._address:
                 self._socket.disconnect(self._address)
@@ -131,11 +131,11 @@ class Witness:
             self._scanned.clear()
 
     def wait_for_scan(self) -> None:
-        """Wait for a scan of the scheduler that is listened to now."""
+        """Wait for a scan of the present scheduler."""
         assert self._scanned.wait(DEADLINE_S), "nothing is measured"
 
     def close(self) -> None:
-        """Take in what has come, and leave."""
+        """Receive pending packets, and close."""
         self._over.set()
         self._thread.join()
         self._context.destroy(linger=0)
@@ -168,7 +168,7 @@ class Witness:
 
 @dataclass
 class Life:
-    """One life of the run: `afspm run` with everything that it starts."""
+    """One life of the run: `afspm run` with all its processes."""
 
     command: tuple[str, ...]
     folder: Path
@@ -196,7 +196,7 @@ class Life:
         self._incoming.put(None)
 
     def wait_for(self, pattern: str, within_s: float = DEADLINE_S) -> str | None:
-        """The next line with the pattern; None: it has ended, or none came in time."""
+        """Return the next line with the pattern; None if the process ends, or on a timeout."""
         until_s = CLOCK.monotonic_s() + within_s
         with contextlib.suppress(queue.Empty):
             while (line := self._incoming.get(timeout=max(0.0, until_s - CLOCK.monotonic_s()))) is not None:
@@ -206,7 +206,7 @@ class Life:
         return None
 
     def cut(self) -> None:
-        """Kill everything, at one moment."""
+        """Kill all processes at one moment."""
         tree = [self.process.pid, *_below(self.process.pid)]
         for sent in (signal.SIGSTOP, signal.SIGKILL):  # nobody sees another die
             for pid in tree:
@@ -216,7 +216,6 @@ class Life:
 
 
 def _below(pid: int) -> Iterator[int]:
-    """All processes that this one has started, and those have."""
     with contextlib.suppress(OSError):
         for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split():
             yield int(child)
@@ -225,7 +224,7 @@ def _below(pid: int) -> Iterator[int]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of it: `wrong` says what should not be so; `seen` is how many packets the one outside saw."""
+    """The result: `wrong` lists the errors; `seen` is the number of packets received by the witness."""
 
     folder: Path
     cuts: int
@@ -236,13 +235,13 @@ class Verdict:
 
 
 def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None, *, lossy: bool = True) -> Verdict:
-    """Begin an experiment in a folder, cut it so often, resume it, and end it.
+    """Start an experiment in a folder, cut and resume it `cuts` times, and end it.
 
     Args:
-        lossy: what was not synced is lost with each cut.
+        lossy: unsynced data are lost with each cut.
 
     Raises:
-        AssertionError: a life of it did not begin, or the last did not end.
+        AssertionError: a life did not start, or the last did not end.
     """
     chance = random.Random(seed)
     (folder / "experiment.toml").write_text(EXPERIMENT.format(seed=seed), encoding="utf-8")
@@ -281,7 +280,7 @@ def power_cuts(folder: Path, cuts: int, seed: int, tell: Any = lambda text: None
 
 
 def shadow(folder: Path) -> Any:
-    """What is on the disk for sure of a folder that is written with LOSSY in PYTHONPATH."""
+    """Return the synced state of a folder that is written with LOSSY in PYTHONPATH."""
     spec = importlib.util.spec_from_file_location("lossy_disk", LOSSY / "sitecustomize.py")
     assert spec is not None
     assert spec.loader is not None
@@ -312,7 +311,7 @@ def _verdict(run: Path, witness: Witness, cuts_s: list[tuple[float, float]], *, 
 
 
 def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
-    """The packets that told of a problem first."""
+    # the first packets of each new problem
     before: set[int] = set()
     for key in sorted(key for key in witness.seen if key[1] == "ControlState"):
         problems = set(wire.decode("ControlState", witness.seen[key]).problems)
@@ -322,12 +321,7 @@ def _flags(witness: Witness) -> Iterator[tuple[int, str]]:
 
 
 def _wrong(record: Any, witness: Witness, cuts_s: list[tuple[float, float]], most_lost: int) -> Iterator[str]:
-    """Yield what is wrong.
-
-    Args:
-        cuts_s: between which moments packets may be lost, for each cut.
-        most_lost: files of measurements that may be lost.
-    """
+    # cuts_s: intervals in which packets may be lost, one for each cut; most_lost: measured files that may be lost
     flags = set(_flags(witness))
 
     def may_be_lost(key: tuple[int, str]) -> bool:
@@ -372,7 +366,7 @@ def _say(text: str) -> None:
 
 
 def main() -> int:
-    """Returns the exit code: 1 if something was lost, or is there twice."""
+    """Return the exit code: 1 if a publication was lost or duplicated."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--cuts", type=int, default=100)
     parser.add_argument("--killed", action="store_true", help="what was not synced is not lost")

@@ -12,7 +12,7 @@ pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="fi
 
 
 @pytest.mark.parametrize("lossy", [True, False], ids=["what was not synced is lost", "all processes are killed"])
-def test_nothing_that_was_published_is_lost_and_nothing_is_there_twice(tmp_path: Path, *, lossy: bool) -> None:
+def test_power_cut_loses_and_duplicates_no_publication(tmp_path: Path, *, lossy: bool) -> None:
     verdict = power_cuts(tmp_path, cuts=3, seed=5, lossy=lossy)
     assert verdict.wrong == []
     assert verdict.seen > 0, "nobody saw anything"

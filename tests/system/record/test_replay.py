@@ -31,7 +31,7 @@ SCANS = 30
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Half an hour, with a scan every minute."""
+    """A run of half an hour, with a scan every minute."""
     folder = tmp_path_factory.mktemp("recorded")
     store = RecordStore(folder, RecordSettings({"experiment": "night", "simulated": True, "frame": "tip"}))
     things: list[tuple[str, object]] = [
@@ -55,7 +55,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def replaying(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A replay that has said where it is: a scan a tenth of a second."""
+    """A replay that has printed its address, at ten scans a second."""
     command = [sys.executable, "-m", "afspm", "replay", str(recorded), "--stay"]
     process = subprocess.Popen(
         command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8"
@@ -69,7 +69,7 @@ def replaying(recorded: Path, tmp_path: Path) -> Iterator[subprocess.Popen[str]]
     process.wait()
 
 
-def test_a_notebook_joins_gets_what_was_published_and_is_refused_clearly(
+def test_notebook_joins_a_replay_and_its_requests_are_refused(
     replaying: subprocess.Popen[str], recorded: Path, tmp_path: Path
 ) -> None:
     with afspm.open_run(recorded) as run:
@@ -94,7 +94,7 @@ def test_a_notebook_joins_gets_what_was_published_and_is_refused_clearly(
         assert late.control_state.holder == "series"
 
 
-def test_it_ends_as_an_experiment_does_with_its_folder_saying_so(recorded: Path, tmp_path: Path) -> None:
+def test_replay_ends_like_an_experiment_and_records_it(recorded: Path, tmp_path: Path) -> None:
     told: list[str] = []
     options = ReplayOptions(speed=1e6, only=["Scan2d"], runs=tmp_path / "runs")
     assert replay(recorded, options, told.append) == SCANS
@@ -113,7 +113,7 @@ TERMINATE = pytest.param(
 
 
 @pytest.mark.parametrize("stop", [pytest.param(interrupt, marks=can_interrupt), TERMINATE])
-def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
+def test_stopped_replay_records_and_publishes_its_end(
     replaying: subprocess.Popen[str], tmp_path: Path, stop: Callable[[subprocess.Popen[str]], None]
 ) -> None:
     (folder,) = (tmp_path / "runs").glob("replay-*")
@@ -128,7 +128,7 @@ def test_one_that_is_stopped_says_so_in_its_folder_and_to_who_listens(
             follower.pump(1.0)
 
 
-def test_an_address_that_is_taken_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
+def test_address_that_is_taken_leaves_no_folder(recorded: Path, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         options = ReplayOptions(publish=f"tcp://127.0.0.1:{taken.getsockname()[1]}", runs=tmp_path / "runs")
         with pytest.raises(TransportError):
@@ -136,7 +136,7 @@ def test_an_address_that_is_taken_leaves_no_folder(recorded: Path, tmp_path: Pat
     assert not (tmp_path / "runs").exists()
 
 
-def test_what_cannot_be_replayed_is_told(recorded: Path, tmp_path: Path) -> None:
+def test_unreplayable_run_is_refused(recorded: Path, tmp_path: Path) -> None:
     for only, said in ((["Scan3d"], "no message 'Scan3d'"), (["Spec1d"], "nothing to replay")):
         with pytest.raises(ConfigError, match=said):
             replay(recorded, ReplayOptions(only=only, runs=tmp_path), lambda _: None)
@@ -152,7 +152,7 @@ def test_replay_imports_no_module_that_the_recorded_run_names(
     assert replay(recorded, options, lambda _: None) == 1
 
 
-def test_the_addresses_of_the_experiment_file_are_taken(recorded: Path, tmp_path: Path) -> None:
+def test_replay_uses_the_addresses_of_the_experiment_file(recorded: Path, tmp_path: Path) -> None:
     file = recorded / "experiment.toml"
     file.write_text(
         '[scheduler]\ncomponent = true\nclass = "Scheduler"\npubsubcache = "tcp://127.0.0.1:19471"\n'

@@ -1,4 +1,4 @@
-"""What can be resumed, and what is refused."""
+"""Runs that can be resumed, and refusals."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def memory(run: Path) -> dict[str, Any]:
     return kept
 
 
-def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: Path) -> None:
+def test_stopped_run_is_resumed_and_an_ended_one_is_not(tmp_path: Path) -> None:
     beside, away = tmp_path / "lab", tmp_path / "away"
     beside.mkdir()
     away.mkdir()
@@ -110,7 +110,7 @@ def test_a_stopped_run_goes_on_where_it_was_and_an_ended_one_does_not(tmp_path: 
         resume.find(run)
 
 
-def test_a_killed_run_goes_on_with_a_dashboard_that_it_had_not(tmp_path: Path) -> None:
+def test_killed_run_is_resumed_with_an_added_dashboard(tmp_path: Path) -> None:
     (tmp_path / "night.toml").write_text(EXPERIMENT, encoding="utf-8")
     waiting = COMPONENT.replace("self.scope.end_experiment()", "self.scope.sleep(60.0)")
     (tmp_path / "short.py").write_text(waiting, encoding="utf-8")
@@ -129,7 +129,7 @@ def test_a_killed_run_goes_on_with_a_dashboard_that_it_had_not(tmp_path: Path) -
     again.communicate(timeout=DEADLINE_S)
 
 
-def test_a_run_that_has_a_dashboard_is_resumed_with_that_one(tmp_path: Path) -> None:
+def test_run_with_a_dashboard_is_resumed_with_it(tmp_path: Path) -> None:
     own = EXPERIMENT + '\n[page]\ncomponent = true\nclass = "Dashboard"\n'
     (tmp_path / "experiment.toml").write_text(own, encoding="utf-8")
     (tmp_path / "short.py").write_text(COMPONENT, encoding="utf-8")
@@ -140,7 +140,7 @@ def test_a_run_that_has_a_dashboard_is_resumed_with_that_one(tmp_path: Path) -> 
     assert found.added == ()
 
 
-def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
+def test_folder_without_a_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileError):
         resume.find(tmp_path)
     (tmp_path / "run.json").write_text("{}", encoding="utf-8")
@@ -152,7 +152,7 @@ def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no journal at all", b"SQLite format 3\0 and then nothing"])
-def test_a_damaged_journal_does_not_keep_a_run_from_going_on(tmp_path: Path, content: bytes | None) -> None:
+def test_damaged_journal_does_not_prevent_a_resume(tmp_path: Path, content: bytes | None) -> None:
     (tmp_path / "state").mkdir()
     (tmp_path / "state" / "microscope.json").write_text('{"seen_ns": 17}', encoding="utf-8")
     if content is not None:
@@ -160,7 +160,7 @@ def test_a_damaged_journal_does_not_keep_a_run_from_going_on(tmp_path: Path, con
     assert resume.last_seen_ns(tmp_path) == 17
 
 
-def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
+def test_lock_is_exclusive_and_released_at_exit(tmp_path: Path) -> None:
     (tmp_path / STATE_DIR).mkdir()
     with lock_run(tmp_path), pytest.raises(FileError, match="still going on"):
         lock_run(tmp_path).__enter__()
@@ -168,7 +168,7 @@ def test_a_lock_is_given_back_by_who_leaves(tmp_path: Path) -> None:
         pass
 
 
-def test_a_run_is_resumed_as_it_was_begun(tmp_path: Path) -> None:
+def test_resume_at_another_speed_is_refused(tmp_path: Path) -> None:
     process = afspm_run(tmp_path, "--resume", "runs", "--speed", "2")
     told = process.communicate(timeout=DEADLINE_S)[0]
     assert process.returncode != 0

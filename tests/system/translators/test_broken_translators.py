@@ -84,7 +84,7 @@ def test_what_is_wrong_is_said_in_one_line(
 def test_what_a_translator_logs_is_shown_with_the_check_that_failed(tmp_path: Path) -> None:
     report = checked(tmp_path, "broken.LosesScans", "scan/frame")
     (failure,) = report.failed
-    assert any("is lost" in line and line.startswith("microscope said: ") for line in failure.complaints)
+    assert any("is lost" in line and line.startswith("microscope: ") for line in failure.complaints)
     console = Console(width=200)
     with console.capture() as shown:
         show_result(failure, console)

@@ -14,7 +14,7 @@ import pytest
 from afspm_process import AFSPM
 from makers import MAKERS
 
-from afspm.simulation.emulation import registry
+from afspm.simulation.emulation.emulator import find_emulator
 
 DEADLINE_S = 90.0
 
@@ -45,7 +45,7 @@ def checked(folder: Path, *files: Path) -> dict[str, Any]:
 def test_no_byte_reaches_who_has_the_vendors_usual_port(
     vendor: str, tmp_path: Path, strangers: Callable[..., AbstractContextManager[Any]]
 ) -> None:
-    usual = registry.emulator(vendor).usual
+    usual = find_emulator(vendor).usual
     with strangers(*range(usual["port"], usual["port"] + usual.get("ports", 1))):
         assert checked(tmp_path, MAKERS[vendor].emulated)["simulated"] is True
 

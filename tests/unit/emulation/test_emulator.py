@@ -1,4 +1,4 @@
-"""What all emulated controllers have in common: how they run, stop, crash, and are named."""
+"""The common behaviour of all emulated controllers: start, stop, crash, names."""
 
 from __future__ import annotations
 
@@ -13,27 +13,26 @@ import pytest
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError, TransportError
 from afspm.plugins.asylum.emulator import AsylumEmulator
-from afspm.simulation.emulation import registry
-from afspm.simulation.emulation.emulator import Emulator
+from afspm.simulation.emulation.emulator import Emulator, emulator_names, find_emulator
 
 from .tiny import Tiny, ask
 
 
-def test_it_answers_while_in_the_block_and_is_gone_after_it(tmp_path: Path) -> None:
+def test_emulator_answers_in_the_block_and_is_gone_after_it(tmp_path: Path) -> None:
     with Tiny(port=0).running(tmp_path) as address:
         assert ask(address, "hello") == ["1"]
     with pytest.raises(OSError):  # noqa: PT011 - each system refuses in words of its own
         ask(address, "hello")
 
 
-def test_it_can_be_run_again(tmp_path: Path) -> None:
+def test_emulator_can_be_run_again(tmp_path: Path) -> None:
     tiny = Tiny(port=0)
     for _ in range(2):
         with tiny.running(tmp_path) as address:
             assert ask(address, "hello") == ["1"]
 
 
-def test_what_ends_by_itself_is_seen_to_at_that_time_and_not_at_the_next_request(tmp_path: Path) -> None:
+def test_activity_ends_at_its_time_without_a_request(tmp_path: Path) -> None:
     written = threading.Event()
 
     class Telling(Tiny):
@@ -54,7 +53,7 @@ def test_what_ends_by_itself_is_seen_to_at_that_time_and_not_at_the_next_request
 
 
 class WithButton(Tiny):
-    """Shows a button while it listens, and another one when that is pressed."""
+    """Shows a button while it listens, and another one once that is pressed."""
 
     def open(self) -> str:
         self.pressed = threading.Event()
@@ -99,12 +98,12 @@ def test_button_is_gone_when_the_controller_ends(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("delete-to-*"))
 
 
-def test_an_emulated_crash_closes_the_connection_without_an_answer(tmp_path: Path) -> None:
+def test_emulated_crash_closes_the_connection_without_an_answer(tmp_path: Path) -> None:
     with Tiny(port=0, faults=["crash"]).running(tmp_path) as address:
         assert ask(address, "hello") == [""]
 
 
-def test_a_port_that_is_taken_is_an_error_of_the_block(tmp_path: Path) -> None:
+def test_port_that_is_taken_is_an_error_of_the_block(tmp_path: Path) -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as taken,
         pytest.raises(TransportError, match="another program listens"),
@@ -113,11 +112,11 @@ def test_a_port_that_is_taken_is_an_error_of_the_block(tmp_path: Path) -> None:
         pytest.fail("it listens on a taken port")
 
 
-def test_the_vendors_usual_port_is_taken_on_request_alone() -> None:
+def test_vendors_usual_port_is_taken_on_request_alone() -> None:
     assert (Tiny().port, Tiny(**Tiny.usual).port) == (0, 45997)
 
 
-def test_settings_without_sense_are_refused_before_it_runs() -> None:
+def test_invalid_settings_are_refused_before_the_start() -> None:
     with pytest.raises(ConfigError, match="drifft"):
         Tiny(drifft={}).check()
     with pytest.raises(ConfigError, match="no fault 'crush'"):
@@ -126,23 +125,23 @@ def test_settings_without_sense_are_refused_before_it_runs() -> None:
         AsylumEmulator(feedback={"mode": "frequency-shift", "setpoint": -20.0}).check()
 
 
-def test_an_emulator_has_a_name_or_is_one_of_the_users() -> None:
-    assert registry.emulator(f"{Tiny.__module__}.Tiny") is Tiny
+def test_emulator_is_found_by_short_name_or_by_module() -> None:
+    assert find_emulator(f"{Tiny.__module__}.Tiny") is Tiny
     with pytest.raises(ConfigError, match="there is no emulator 'veeco'"):
-        registry.emulator("veeco")
+        find_emulator("veeco")
     with pytest.raises(ConfigError, match="is not an emulator"):
-        registry.emulator("pathlib.Path")
+        find_emulator("pathlib.Path")
 
 
-@pytest.mark.parametrize("name", registry.names())
-def test_those_of_afspm_say_what_they_are(name: str) -> None:
-    found = registry.emulator(name)
+@pytest.mark.parametrize("name", emulator_names())
+def test_emulators_of_afspm_declare_their_vendor(name: str) -> None:
+    found = find_emulator(name)
     assert issubclass(found, Emulator)
     assert found.vendor
     assert all(found.fault_kinds.values())
 
 
-def test_an_error_that_nobody_foresaw_ends_what_goes_on_and_not_the_emulator(
+def test_unexpected_error_ends_the_activity_and_not_the_emulator(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     class Clumsy(Tiny):

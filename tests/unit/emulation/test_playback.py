@@ -1,4 +1,4 @@
-"""A trace played back to a client whose connections take another time than they took."""
+"""A trace played back to a client whose connections have another timing."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ def look(connection: int, asked: bytes, after: int, lost: str = "") -> TracedExc
     return TracedExchange(connection, "tcp", "", asked, b"" if lost else asked.upper(), after, lost)
 
 
-def test_a_client_that_looks_less_often_keeps_no_other_connection_waiting() -> None:
-    """The second waits for the end of the scan, and is told of it after the last look of the first."""
+def test_client_that_reads_less_often_delays_no_other_connection() -> None:
+    # the second connection waits for the end of the scan, which follows the last read of the first
     played = Playback(
         [
             look(0, b"first", 0),
@@ -29,8 +29,8 @@ def test_a_client_that_looks_less_often_keeps_no_other_connection_waiting() -> N
     assert played.ask(one, b"last") == PlayedAnswer(5, b"LAST")
 
 
-def test_what_was_under_way_when_the_recording_ended_is_not_lost_again() -> None:
-    """It would be far too early for a client that has yet to ask for what is left."""
+def test_exchange_unfinished_at_the_end_of_the_recording_is_not_cut() -> None:
+    # too early for a client that has yet to send its remaining requests
     played = Playback([look(0, b"first", 0), look(0, b"state", 1), look(1, b"end", 2, lost="closed")])
     one, other = played.connect(), played.connect()
     assert played.ask(one, b"state") == PlayedAnswer(2, b"STATE")
@@ -38,7 +38,7 @@ def test_what_was_under_way_when_the_recording_ended_is_not_lost_again() -> None
     assert played.ask(one, b"first") == PlayedAnswer(1, b"FIRST")
 
 
-def test_what_the_controller_did_not_answer_is_lost_again() -> None:
+def test_unanswered_question_is_unanswered_again() -> None:
     played = Playback([look(0, b"first", 0, lost="closed"), look(1, b"first", 1)])
     assert played.ask(played.connect(), b"first") == PlayedAnswer(1, None)
     assert played.ask(played.connect(), b"first") == PlayedAnswer(2, b"FIRST")

@@ -11,8 +11,8 @@ from afspm.simulation.emulation.replay import TraceReplay
 from afspm.translator.trace import TCP, Trace, TracedConnection, TraceHeader
 
 
-def test_who_waits_for_what_another_one_is_told_is_answered_right_after_it(tmp_path: Path) -> None:
-    """The second connection is told of the end of a scan between two looks of the first."""
+def test_answer_that_depends_on_another_connection_follows_it_directly(tmp_path: Path) -> None:
+    # the end of the scan reaches the second connection between two reads of the first
     replay = TraceReplay(trace=str(recorded(tmp_path / "trace.jsonl")))
     with replay.running(tmp_path / "controller") as address, ExitStack() as stack:
         host, _, port = address.partition(":")

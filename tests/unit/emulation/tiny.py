@@ -40,7 +40,7 @@ class Tiny(Emulator):
     def _answer(self, asked: str) -> None:
         now_s = self.clock.now_s()
         if self.faults.strikes("crash", now_s):
-            raise Crashed("as it was told to")
+            raise Crashed("on request")
         if self.faults.strikes("no-reply", now_s):
             return
         if asked == "scan":
@@ -63,7 +63,7 @@ class Tiny(Emulator):
 
 
 def ask(address: str, *lines: str) -> list[str]:
-    """One client's lines, each after the answer to the last; an answer that never comes is empty."""
+    """Send lines, each after the answer to the previous one; a missing answer is empty."""
     host, port = address.rsplit(":", 1)
     answers = []
     with socket.create_connection((host, int(port)), timeout=10.0) as client:

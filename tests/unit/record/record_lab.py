@@ -30,7 +30,7 @@ Given = tuple[Packet, str]
 
 
 class Night:
-    """Makes packets, one after the other, 1 ms apart."""
+    """Creates packets, one after the other, 1 ms apart."""
 
     def __init__(self) -> None:
         self.now_ns = START_NS
@@ -58,7 +58,7 @@ class Night:
         return [self.packet(scan, f"Scan2d_1000.0_{scan.channel}") for scan in made]
 
     def scan_in_files(self, number: int, channels: tuple[str, ...] = ("Topo", "Current", "Phase")) -> list[Given]:
-        """As controllers give it that write a file for each channel."""
+        """Return the channels of a scan, as from a controller that writes a file for each channel."""
         time_ns = self.now_ns
         values = self.random.normal(size=(len(channels), 6, 8))
         made = [
@@ -77,12 +77,12 @@ class Night:
         return self.packet(spectrum, "Spec1d_IV")
 
     def whole_scan(self, number: int) -> list[Given]:
-        """From its beginning to its end."""
+        """Return the packets of a scan from start to end."""
         scanning = self.state(ScopeState.SCANNING)
         return [scanning, *self.scans(number), self.state(ScopeState.FREE)]
 
     def registered_scan(self, number: int, outcome: RegistrationOutcome, sd_m: float) -> list[Given]:
-        """As a Drift Compensated Scheduler publishes it: the mapping comes just before."""
+        """Return a scan with its mapping just before it, as a Drift Compensated Scheduler publishes them."""
         scanning = self.state(ScopeState.SCANNING)
         message = wire.message_type("DriftMapping")(
             matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[sd_m**2, 0, 0, sd_m**2], outcome=int(outcome),
@@ -93,7 +93,7 @@ class Night:
 
 
 def same(recorded: list[Packet], given: list[Given]) -> bool:
-    """Whether these are the packets that were given, bit by bit."""
+    """Return whether the packets agree with the given ones, bit by bit."""
     wanted = [packet for packet, _ in given]
     return [(p.envelope, p.time_ns, bytes(p.payload)) for p in recorded] == [
         (p.envelope, p.time_ns, bytes(p.payload)) for p in wanted

@@ -1,4 +1,4 @@
-"""All runs under a folder: listed, searched, and read anew only where something has changed."""
+"""The catalogue of all runs under a folder: listed, searched, and read again only after a change."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def names(root: Path, *words: str) -> list[str]:
     return sorted(run.folder for run in find_runs(root, words))
 
 
-def test_every_run_is_there_with_what_it_was(root: Path) -> None:
+def test_catalogue_lists_every_run_with_its_facts(root: Path) -> None:
     gold, mica = sorted(find_runs(root), key=lambda run: run.folder)
     assert (gold.folder, gold.scans, gold.metadata["sample"], gold.microscope) == (
         "gold-1",
@@ -70,17 +70,17 @@ def test_every_run_is_there_with_what_it_was(root: Path) -> None:
         (["silicon"], []),
     ],
 )
-def test_words_narrow_it_down(root: Path, words: list[str], found: list[str]) -> None:
+def test_words_select_runs(root: Path, words: list[str], found: list[str]) -> None:
     assert names(root, *words) == found
 
 
-def test_days_narrow_it_down(root: Path) -> None:
+def test_days_select_runs(root: Path) -> None:
     day, next_day = date(2026, 3, 14), date(2026, 3, 15)
     assert len(find_runs(root, since=day, until=day)) == 2
     assert find_runs(root, since=next_day) == find_runs(root, until=date(2026, 3, 13)) == []
 
 
-def test_only_what_has_changed_is_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_changed_runs_are_read_again(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     find_runs(root)
     read: list[str] = []
     summary = catalogue._summary
@@ -92,7 +92,7 @@ def test_only_what_has_changed_is_read_again(root: Path, monkeypatch: pytest.Mon
     assert read == ["gold-1"]
 
 
-def test_an_index_that_is_damaged_or_of_another_version_is_made_anew(root: Path) -> None:
+def test_damaged_or_outdated_index_is_rebuilt(root: Path) -> None:
     (root / INDEX_FILE).write_bytes(b"no database" * 1000)
     assert len(find_runs(root)) == 2
     with sqlite3.connect(root / INDEX_FILE) as index:
@@ -101,7 +101,7 @@ def test_an_index_that_is_damaged_or_of_another_version_is_made_anew(root: Path)
     assert len(find_runs(root)) == 2
 
 
-def test_a_run_that_is_gone_is_forgotten_and_one_that_is_damaged_named(root: Path) -> None:
+def test_deleted_run_is_dropped_and_a_damaged_one_is_named(root: Path) -> None:
     find_runs(root)
     (root / "gold-1").rename(root.parent / "elsewhere")
     (root / "spring" / "mica-1" / "journal.sqlite").write_bytes(b"x" * 5000)
@@ -110,19 +110,19 @@ def test_a_run_that_is_gone_is_forgotten_and_one_that_is_damaged_named(root: Pat
     assert "damaged" in run.damage
 
 
-def test_where_no_index_can_be_written_all_is_found_the_same(root: Path) -> None:
+def test_runs_are_found_without_a_writable_index(root: Path) -> None:
     (root / INDEX_FILE).mkdir()
     assert len(find_runs(root)) == 2
 
 
-def test_what_makes_no_sense_is_refused(root: Path) -> None:
+def test_invalid_search_is_refused(root: Path) -> None:
     with pytest.raises(InvalidValue, match="no 'colour' to look in"):
         find_runs(root, ["colour:red"])
     with pytest.raises(FileError, match="no such folder"):
         find_runs(root / "nowhere")
 
 
-def test_the_page_has_a_card_with_pictures_for_each_run(root: Path) -> None:
+def test_page_has_a_card_with_pictures_for_each_run(root: Path) -> None:
     (root / "gold-1" / "report.html").write_text("", encoding="utf-8")
     done = CliRunner().invoke(app, ["runs", "--in", str(root), "--page"])
     assert done.exit_code == 0
@@ -134,7 +134,7 @@ def test_the_page_has_a_card_with_pictures_for_each_run(root: Path) -> None:
     assert "Au(111) on mica" in text
 
 
-def test_the_terminal_lists_them_without_columns_of_which_nothing_is_known(root: Path) -> None:
+def test_terminal_omits_empty_columns(root: Path) -> None:
     shown = CliRunner().invoke(app, ["runs", "--in", str(root), "person:a."]).stdout
     assert "gold-1" in shown
     assert "problems" not in shown
@@ -142,7 +142,7 @@ def test_the_terminal_lists_them_without_columns_of_which_nothing_is_known(root:
     assert {run["folder"] for run in told} == {"gold-1", "spring/mica-1"}
 
 
-def test_index_that_is_not_ours_is_made_anew(root: Path) -> None:
+def test_foreign_index_is_rebuilt(root: Path) -> None:
     find_runs(root)
     with closing(sqlite3.connect(root / INDEX_FILE)) as index, index:
         index.execute("DROP TABLE runs")

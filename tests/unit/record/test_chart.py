@@ -12,7 +12,7 @@ from afspm.record.drawing.chart import Axis, Band, Curve, chart
 BIAS = np.linspace(-1.0, 1.0, 21)
 
 
-def test_a_chart_has_ticks_units_and_its_curves_within_the_frame() -> None:
+def test_chart_has_ticks_units_and_its_curves_within_the_frame() -> None:
     current = 3e-9 * BIAS
     drawn = chart(Axis.over("Bias", "V", BIAS), Axis.over("<I>", "A", current), [Curve(BIAS, current)])
     assert ElementTree.fromstring(drawn).tag == "svg"
@@ -27,7 +27,7 @@ def test_a_chart_has_ticks_units_and_its_curves_within_the_frame() -> None:
     assert y.min() >= 8.0
 
 
-def test_what_was_not_measured_is_left_out_and_one_value_has_an_axis() -> None:
+def test_unmeasured_points_are_left_out_and_a_single_value_has_an_axis() -> None:
     values = np.array([1.0, np.nan, 1.0])
     axis = Axis.over("a", "", values)
     assert axis.low < 1.0 < axis.high

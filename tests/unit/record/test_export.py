@@ -1,4 +1,4 @@
-"""Exports hold what was measured, as readers of others see it."""
+"""Exports contain the measurements, as other programs read them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def run(night: Night, store: RecordStore, tmp_path: Path) -> Run:
 
 
 def parsed(data: bytes) -> dict[str, Any]:
-    """A .gwy file as nested dicts, by the description of the format alone."""
+    """Return a .gwy file as nested dicts, parsed by the description of the format alone."""
     assert data[:4] == b"GWYP"
     (name, content), end = _object(data, 4)
     assert (name, end) == ("GwyContainer", len(data))
@@ -97,7 +97,7 @@ def test_gwyddion_gets_every_channel_with_place_and_units(run: Run, tmp_path: Pa
         assert content[f"/{number}/meta"][1]["in_control"] == "series"
 
 
-def test_an_independent_reader_of_gwyddion_files_reads_them(run: Run, tmp_path: Path) -> None:
+def test_independent_reader_of_gwyddion_files_reads_them(run: Run, tmp_path: Path) -> None:
     import gwyfile.util  # a reader by others
 
     (file,) = export(run, "gwy", tmp_path / "out", "2")
@@ -106,7 +106,7 @@ def test_an_independent_reader_of_gwyddion_files_reads_them(run: Run, tmp_path: 
     assert np.array_equal(channels["Height"].data[::-1], run.scan(1)["Height"].values)
 
 
-def test_what_was_not_measured_is_masked_for_gwyddion(run: Run, tmp_path: Path) -> None:
+def test_unmeasured_pixels_are_masked_for_gwyddion(run: Run, tmp_path: Path) -> None:
     (file,) = export(run, "gwy", tmp_path / "out", "3")
     content = parsed(file.read_bytes())
     mask = content["/0/mask"][1]["data"].reshape(6, 8)[::-1]
@@ -123,7 +123,7 @@ def test_gwyddion_gets_the_curves_of_a_spectrum(run: Run, tmp_path: Path) -> Non
 
 
 def spectra_of_a_grid(night: Night, store: RecordStore, folder: Path) -> Run:
-    """Two rows of three spectra; the current at a bias of 1 V is 1, 2 … 6 A."""
+    """Record two rows of three spectra; the current at a bias of 1 V is 1, 2 … 6 A."""
     bias = np.linspace(-1.0, 2.0, 31)
     for number in range(6):
         place = (number % 3 * 2e-9, number // 3 * 3e-9)
@@ -166,7 +166,7 @@ COLUMNS = [("Current", "Current Retrace"), ("I [fwd]", "I [bwd]"), ("Force",), (
 
 @pytest.mark.parametrize("columns", COLUMNS)
 @pytest.mark.parametrize("swept", [ONE_WAY, THERE_AND_BACK])
-def test_the_file_of_a_grid_is_read_as_the_spectra_of_the_run(
+def test_file_of_a_grid_is_read_as_the_spectra_of_the_run(
     night: Night, store: RecordStore, tmp_path: Path, columns: tuple[str, ...], swept: np.ndarray
 ) -> None:
     for number in (0, 1, 2, 3, 5):  # of two rows of three that are turned, one is missing
@@ -187,7 +187,7 @@ def test_the_file_of_a_grid_is_read_as_the_spectra_of_the_run(
         assert one.values == pytest.approx(own.values)
 
 
-def test_a_spectrum_that_is_damaged_is_missing_in_the_grid(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_damaged_spectrum_is_missing_in_the_grid(night: Night, store: RecordStore, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     run = spectra_of_a_grid(night, store, tmp_path)
     (tmp_path / run.spectra[4].file).write_bytes(b"no file")
@@ -199,7 +199,7 @@ def test_a_spectrum_that_is_damaged_is_missing_in_the_grid(night: Night, store: 
         assert file["entry/forward/current"][1, 2, 20] == pytest.approx(6.0)
 
 
-def test_a_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
     spectra = spectra_of_a_grid(night, store, tmp_path).spectra
     current = spectra.map("Current", at=1.0)
     assert current.values == pytest.approx(np.array([[1, 2, 3], [4, 5, 6]]))
@@ -221,7 +221,7 @@ def test_a_map_of_a_grid_is_a_scan(night: Night, store: RecordStore, tmp_path: P
         ({"quantity": "Current", "at": 1.0, "direction": "up"}, "there is forward, backward"),
     ],
 )
-def test_a_map_of_what_was_not_measured_is_refused(
+def test_map_of_an_unknown_quantity_is_refused(
     night: Night, store: RecordStore, tmp_path: Path, asked: dict[str, Any], why: str
 ) -> None:
     spectra = spectra_of_a_grid(night, store, tmp_path).spectra
@@ -271,12 +271,12 @@ def test_scans_are_chosen_by_their_numbers(run: Run, numbers: str, meant: list[i
 
 
 @pytest.mark.parametrize("numbers", ["", "x", "0", "4", "1-9", "2-1", "2-1,3", "1-999999999999999", "1;2"])
-def test_what_is_no_scan_is_refused(run: Run, numbers: str) -> None:
+def test_unknown_scan_is_refused(run: Run, numbers: str) -> None:
     with pytest.raises(InvalidValue):
         chosen(list(run.scans), numbers)
 
 
-def test_an_unknown_format_and_an_impossible_folder_are_refused(run: Run, tmp_path: Path) -> None:
+def test_unknown_format_and_an_impossible_folder_are_refused(run: Run, tmp_path: Path) -> None:
     with pytest.raises(InvalidValue, match="no format 'doc'"):
         list(export(run, "doc", tmp_path))
     (tmp_path / "file").write_text("")
@@ -285,7 +285,7 @@ def test_an_unknown_format_and_an_impossible_folder_are_refused(run: Run, tmp_pa
 
 
 @pytest.mark.parametrize("to", ["gwy", "nc", "png"])
-def test_a_damaged_file_costs_what_is_in_it_alone(run: Run, tmp_path: Path, to: str) -> None:
+def test_damaged_file_costs_its_own_measurement_only(run: Run, tmp_path: Path, to: str) -> None:
     if to == "png":
         pytest.importorskip("matplotlib")
     whole = len(list(export(run, to, tmp_path / "whole")))
@@ -299,7 +299,7 @@ def test_a_damaged_file_costs_what_is_in_it_alone(run: Run, tmp_path: Path, to: 
         list(export(run, to, tmp_path / "out"))
 
 
-def test_packets_of_a_damaged_file_are_left_out_if_wanted(run: Run, tmp_path: Path) -> None:
+def test_packets_of_a_damaged_file_are_left_out_on_request(run: Run, tmp_path: Path) -> None:
     (tmp_path / run.scans[1].file).unlink()
     told: list[str] = []
     packets = list(run.packets(tell=told.append))
@@ -309,7 +309,7 @@ def test_packets_of_a_damaged_file_are_left_out_if_wanted(run: Run, tmp_path: Pa
         list(run.packets())
 
 
-def test_what_was_not_seen_is_told_and_left_out(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_scan_without_lines_is_reported_and_left_out(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])
     told: list[str] = []
     assert list(export(afspm.open_run(tmp_path), "gwy", tmp_path / "out", tell=told.append)) == []

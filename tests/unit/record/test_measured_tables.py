@@ -17,15 +17,13 @@ from afspm.record.store import RecordStore
 
 
 def start(night: Night, key: str, action: str = names.START_SCAN, response: int = ControlResponse.SUCCESS) -> Given:
-    """An entry as the scheduler writes it: the answer comes later than the request was sent."""
+    """Return an entry in the scheduler's form: the answer comes later than the request."""
     night.now_ns += 1_000_000
     entry = JournalEntry(night.now_ns, "request", "survey", action, int(response), sent_ns=night.now_ns, key=key)
     return night.packet(JournalEntries((entry,)))
 
 
-def test_a_scan_is_found_by_the_key_that_it_was_asked_for_with(
-    night: Night, store: RecordStore, tmp_path: Path
-) -> None:
+def test_scan_is_found_by_its_key(night: Night, store: RecordStore, tmp_path: Path) -> None:
     first, tile = start(night, "tile-1"), night.whole_scan(1)
     store.take([*tile, first])  # entries are published some at a time: perhaps after the scan
     store.take(night.whole_scan(2))  # begun at the controller, by hand
@@ -44,13 +42,13 @@ def test_a_scan_is_found_by_the_key_that_it_was_asked_for_with(
         run.scan("tile-9")
 
 
-def test_a_record_without_keys_says_so(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_record_without_keys_is_named_in_the_error(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     with pytest.raises(KeyError, match="nothing was measured under a key"):
         afspm.open_run(tmp_path).scans["a"]
 
 
-def test_a_table_shows_itself_in_a_notebook(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_table_shows_itself_in_a_notebook(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     store.take([start(night, "<b>"), *night.whole_scan(2)])
     shown = afspm.open_run(tmp_path).scans._repr_html_()
@@ -62,7 +60,7 @@ def test_a_table_shows_itself_in_a_notebook(night: Night, store: RecordStore, tm
     assert "2 rows" in shown
 
 
-def test_a_long_table_shows_its_ends(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_long_table_shows_its_ends(night: Night, store: RecordStore, tmp_path: Path) -> None:
     for number in range(1, 64):
         store.take(night.whole_scan(number))
     shown = afspm.open_run(tmp_path).scans._repr_html_()
@@ -70,7 +68,7 @@ def test_a_long_table_shows_its_ends(night: Night, store: RecordStore, tmp_path:
     assert "63 rows" in shown
 
 
-def test_a_table_becomes_a_data_frame(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_table_becomes_a_data_frame(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([*night.whole_scan(1), *night.whole_scan(2)])
     frame = afspm.open_run(tmp_path).scans.to_pandas()
     assert list(frame.number) == [1, 2]
@@ -88,7 +86,7 @@ def test_spectra_of_one_place_are_repeats(night: Night, store: RecordStore, tmp_
     assert np.isfinite(stacked.Current.values).all()
 
 
-def test_an_export_has_the_key_of_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_export_has_the_key_of_a_scan(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([start(night, "tile-1"), *night.whole_scan(1), *night.whole_scan(2)])
     with afspm.open_run(tmp_path) as run:
         first, second = (path for path in export(run, "h5", tmp_path / "h5"))

@@ -34,7 +34,7 @@ def noted(night: Night, store: RecordStore, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_notes_come_in_the_order_of_their_moments_with_the_number_of_the_scan(noted: Path) -> None:
+def test_notes_are_ordered_by_their_moments_and_name_their_scan(noted: Path) -> None:
     with afspm.open_run(noted) as run:
         assert [(note.who, note.text, note.scan) for note in run.notes] == [
             ("survey", "the door slammed", None),
@@ -45,7 +45,7 @@ def test_notes_come_in_the_order_of_their_moments_with_the_number_of_the_scan(no
         assert [note.text for note in run.overview().notes] == [HOSTILE, "the door slammed"]
 
 
-def test_the_journal_has_each_note_once(noted: Path) -> None:
+def test_journal_has_each_note_once(noted: Path) -> None:
     with afspm.open_run(noted) as run:
         entries = [entry for entry in run.journal if entry.kind == "note"]
         assert entries[1] == JournalEntry(run.scans[1].time_ns, "note", "terminal:ada", HOSTILE)
@@ -70,7 +70,7 @@ def test_exports_have_the_notes(noted: Path, tmp_path: Path) -> None:
         assert [row["text"] for row in csv.DictReader(table)] == ["the door slammed", HOSTILE]
 
 
-def test_the_report_tells_of_the_notes_and_runs_none_of_them(noted: Path) -> None:
+def test_report_shows_notes_with_escaped_markup(noted: Path) -> None:
     html = write(noted).read_text(encoding="utf-8")
     assert "<script>" not in html
     assert "&lt;script&gt;alert(&quot;x&quot;)" in html
@@ -78,7 +78,7 @@ def test_the_report_tells_of_the_notes_and_runs_none_of_them(noted: Path) -> Non
     assert 'class="marked"' in html
 
 
-def test_after_the_end_a_note_is_appended_in_the_same_form(noted: Path, store: RecordStore) -> None:
+def test_note_after_the_end_is_appended_in_the_published_form(noted: Path, store: RecordStore) -> None:
     store.settle()
     store.close()
     with afspm.open_run(noted) as run:
@@ -96,7 +96,7 @@ def test_after_the_end_a_note_is_appended_in_the_same_form(noted: Path, store: R
     assert not list(noted.glob("journal.sqlite-*"))
 
 
-def test_while_a_run_goes_on_its_record_is_left_alone(noted: Path) -> None:
+def test_running_record_refuses_appended_notes(noted: Path) -> None:
     (noted / STATE_DIR).mkdir()
     with lock_run(noted), pytest.raises(FileError, match="still going on"):
         append_note(noted, "terminal:ada", "double tip", 7)
@@ -105,11 +105,11 @@ def test_while_a_run_goes_on_its_record_is_left_alone(noted: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "  \n", "x" * 1001, "\x1b[2J", "a\0b", "\ud800"])
-def test_a_note_without_text_too_long_or_with_control_characters_is_refused(text: str) -> None:
+def test_note_without_text_too_long_or_with_control_characters_is_refused(text: str) -> None:
     with pytest.raises(InvalidValue):
         Note(1, "ada", text)
 
 
-def test_there_is_no_scan_with_another_number(noted: Path) -> None:
+def test_unknown_scan_number_is_refused(noted: Path) -> None:
     with afspm.open_run(noted) as run, pytest.raises(InvalidValue, match="no scan 3"):
         run.numbered(3)

@@ -1,4 +1,4 @@
-"""What NXspm and NXsts require is in the files of a record; `make test-nexus` asks NeXus' own validator."""
+"""Files of a record have the fields that NXspm and NXsts require; `make test-nexus` runs NeXus' own validator."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def said(entry: Any, *paths: str) -> list[Any]:
     return [value.decode() if isinstance(value, bytes) else value for value in values]
 
 
-def test_a_scan_has_what_nxspm_requires() -> None:
+def test_scan_file_has_all_fields_required_by_nxspm() -> None:
     entry = opened(encode_scan([SCAN], KNOWN))
     assert said(entry, "definition", "experiment_technique") == ["NXspm", "STM"]
     assert entry["definition"].attrs["version"]
@@ -49,20 +49,20 @@ def test_a_scan_has_what_nxspm_requires() -> None:
     assert set(region.attrs) == {"NX_class"}
 
 
-def test_a_file_says_of_what_it_is_and_who_measured_it() -> None:
+def test_file_names_sample_and_user() -> None:
     entry = opened(encode_scan([SCAN], KNOWN))
     assert said(entry, "sample/name", "user/name", "user/ORCID", "collection_identifier") == [
         "Au(111)", "A. Student", "https://orcid.org/0000-0002-1825-0097", "steps",
     ]  # fmt: skip
 
 
-def test_what_is_not_known_is_left_out() -> None:
+def test_unknown_facts_are_left_out() -> None:
     entry = opened(encode_scan([SCAN], replace(KNOWN, facts={})))
     assert {"experiment_technique", "user", "collection_identifier"} & set(entry) == set()
     assert {"hardware", "software"} & set(entry["experiment_instrument"]) == set()
 
 
-def test_a_spectrum_over_the_bias_of_a_tunnelling_microscope_follows_nxsts() -> None:
+def test_spectrum_over_the_bias_of_a_tunnelling_microscope_follows_nxsts() -> None:
     entry = opened(encode_spectrum(SPECTRUM, KNOWN))
     assert said(entry, "definition", "experiment_technique", "scan_mode") == ["NXsts", "STS", "constant height"]
     sweep = entry["experiment_instrument/bias_spectroscopy_environment/bias_spectroscopy/bias_sweep"]
@@ -78,7 +78,7 @@ def test_a_spectrum_over_the_bias_of_a_tunnelling_microscope_follows_nxsts() -> 
     [(SPECTRUM, "AFM"), (replace(SPECTRUM, names=("Z", "Force"), units=("m", "N"), kind="force"), "STM")],
     ids=["conductive AFM", "over z"],
 )
-def test_any_other_spectrum_is_a_scan_of_one_point(spectrum: Spectrum, technique: str) -> None:
+def test_other_spectrum_follows_nxspm_as_a_scan_of_one_point(spectrum: Spectrum, technique: str) -> None:
     about = replace(KNOWN, facts={"metadata": {**METADATA, "technique": technique}})
     entry = opened(encode_spectrum(spectrum, about))
     assert said(entry, "definition", "experiment_technique") == ["NXspm", technique]

@@ -1,4 +1,4 @@
-"""Runs that go on, that were killed, that are damaged or are none, as open_run sees them."""
+"""`open_run` on running, killed and damaged runs, and on folders without a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
 
-def test_a_run_that_goes_on_is_read_as_far_as_it_is(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_running_record_is_read_up_to_now(night: Night, store: RecordStore, tmp_path: Path) -> None:
     run = afspm.open_run(tmp_path)
     assert len(run.scans) == 0
     store.take(night.whole_scan(1))
@@ -32,7 +32,7 @@ def test_a_run_that_goes_on_is_read_as_far_as_it_is(night: Night, store: RecordS
     assert run.scan(-1).first.filename == "scan-0001.nc"
 
 
-def test_a_killed_run_is_read_from_what_it_left(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_killed_run_is_readable(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     left = tmp_path / "left"
     left.mkdir()
@@ -41,7 +41,7 @@ def test_a_killed_run_is_read_from_what_it_left(night: Night, store: RecordStore
     assert len(afspm.open_run(left).scans) == 1
 
 
-def test_the_copy_of_a_journal_on_a_disk_that_is_only_read_goes_when_it_is_closed_or_forgotten(
+def test_copy_of_a_read_only_journal_is_removed_when_closed_or_collected(
     night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     store.take(night.whole_scan(1))
@@ -84,9 +84,7 @@ def test_reading_changes_nothing(night: Night, tmp_path: Path) -> None:
     assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.suffix in (".sqlite", ".h5")} == before
 
 
-def test_a_run_that_has_ended_is_one_file_and_reading_makes_no_other(
-    night: Night, store: RecordStore, tmp_path: Path
-) -> None:
+def test_ended_journal_is_one_file_and_stays_one_when_read(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     store.settle()
     store.close()
@@ -99,7 +97,7 @@ def test_a_run_that_has_ended_is_one_file_and_reading_makes_no_other(
     again.close()
 
 
-def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_reader_is_not_disturbed_by_the_end_of_the_run(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     with afspm.open_run(tmp_path) as run:
         rows = run._journal.execute("SELECT * FROM packets")
@@ -109,7 +107,7 @@ def test_who_reads_while_it_ends_is_not_disturbed(night: Night, store: RecordSto
         assert len(run.scans) == 1
 
 
-def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -> None:
+def test_folder_of_runs_opens_the_newest_run(night: Night, tmp_path: Path) -> None:
     (tmp_path / "night-2").mkdir()
     RecordStore(tmp_path / "night-2", ABOUT).close()
     (tmp_path / "latest.txt").write_text("night-2\n")
@@ -123,7 +121,7 @@ def test_the_newest_of_a_folder_of_runs_is_meant(night: Night, tmp_path: Path) -
         (r"\\nas\runs\journal.sqlite", "file:////nas/runs/journal.sqlite?mode=ro"),
     ],
 )
-def test_a_record_on_a_network_share_is_named_so_that_it_is_opened(path: str, said: str, tmp_path: Path) -> None:
+def test_record_on_a_network_share_has_a_valid_uri(path: str, said: str, tmp_path: Path) -> None:
     assert read_only(PureWindowsPath(path)) == said
     if sys.platform == "win32":
         return  # there the form with four slashes is a share, which this computer may not have
@@ -134,14 +132,14 @@ def test_a_record_on_a_network_share_is_named_so_that_it_is_opened(path: str, sa
         assert opened.execute("SELECT * FROM about").fetchall() == []
 
 
-def test_a_folder_without_a_record_is_named(tmp_path: Path) -> None:
+def test_folder_without_a_record_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no record") as caught:
         afspm.open_run(tmp_path)
     assert str(tmp_path) in str(caught.value)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a database at all" * 100, b"SQLite format 3\0" + bytes(500)])
-def test_a_damaged_journal_is_named(tmp_path: Path, content: bytes) -> None:
+def test_damaged_journal_is_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / JOURNAL_FILE).write_bytes(content)
     with pytest.raises(FileError) as caught:
         afspm.open_run(tmp_path)
@@ -155,7 +153,7 @@ class _nothing:  # noqa: N801 - an empty file is a new journal to whoever writes
     def __exit__(self, *_: object) -> None: ...
 
 
-def test_a_journal_whose_tables_are_named_by_no_text_is_damaged_to_readers_and_writers(tmp_path: Path) -> None:
+def test_journal_with_table_names_that_are_no_text_is_damaged(tmp_path: Path) -> None:
     RecordStore(tmp_path, ABOUT).close()
     data = (tmp_path / JOURNAL_FILE).read_bytes()
     (tmp_path / JOURNAL_FILE).write_bytes(data.replace(b"CREATE TABLE packets", b"CREATE TABL\x98 packets"))
@@ -173,7 +171,7 @@ READINGS: dict[str, Callable[[Run], object]] = {
 
 
 @pytest.mark.parametrize("reading", READINGS.values(), ids=READINGS)
-def test_a_journal_that_is_damaged_inside_is_named_when_that_is_read(
+def test_journal_damaged_inside_is_named_when_read(
     night: Night, tmp_path: Path, reading: Callable[[Run], object]
 ) -> None:
     store = RecordStore(tmp_path, ABOUT)
@@ -192,7 +190,7 @@ def _open_and_read(folder: Path, reading: Callable[[Run], object]) -> None:
         reading(run)
 
 
-def test_the_journal_of_a_version_to_come_is_refused(tmp_path: Path) -> None:
+def test_journal_of_a_later_version_is_refused(tmp_path: Path) -> None:
     RecordStore(tmp_path, ABOUT).close()
     with sqlite3.connect(tmp_path / JOURNAL_FILE) as connection:
         connection.execute("UPDATE about SET value = 'afspm record 2' WHERE name = 'format'")
@@ -201,7 +199,7 @@ def test_the_journal_of_a_version_to_come_is_refused(tmp_path: Path) -> None:
         afspm.open_run(tmp_path)
 
 
-def test_a_database_of_others_is_refused(tmp_path: Path) -> None:
+def test_foreign_database_is_refused(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / JOURNAL_FILE) as connection:
         connection.execute("CREATE TABLE cats (name TEXT)")
     connection.close()
@@ -210,7 +208,7 @@ def test_a_database_of_others_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"\x89HDF\r\n\x1a\n" + bytes(100)])
-def test_a_damaged_or_missing_file_of_a_scan_is_named(
+def test_damaged_or_missing_file_of_a_scan_is_named(
     night: Night, store: RecordStore, tmp_path: Path, content: bytes | None
 ) -> None:
     store.take([*night.whole_scan(1), *night.whole_scan(2)])
@@ -265,7 +263,7 @@ def test_tables_become_arrays_and_datasets(night: Night, store: RecordStore, tmp
     assert [row.number for row in run.scans.where(lambda row: row.interrupted)] == [2]
 
 
-def test_the_overview_comes_without_reading_files(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_overview_reads_no_files(night: Night, store: RecordStore, tmp_path: Path) -> None:
     curve = Spectrum((1e-9, 2e-9), "IV", ("Bias", "Current"), ("V", "A"), np.ones((5, 2)), 3)
     store.take([night.control("series", (4,)), *night.whole_scan(1), night.packet(curve, "Spec1d_IV")])
     run = afspm.open_run(tmp_path)
@@ -277,7 +275,7 @@ def test_the_overview_comes_without_reading_files(night: Night, store: RecordSto
     assert [row.name for row in run.problems] == ["thermal-drift"]
 
 
-def test_scans_say_how_their_position_is_known_and_how_well(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_scan_rows_have_registration_and_uncertainty(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take(night.whole_scan(1))
     store.take(night.registered_scan(2, RegistrationOutcome.REGISTERED, 1e-9))
     store.take(night.registered_scan(3, RegistrationOutcome.FAILED, 30e-9))
@@ -296,7 +294,7 @@ def test_scans_say_how_their_position_is_known_and_how_well(night: Night, store:
     assert run.drift.columns()["outcome"] == ["registered", "failed"]
 
 
-def test_the_first_thermal_drift_is_not_among_the_problems(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_first_thermal_drift_is_not_among_the_problems(night: Night, store: RecordStore, tmp_path: Path) -> None:
     flagged = night.control("rescanner", (int(Problem.THERMAL_DRIFT),))
     asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
     asked.timestamp.FromNanoseconds(night.now_ns)
@@ -336,7 +334,7 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) SELECT i 
 def test_journal_with_anything_but_tables_is_refused(
     night: Night, store: RecordStore, tmp_path: Path, statement: str
 ) -> None:
-    """One of somebody else could hold a view that never ends, and `afspm runs` with it."""
+    # a foreign journal could contain a view that never ends, which would block `afspm runs`
     store.take(night.whole_scan(1))
     store.close()
     with closing(sqlite3.connect(tmp_path / JOURNAL_FILE)) as journal, journal:

@@ -1,4 +1,4 @@
-"""What an experiment has come to, from its packets."""
+"""The overview of an experiment, reduced from its packets."""
 
 from __future__ import annotations
 
@@ -86,52 +86,52 @@ def test_newest_of_each_state_is_kept() -> None:
     night = seen(*NIGHT)
     assert night.status == status(ScopeState.FREE)
     assert night.control == control(None, mode=ControlMode.MANUAL)
-    assert night.scan_parameters == model.ScanParameters(REGION, (4, 4))
+    assert night.readings.scan_parameters == model.ScanParameters(REGION, (4, 4))
     assert night.newest_ns == 40 * S
 
 
-def test_control_lies_in_spans_with_its_holder() -> None:
-    spans = [(s.label, s.start_ns // S, s.end_ns and s.end_ns // S) for s in seen(*NIGHT).controls.spans]
+def test_timeline_of_control_names_its_holders() -> None:
+    spans = [(s.label, s.start_ns // S, s.end_ns and s.end_ns // S) for s in seen(*NIGHT).timelines.control.spans]
     assert spans == [("series", 2, 22), ("corrector", 26, 40)]
 
 
-def test_mode_is_a_lane_too_and_the_present_has_no_end() -> None:
-    now = seen(*NIGHT).modes.now
+def test_timeline_of_modes_has_an_open_end() -> None:
+    now = seen(*NIGHT).timelines.mode.now
     assert now is not None
     assert (now.label, now.start_ns, now.end_ns) == ("manual", 40 * S, None)
 
 
-def test_a_problem_is_told_with_who_flagged_it() -> None:
-    (span,) = seen(*NIGHT).problem_timelines[TIP].spans
+def test_problem_span_names_its_flagger() -> None:
+    (span,) = seen(*NIGHT).timelines.problems[TIP].spans
     assert (span.label, span.start_ns, span.end_ns) == ("tip-shape-changed", 22 * S, 35 * S)
     assert span.by == "classifier"
 
 
-def test_a_scan_has_its_beginning_and_who_was_in_control() -> None:
+def test_scan_has_its_start_and_its_holder() -> None:
     whole = seen(*NIGHT).scans[0]
     assert (whole.began_ns, whole.time_ns, whole.holder, whole.interrupted) == (10 * S, 14 * S, "series", False)
 
 
-def test_an_interrupted_scan_is_kept_and_marked_where_lines_came() -> None:
+def test_interrupted_scan_with_lines_is_kept_and_marked() -> None:
     part = seen(*NIGHT).scans[1]
     assert part.interrupted
     assert (part.began_ns, part.time_ns, part.shape, part.holder) == (20 * S, 24 * S, (4, 4), "series")
 
 
-def test_a_scan_without_values_is_told_with_the_shape_that_it_was_taken_with() -> None:
+def test_scan_without_values_has_its_measured_shape() -> None:
     night = Overview()
     night.take("Scan2d", model.Scan(REGION, "Topo", "m", np.empty((0, 0)), 5 * S, pixels=(6, 8)), 6 * S, "Scan2d")
     assert [one.shape for one in night.scans] == [(6, 8)]
 
 
-def test_channels_of_a_scan_are_entries_of_their_own() -> None:
+def test_each_channel_of_a_scan_has_a_summary() -> None:
     night = Overview()
     night.take("Scan2d", scan("Height", 5), 6 * S, "Scan2d_1000.0_Height")
     night.take("Scan2d", scan("Phase", 5), 7 * S, "Scan2d_1000.0_Phase")
     assert [one.channel for one in night.scans] == ["Height", "Phase"]
 
 
-def test_what_was_taken_before_changes_nothing() -> None:
+def test_repeated_packets_do_not_change_the_overview() -> None:
     once, twice = seen(*NIGHT), seen(*NIGHT, *NIGHT)
     for _ in range(2):
         for message, thing, time_s in NIGHT[::3]:
@@ -141,17 +141,17 @@ def test_what_was_taken_before_changes_nothing() -> None:
 
 def facts(night: Overview) -> list[object]:
     lanes = [
-        night.controls,
-        night.modes,
-        night.states,
-        *night.problem_timelines.values(),
-        *night.process_timelines.values(),
+        night.timelines.control,
+        night.timelines.mode,
+        night.timelines.scope_state,
+        *night.timelines.problems.values(),
+        *night.process_history.timelines.values(),
     ]
     told = [night.scans, night.spectra, night.drift, list(night.log), list(night.entries), list(night.refusals)]
     return [*told, night.control, night.status, night.processes, [list(lane.spans) for lane in lanes]]
 
 
-def test_a_refusal_is_kept_with_its_reason() -> None:
+def test_refusal_is_kept_with_its_reason() -> None:
     (refused,) = seen(*NIGHT).refusals
     assert (refused.who, refused.reason) == ("series", "at most 1e-5 m/s")
 
@@ -165,45 +165,47 @@ def test_log_is_bounded() -> None:
     assert night.log[-1].text == f"2 {MOST_LINES - 1}"
 
 
-def test_busy_is_alive_in_the_time_line_but_not_in_the_present() -> None:
+def test_busy_counts_as_alive_in_the_timeline_only() -> None:
     night = seen(
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.ALIVE, 1),)), 1),
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.BUSY, 3),)), 3),
     )
-    assert [span.label for span in night.process_timelines["series"].spans] == ["alive"]
+    assert [span.label for span in night.process_history.timelines["series"].spans] == ["alive"]
     assert night.processes["series"].condition is ProcessCondition.BUSY
 
 
-def test_a_restart_is_told_once_with_how_it_had_ended() -> None:
+def test_restart_is_listed_once_with_its_last_exit() -> None:
     again = process(ProcessCondition.ALIVE, 5, 2, "killed")
     night = seen(
         ("ProcessStates", model.ProcessStates(S, "lab", (process(ProcessCondition.ALIVE, 1),)), 1),
         ("ProcessStates", model.ProcessStates(5 * S, "lab", (again,)), 5),
         ("ProcessStates", model.ProcessStates(7 * S, "lab", (again,)), 7),
     )
-    assert [(one.name, one.starts, one.last_exit) for one in night.restarts] == [("series", 2, "killed")]
+    assert [(one.name, one.starts, one.last_exit) for one in night.process_history.restarts] == [
+        ("series", 2, "killed")
+    ]
 
 
-def test_a_running_scan_tells_how_far_it_is_by_its_lines() -> None:
+def test_progress_of_a_running_scan_follows_its_lines() -> None:
     night = seen(*NIGHT[:5])
     assert night.running is not None
     assert night.running.rows == (2, 4)
     assert night.scan_progress(12 * S) == (0.5, 2 * S)
 
 
-def test_a_running_scan_without_lines_is_compared_with_those_before() -> None:
+def test_progress_of_a_scan_without_lines_follows_earlier_scans() -> None:
     without_lines = [one for one in NIGHT[:8] if one[0] != "ScanLines"]
     assert seen(*without_lines[:4]).scan_progress(12 * S) is None
     assert seen(*without_lines).scan_progress(22 * S) == (0.4, 3 * S)  # the one before took 5 s
 
 
-def test_a_scan_of_other_pixels_is_not_compared_with() -> None:
+def test_progress_ignores_scans_of_other_pixels() -> None:
     wide = ("ScanParameters2d", model.ScanParameters(REGION, (400, 400)), 16)
     without_lines = [*NIGHT[:4], *NIGHT[5:7], wide, NIGHT[7]]
     assert seen(*without_lines).scan_progress(22 * S) is None
 
 
-def test_a_running_scan_is_none_when_it_is_over() -> None:
+def test_running_scan_is_none_after_its_end() -> None:
     assert seen(*NIGHT).running is None
 
 
@@ -229,7 +231,7 @@ def mapping(at_s: int, outcome: RegistrationOutcome, failures: int = 0) -> Any:
     return message
 
 
-def test_the_position_of_each_scan_is_known_with_its_uncertainty_and_how() -> None:
+def test_drift_point_has_outcome_and_uncertainty() -> None:
     night = Overview()
     outcomes = (RegistrationOutcome.REGISTERED, RegistrationOutcome.COARSE, RegistrationOutcome.FAILED)
     for number, outcome in enumerate(outcomes):
@@ -247,7 +249,7 @@ def opposite(at_s: int, kind: RescanKind = RescanKind.OPPOSITE) -> Any:
     return message
 
 
-def test_thermal_drift_until_the_first_scan_was_taken_both_ways_is_no_problem() -> None:
+def test_thermal_drift_before_the_first_scan_in_both_directions_is_routine() -> None:
     drift = int(model.Problem.THERMAL_DRIFT)
     night = seen(
         ("ControlState", control("series"), 1),
@@ -261,13 +263,13 @@ def test_thermal_drift_until_the_first_scan_was_taken_both_ways_is_no_problem() 
     assert [span.start_ns for span in night.problem_spans] == [50 * S]
 
 
-def test_a_spectrum_is_told_with_its_place() -> None:
+def test_spectrum_summary_has_its_position() -> None:
     curve = model.Spectrum((1e-9, 2e-9), "IV", ("V", "I"), ("V", "A"), np.zeros((3, 2)), 4 * S)
     (told,) = seen(("ControlState", control("grid"), 1), ("Spec1d", curve, 5)).spectra
     assert (told.time_ns, told.position_m, told.kind, told.holder) == (4 * S, (1e-9, 2e-9), "IV", "grid")
 
 
-def test_unknown_messages_are_passed_over() -> None:
+def test_unknown_messages_are_ignored() -> None:
     night = seen(("Own", object(), 1))
     assert night.newest_ns == S
 
@@ -279,7 +281,7 @@ def test_progress_is_the_newest_of_each_component() -> None:
     assert night.progress == {"series": (4, 9), "grid": (1, 9)}
 
 
-def test_what_remains_gets_less_while_nothing_new_is_told() -> None:
+def test_remaining_time_falls_between_packets() -> None:
     told = model.Progress(20 * S, "series", 2, 10, left_s=40.0)
     assert told.remaining_ns(25 * S) == 35 * S
     assert told.remaining_ns(500 * S) == 0
@@ -302,17 +304,17 @@ STORY = [
 ]
 
 
-def test_who_comes_late_has_the_past_from_the_journal() -> None:
+def test_late_joiner_gets_the_past_from_the_journal() -> None:
     late = seen(*STORY, ("ControlState", control(None, mode=ControlMode.MANUAL), 41))
-    assert [(s.label, s.start_ns // S) for s in late.controls.spans] == [("series", 2), ("corrector", 26)]
+    assert [(s.label, s.start_ns // S) for s in late.timelines.control.spans] == [("series", 2), ("corrector", 26)]
     assert (late.in_control, late.control_since_ns) == ("ada", 40 * S)
-    (flagged,) = late.problem_timelines[TIP].spans
+    (flagged,) = late.timelines.problems[TIP].spans
     assert (flagged.by, flagged.start_ns, flagged.end_ns) == ("classifier", 22 * S, 35 * S)
-    assert late.modes.now is not None
-    assert late.modes.now.start_ns == 40 * S
+    assert late.timelines.mode.now is not None
+    assert late.timelines.mode.now.start_ns == 40 * S
 
 
-def test_what_the_journal_says_of_what_was_seen_changes_nothing() -> None:
+def test_journal_of_known_changes_adds_nothing() -> None:
     states = [one for one in NIGHT if one[0] == "ControlState"]
     with_journal = seen(
         *states,
@@ -326,11 +328,11 @@ def test_what_the_journal_says_of_what_was_seen_changes_nothing() -> None:
             41,
         ),
     )  # type: ignore[attr-defined]
-    assert [list(seen(*states).controls.spans)] == [list(with_journal.controls.spans)]
+    assert [list(seen(*states).timelines.control.spans)] == [list(with_journal.timelines.control.spans)]
 
 
-def test_channels_of_a_scan_share_what_is_equal() -> None:
-    """A page that is open for weeks keeps a hundred thousand; each packet brings objects of its own."""
+def test_summaries_of_a_scan_share_equal_parts() -> None:
+    # a page that is open for weeks keeps a hundred thousand; each packet brings its own objects
     overview = Overview()
     for number, channel in enumerate(("Height", "Phase", "Height_Retrace")):
         message, payload = wire.encode(model.Scan(REGION, channel, "m", np.zeros((4, 4)), 14 * S, "scan-0001.nc"))

@@ -1,4 +1,4 @@
-"""RecordPlayback of what was recorded: each thing in its time, and none twice or never."""
+"""RecordPlayback: each item when it is due, none twice and none missing."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def times(things: object) -> list[int | None]:
     return [one.time_ns for one in things]  # type: ignore[attr-defined]
 
 
-def test_each_is_given_once_its_time_has_come() -> None:
+def test_items_are_yielded_when_due() -> None:
     playback = RecordPlayback([Recorded(10), Recorded(20), Recorded(20), Recorded(30)])
     assert (playback.next_ns, times(playback.due(9))) == (10, [])
     assert times(playback.due(20)) == [10, 20, 20]
@@ -26,7 +26,7 @@ def test_each_is_given_once_its_time_has_come() -> None:
     assert playback.next_ns is None
 
 
-def test_caller_that_stops_early_loses_none_and_gets_none_twice() -> None:
+def test_caller_that_stops_early_loses_no_item_and_gets_none_twice() -> None:
     playback = RecordPlayback([Recorded(None), *map(Recorded, range(1, 10))])
     assert times(islice(playback.due(100), 4)) == [None, 1, 2, 3]
     assert times(playback.due(100)) == [4, 5, 6, 7, 8, 9]

@@ -21,29 +21,29 @@ def tilted(values: np.ndarray) -> np.ndarray:
     return values + 3.0 + 0.7 * rows[:, None] - 0.2 * columns[None, :]
 
 
-def test_a_plane_is_taken_off_whole() -> None:
+def test_plane_levelling_removes_a_plane_completely() -> None:
     assert np.abs(levelled(tilted(np.zeros((40, 60))), Levelling.PLANE)).max() < 1e-12
 
 
-def test_what_lies_on_a_plane_keeps_its_height() -> None:
+def test_plane_levelling_keeps_heights_above_the_plane() -> None:
     flat = levelled(BUMP, Levelling.PLANE)
     assert np.allclose(levelled(tilted(BUMP), Levelling.PLANE), flat, atol=1e-12)
 
 
-def test_line_by_line_takes_each_lines_own_slope_and_offset() -> None:
+def test_line_levelling_removes_slope_and_offset_of_each_line() -> None:
     rows = np.random.default_rng(1).normal(size=(30, 2, 1))
     values = rows[:, 0] + rows[:, 1] * np.arange(50)
     assert np.abs(levelled(values, Levelling.LINES)).max() < 1e-12
     assert np.abs(levelled(values, Levelling.PLANE)).max() > 0.1
 
 
-def test_no_levelling_is_what_was_published() -> None:
+def test_no_levelling_keeps_the_published_values() -> None:
     values = tilted(BUMP)
     assert levelled(values, Levelling.NONE) is values
 
 
 @pytest.mark.parametrize("how", [Levelling.PLANE, Levelling.LINES])
-def test_lines_that_have_not_come_count_for_nothing(how: Levelling) -> None:
+def test_missing_lines_are_ignored_by_levelling(how: Levelling) -> None:
     values = tilted(BUMP)
     growing = values.copy()
     growing[12:] = np.nan
@@ -53,16 +53,16 @@ def test_lines_that_have_not_come_count_for_nothing(how: Levelling) -> None:
 
 @pytest.mark.parametrize("how", list(Levelling))
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1), (0, 4), (2, 2)])
-def test_the_smallest_scans_can_be_levelled(how: Levelling, shape: tuple[int, int]) -> None:
+def test_smallest_scans_can_be_levelled(how: Levelling, shape: tuple[int, int]) -> None:
     assert np.isfinite(levelled(np.ones(shape), how)).all()
 
 
 @pytest.mark.parametrize("how", list(Levelling))
-def test_a_scan_without_a_value_stays_without(how: Levelling) -> None:
+def test_scan_without_a_value_stays_without(how: Levelling) -> None:
     assert np.isnan(levelled(np.full((4, 5), np.nan), how)).all()
 
 
-def test_the_span_leaves_outliers_out_if_wanted() -> None:
+def test_robust_range_excludes_outliers() -> None:
     values = np.linspace(0.0, 1.0, 10_000).reshape(100, 100)
     values[50, 50] = 1e6
     robust, full = value_range(values, Contrast.ROBUST), value_range(values, Contrast.FULL)
@@ -70,7 +70,7 @@ def test_the_span_leaves_outliers_out_if_wanted() -> None:
     assert full.high == 1e6
 
 
-def test_the_span_of_a_large_scan_is_found_from_all_of_its_columns() -> None:
+def test_range_of_a_large_scan_samples_all_columns() -> None:
     values = np.tile(np.arange(1024.0), (1024, 1))
     span = value_range(values, Contrast.ROBUST)
     assert span.low < 11
@@ -78,7 +78,7 @@ def test_the_span_of_a_large_scan_is_found_from_all_of_its_columns() -> None:
 
 
 @pytest.mark.parametrize("values", [np.full((3, 3), 2.5), np.full((3, 3), np.nan), np.zeros((0, 3))])
-def test_there_is_always_a_span(values: np.ndarray) -> None:
+def test_range_exists_for_any_values(values: np.ndarray) -> None:
     span = value_range(values, Contrast.ROBUST)
     assert span.high > span.low
 
@@ -93,7 +93,7 @@ def test_any_value_has_an_index(value: float) -> None:
     assert indices(np.array([[value]]), ValueRange(-1.0, 1.0)).dtype == np.uint8
 
 
-def test_the_first_row_of_the_picture_is_the_highest_y_and_what_is_not_measured_is_transparent() -> None:
+def test_png_begins_with_the_highest_y_and_unmeasured_pixels_are_transparent() -> None:
     levels = np.array([[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 254, UNMEASURED]], np.uint8)
     read = Image.open(io.BytesIO(png(levels, "gold")))
     assert (read.format, read.mode, read.size) == ("PNG", "P", (4, 3))
@@ -103,7 +103,7 @@ def test_the_first_row_of_the_picture_is_the_highest_y_and_what_is_not_measured_
 
 
 @pytest.mark.parametrize("small", [True, False])
-def test_a_picture_is_small_and_brightest_where_values_are_highest(small: bool) -> None:
+def test_thumbnail_is_small_and_brightest_at_the_highest_values(small: bool) -> None:
     values = np.tile(np.linspace(0.0, 1.0, 1000), (600, 1))
     values[-4:] = np.nan
     image = shown(values, 256, small=small)
@@ -116,7 +116,7 @@ def test_a_picture_is_small_and_brightest_where_values_are_highest(small: bool) 
     assert (image.span.low, image.span.high) == pytest.approx((0.0, 1.0), abs=0.02)
 
 
-def test_pixels_are_put_together_by_their_means_whatever_is_missing() -> None:
+def test_reduced_image_has_means_of_blocks_without_missing_pixels() -> None:
     values = np.arange(36.0).reshape(6, 6)
     values[0, 0] = np.nan
     values[:3, 3:] = np.nan
@@ -127,7 +127,7 @@ def test_pixels_are_put_together_by_their_means_whatever_is_missing() -> None:
     assert reduced(values, 6) is values
 
 
-def test_a_scale_bar_is_of_a_round_length() -> None:
+def test_scale_bar_has_a_round_length() -> None:
     assert [round_length_m(length) for length in (9.9e-7, 1e-6, 3.3e-9)] == pytest.approx([5e-7, 1e-6, 2e-9])
     assert "width:20%" in scale_bar((1e-6, 1e-6))
     assert "200 nm" in scale_bar((1e-6, 1e-6))
@@ -142,7 +142,7 @@ def test_rows_are_aligned_by_their_differences_beside_a_pit_that_is_longer_than_
     assert np.ptp(by_differences[12:, 0]) < 1e-12
 
 
-def test_small_pictures_are_flattened_without_a_scar_tilting_its_neighbours() -> None:
+def test_flattening_is_not_disturbed_by_a_scar() -> None:
     rows = np.cumsum(np.random.default_rng(2).normal(size=40))[:, None]
     scarred = tilted(BUMP + rows)
     scarred[17, 5:25] += 50.0
@@ -152,7 +152,7 @@ def test_small_pictures_are_flattened_without_a_scar_tilting_its_neighbours() ->
     assert np.ptp(flattened(tilted(rows + np.zeros((40, 60))))) < 1e-9
 
 
-def test_compared_pictures_have_one_range_that_no_picture_exceeds() -> None:
+def test_shared_range_contains_every_picture() -> None:
     low, high = np.linspace(0.0, 1.0, 10_000).reshape(100, 100), np.linspace(0.5, 3.0, 10_000).reshape(100, 100)
     span = shared_range([low, high])
     assert (span.low, span.high) == (value_range(low).low, value_range(high).high)

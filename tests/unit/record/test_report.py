@@ -99,7 +99,7 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report that is only looked at."""
+    """The report of the run, for tests that only read it."""
     return write(recorded(tmp_path_factory.mktemp("report")))
 
 
@@ -147,7 +147,7 @@ def told(run: Path) -> story.RunStory:
 
 
 class Page(HTMLParser):
-    """What a browser would load, and whether every element is closed."""
+    """Collects the addresses that a browser would load, and unclosed elements."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -170,7 +170,7 @@ class Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
+def test_page_is_self_contained_and_well_formed(report: Path) -> None:
     text = report.read_text(encoding="utf-8")
     page = Page(text)
     assert page.open == []
@@ -195,21 +195,21 @@ def test_the_page_needs_nothing_else_and_is_whole(report: Path) -> None:
         "series &lt;b&gt;",
     ],
 )
-def test_the_page_says(report: Path, said: str) -> None:
+def test_page_contains(report: Path, said: str) -> None:
     assert said in report.read_text(encoding="utf-8")
 
 
-def test_nothing_of_others_becomes_markup(report: Path) -> None:
+def test_recorded_texts_are_escaped(report: Path) -> None:
     text = report.read_text(encoding="utf-8")
     assert "series <b>" not in text
     assert "<10>" not in text
 
 
-def test_the_night_is_drawn_beside_it(report: Path) -> None:
+def test_night_is_drawn_beside_the_report(report: Path) -> None:
     assert (report.parent / pictures.OWN_NIGHT).read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_a_component_has_drawn_is_shown_instead(run: Path) -> None:
+def test_figure_of_a_component_replaces_the_reports_own(run: Path) -> None:
     write(run)  # while it still goes on
     drawn = (run / pictures.OWN_NIGHT).read_bytes()
     (run / pictures.NIGHT).write_bytes(drawn)
@@ -219,13 +219,13 @@ def test_what_a_component_has_drawn_is_shown_instead(run: Path) -> None:
     assert len(pictures.of_figures(run)[0].image) < len(drawn)
 
 
-def test_writing_again_is_the_same(run: Path) -> None:
+def test_report_is_reproducible(run: Path) -> None:
     first = write(run).read_bytes()
     assert write(run).read_bytes() == first
     assert [file.name for file in run.iterdir() if file.name.startswith(".report")] == []
 
 
-def test_a_run_that_was_resumed_is_told_from_its_first_part_on(run: Path) -> None:
+def test_report_of_a_resumed_run_begins_with_its_first_part(run: Path) -> None:
     facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
     facts["clock"]["start_s"] += 1000.0
     (run / "run.json").write_text(json.dumps(facts), encoding="utf-8")
@@ -239,7 +239,7 @@ def test_without_a_record_there_is_no_report(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("what", ["afspm.record.report.pictures.draw", "pathlib.Path.replace"])
-def test_a_folder_that_can_not_be_written_to_is_told(run: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def test_unwritable_folder_is_named(run: Path, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -249,23 +249,23 @@ def test_a_folder_that_can_not_be_written_to_is_told(run: Path, monkeypatch: pyt
     assert not list(run.glob(".report*"))
 
 
-def test_a_scan_whose_file_is_gone_is_told_without_a_picture(run: Path) -> None:
+def test_scan_without_its_file_is_listed_without_a_picture(run: Path) -> None:
     next((run / "scans").iterdir()).unlink()
     assert "no values" in write(run).read_text(encoding="utf-8")
 
 
-def test_the_same_refusal_is_told_once_with_how_often(run: Path) -> None:
+def test_equal_refusals_are_listed_once_with_their_number(run: Path) -> None:
     (refused,) = told(run).refusals
     assert (refused.count, refused.who, refused.last_ns - refused.first_ns) == (2, "corrector", S)
 
 
-def test_a_problem_is_told_with_who_repaired_it(run: Path) -> None:
+def test_problem_is_listed_with_its_repairers(run: Path) -> None:
     (problem,) = told(run).problems
     assert (problem.by, problem.lasted_ns(0 if problem.end_ns is None else problem.end_ns)) == ("judge", 100 * S)
     assert told(run).repairs(problem) == ["corrector"]
 
 
-def test_a_run_lasts_until_the_experiment_ends_without_the_drawing_after_it(run: Path) -> None:
+def test_duration_excludes_figures_drawn_after_the_end(run: Path) -> None:
     store = RecordStore(run, RecordSettings({}))
     ended = model.JournalEntry(
         START + 3601 * S, "control", "series", "ended", event=model.ControlEvent.EXPERIMENT_ENDED
@@ -287,7 +287,7 @@ def framed(run: Path) -> list[int]:
     return [int(number) for number in re.findall(r'<figure id="scan-(\d+)" class="scan bad"', text)]
 
 
-def test_the_scan_before_a_flag_is_framed_and_an_interrupted_one(run: Path) -> None:
+def test_scan_before_a_flag_and_interrupted_scan_are_framed(run: Path) -> None:
     assert framed(run) == [3, 4]
 
 
@@ -322,7 +322,7 @@ def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:
     assert "2 · 2023-11-16 04:13:20" in text
 
 
-def test_a_problem_that_is_seen_after_the_end_is_told_and_is_no_refusal(run: Path) -> None:
+def test_problem_seen_after_the_end_is_listed_and_not_a_refusal(run: Path) -> None:
     store, flag = RecordStore(run, RecordSettings({})), model.ControlRequest.ADD_EXP_PRBLM
     ended = model.JournalEntry(START, "control", "series", "ended", event=model.ControlEvent.EXPERIMENT_ENDED)
     seen = [model.JournalEntry(START + n, "request", "judge", "flags", 1, request=flag, problem=1) for n in (1, 2)]
@@ -336,13 +336,13 @@ def test_a_problem_that_is_seen_after_the_end_is_told_and_is_no_refusal(run: Pat
     assert "tip-shape-changed seen after the end" in write(run).read_text(encoding="utf-8")
 
 
-def test_time_is_shared_out(run: Path) -> None:
-    shares = dict(told(run).shares(told(run).overview.controls))
+def test_time_in_control_is_summed_by_holder(run: Path) -> None:
+    shares = dict(told(run).shares(told(run).overview.timelines.control))
     assert shares["corrector"] == 90 * S
     assert shares["series <b>"] == (1498 + 2001) * S
 
 
-def test_of_many_scans_the_bad_and_some_between_are_shown(run: Path) -> None:
+def test_selection_of_many_scans_has_the_bad_and_some_between(run: Path) -> None:
     with open_run(run) as opened:
         row = opened.scans[0]
     many = [type(row)(**{**fields_of(row), "number": k, "time_ns": k}) for k in range(1000)]
@@ -356,16 +356,16 @@ def fields_of(row: object) -> dict[str, object]:
     return {name: getattr(row, name) for name in row.__slots__}  # type: ignore[attr-defined]
 
 
-def test_what_can_not_be_told_apart_is_one_bar(run: Path) -> None:
+def test_indistinguishable_intervals_are_one_bar(run: Path) -> None:
     night = told(run)
-    night.overview.states.spans.clear()
+    night.overview.timelines.scope_state.spans.clear()
     for k in range(20_000):  # in an hour: several for each pixel
         begin = night.start_ns + k * 180_000_000
-        night.overview.states.spans.append(Span("scanning", begin, begin + 100_000_000))
+        night.overview.timelines.scope_state.spans.append(Span("scanning", begin, begin + 100_000_000))
     assert page._timeline(night).count("<span") < 1000
 
 
-def test_a_run_of_which_nothing_is_recorded_has_a_report(tmp_path: Path) -> None:
+def test_empty_record_has_a_report(tmp_path: Path) -> None:
     RecordStore(tmp_path, RecordSettings({"experiment": "empty"})).close()
     text = write(tmp_path).read_text(encoding="utf-8")
     assert Page(text).open == []
@@ -391,7 +391,7 @@ def test_spectra_that_form_no_grid_are_shown_in_their_order(tmp_path: Path) -> N
     assert "grid-row" not in text
 
 
-def test_the_page_says_what_ended_the_experiment_and_why(tmp_path: Path) -> None:
+def test_page_names_author_and_reason_of_the_end(tmp_path: Path) -> None:
     text = with_spectra(tmp_path, [(0.0, 0.0)])
     assert "survey ended the experiment at 2023-11-14 22:14:20 UTC: tip &lt;is&gt; gone" in text
 
@@ -412,7 +412,7 @@ def test_local_time_stands_beside_utc_where_it_is_another(run: Path, monkeypatch
     assert ">local</b>" in text
 
 
-def test_pictures_lie_on_the_map_where_they_were_taken_the_newest_on_top(tmp_path: Path) -> None:
+def test_map_shows_pictures_at_their_position_the_newest_on_top(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings({"experiment": "map"}))
     places = [((0.0, 0.0), 4e-6), ((1e-6, 1e-6), 1e-6), ((1e-6, 1e-6), 1e-6)]
     for number, (center, side) in enumerate(places, 1):
@@ -433,12 +433,12 @@ def test_pictures_lie_on_the_map_where_they_were_taken_the_newest_on_top(tmp_pat
     assert "µm" in sample
 
 
-def test_a_figure_that_is_none_is_left_out(run: Path) -> None:
+def test_invalid_figure_is_left_out(run: Path) -> None:
     (run / "half.png").write_bytes(b"\x89PNG but no more")
     assert "half.png" not in write(run).read_text(encoding="utf-8")
 
 
-def test_scans_that_are_not_registered_well_are_listed_with_their_uncertainty(tmp_path: Path) -> None:
+def test_poorly_registered_scans_are_listed_with_their_uncertainty(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings({"experiment": "survey", "frame": "sample"}))
     outcomes = (RegistrationOutcome.REGISTERED, RegistrationOutcome.FAILED, RegistrationOutcome.REGISTERED)
     for number, outcome in enumerate(outcomes):
@@ -469,7 +469,7 @@ def test_scans_that_are_not_registered_well_are_listed_with_their_uncertainty(tm
     assert "± 30 nm, registered" in text
 
 
-def test_the_first_thermal_drift_is_no_problem_and_shown_as_normal(tmp_path: Path) -> None:
+def test_first_thermal_drift_is_shown_as_routine(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings({"experiment": "survey"}))
     asked = wire.message_type("DriftRescan")(kind=int(model.RescanKind.OPPOSITE))
     asked.timestamp.FromNanoseconds(START + 10 * S)

@@ -1,4 +1,4 @@
-"""Whether a run goes on, has ended or was cut off is known without asking it."""
+"""The state of a run, read from its lock without a request: running, ended or cut off."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def folder_of(tmp_path: Path, **facts: Any) -> Path:
     return folder
 
 
-def test_a_run_is_cut_off_if_nobody_runs_it_and_it_has_not_ended(tmp_path: Path) -> None:
+def test_unlocked_run_without_an_end_is_cut_off(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     assert cut_off_message(folder) == f"it was cut off; {resume_command(folder)} goes on with it"
     with lock_run(folder):
@@ -29,7 +29,7 @@ def test_a_run_is_cut_off_if_nobody_runs_it_and_it_has_not_ended(tmp_path: Path)
     assert cut_off_message(folder), "who ran it is gone"
 
 
-def test_to_look_does_not_hold_up_who_wants_to_go_on(tmp_path: Path) -> None:
+def test_state_query_does_not_block_a_resume(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     for _ in range(3):
         assert cut_off_message(folder)
@@ -37,16 +37,16 @@ def test_to_look_does_not_hold_up_who_wants_to_go_on(tmp_path: Path) -> None:
             pass
 
 
-def test_a_replay_is_not_to_be_resumed(tmp_path: Path) -> None:
+def test_cut_off_replay_offers_no_resume(tmp_path: Path) -> None:
     assert cut_off_message(folder_of(tmp_path, replay_of="runs/other")) == "this replay was cut off"
 
 
 @pytest.mark.parametrize("ended", ["the experiment has ended", "Ctrl-C"])
-def test_what_has_ended_was_not_cut_off(tmp_path: Path, ended: str) -> None:
+def test_ended_run_is_not_cut_off(tmp_path: Path, ended: str) -> None:
     assert cut_off_message(folder_of(tmp_path, ended=ended)) == ""
 
 
-def test_of_what_nobody_ran_here_that_is_not_said(tmp_path: Path) -> None:
+def test_run_without_a_lock_is_not_called_cut_off(tmp_path: Path) -> None:
     assert cut_off_message(tmp_path) == ""
     folder = folder_of(tmp_path)
     (folder / "state" / "running").unlink()
@@ -54,7 +54,7 @@ def test_of_what_nobody_ran_here_that_is_not_said(tmp_path: Path) -> None:
     assert describe_state(folder) == "it goes on, or was cut off"
 
 
-def test_how_it_is_with_a_run_is_told_in_words(tmp_path: Path) -> None:
+def test_state_of_a_run_is_described_in_words(tmp_path: Path) -> None:
     folder = folder_of(tmp_path)
     assert describe_state(folder) == cut_off_message(folder)
     with lock_run(folder):
@@ -71,7 +71,7 @@ def test_how_it_is_with_a_run_is_told_in_words(tmp_path: Path) -> None:
         ("win32", r"C:\my runs\night", r'`afspm run --resume "C:\my runs\night"`'),
     ],
 )
-def test_the_command_that_resumes_can_be_typed_as_it_is_told(
+def test_resume_command_is_quoted_for_the_shell(
     monkeypatch: pytest.MonkeyPatch, system: str, folder: str, said: str
 ) -> None:
     monkeypatch.setattr(run_lock.sys, "platform", system)

@@ -1,4 +1,4 @@
-"""What is given to the store is in the record: once, whole, with the circumstances."""
+"""The store records each packet once, complete, with its provenance."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from afspm.record.store import _PROCESS, RecordSettings, RecordStore
 from afspm.storage.formats import read
 
 
-def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(
+def test_scan_is_one_file_with_all_channels_and_its_provenance(
     night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
     given = [night.control("series", (1,)), night.feedback(), *night.whole_scan(1)]
@@ -53,7 +53,7 @@ def test_a_scan_is_one_file_with_all_channels_and_the_circumstances(
     assert (about["experiment"], about["seeds"], about["simulated"]) == ("night", {"microscope": 7}, True)
 
 
-def test_the_file_follows_nexus(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_file_follows_nexus(night: Night, store: RecordStore, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     store.take(night.whole_scan(1))
     with h5py.File(tmp_path / afspm.open_run(tmp_path).scans[0].file) as file:
@@ -74,7 +74,7 @@ def test_the_file_follows_nexus(night: Night, store: RecordStore, tmp_path: Path
         assert entry["experiment_description"].asstr()[()] == "SIMULATED"
 
 
-def test_what_is_given_again_changes_nothing(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_repeated_packets_change_nothing(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.control(), *night.whole_scan(1), night.state(ScopeState.SPEC), night.spectrum()]
     for _ in range(3):
         store.take(given)
@@ -87,7 +87,7 @@ def test_what_is_given_again_changes_nothing(night: Night, store: RecordStore, t
     assert same(list(run.packets()), given)
 
 
-def test_everything_comes_out_as_it_was_published(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_packets_are_read_back_as_published(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.control(), night.feedback(), night.state(ScopeState.SCANNING), night.lines(2), night.lines(4, 2)]
     given += [*night.scans(1), night.state(ScopeState.FREE), night.state(ScopeState.SPEC), night.spectrum()]
     # what lines show is part of the scan that comes
@@ -103,8 +103,8 @@ def test_everything_comes_out_as_it_was_published(night: Night, store: RecordSto
     assert same(list(run.packets(since_ns=given[6][0].time_ns or 0)), given[7:])
 
 
-def test_a_scan_without_values_comes_out_as_it_was_published(night: Night, store: RecordStore, tmp_path: Path) -> None:
-    """There is nothing to make a file of; the journal has what it was taken with."""
+def test_scan_without_values_is_read_back_as_published(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    # no file can be made of it; the journal has its settings
     bare = Scan(REGION, "Topo", "m", np.empty((0, 0)), pixels=(6, 8))
     given = [night.state(ScopeState.SCANNING), night.packet(bare, "Scan2d_1000.0_Topo"), *night.scans(1)]
     given.append(night.state(ScopeState.FREE))
@@ -115,9 +115,7 @@ def test_a_scan_without_values_comes_out_as_it_was_published(night: Night, store
     assert next(wire.decode("Scan2d", p.payload) for p in run.packets(messages=["Scan2d"])).shape == (6, 8)
 
 
-def test_lines_of_a_channel_that_the_end_came_before_are_there(
-    night: Night, store: RecordStore, tmp_path: Path
-) -> None:
+def test_lines_of_a_channel_published_after_the_end_are_kept(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.state(ScopeState.SCANNING), night.lines(2), night.scans(1)[1]]
     store.take(given)
     store.finish()
@@ -155,7 +153,7 @@ def test_channels_in_files_of_their_own_find_their_scan_after_a_kill(night: Nigh
 
 
 def test_scans_of_one_time_in_several_files_are_not_mixed(night: Night, store: RecordStore, tmp_path: Path) -> None:
-    """A controller whose clock has seconds may take two scans in one."""
+    # a controller whose clock has seconds may take two scans in one
     scans = [*night.scans(1, ("Height",), START_NS), *night.scans(2, ("Height",), START_NS)]
     store.take([*scans, night.state(ScopeState.FREE)])
     run = afspm.open_run(tmp_path)
@@ -168,7 +166,7 @@ def test_packets_of_unknown_messages_are_kept_as_they_are(store: RecordStore, tm
     assert same(list(afspm.open_run(tmp_path).packets()), [strange])
 
 
-def test_a_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_path: Path) -> None:
+def test_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_path: Path) -> None:
     scanning, first, second, free = night.whole_scan(1)
     store = RecordStore(tmp_path, ABOUT)
     store.take([scanning, first])
@@ -184,7 +182,7 @@ def test_a_channel_that_comes_after_a_kill_joins_the_others(night: Night, tmp_pa
     assert same(list(run.packets()), [scanning, first, second, free])
 
 
-def test_an_interrupted_scan_is_kept_as_far_as_it_was_seen(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_interrupted_scan_keeps_its_received_lines(night: Night, store: RecordStore, tmp_path: Path) -> None:
     given = [night.control(), night.state(ScopeState.SCANNING), night.lines(2, 0), night.lines(1, 2)]
     given += [night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)]
     store.take(given)
@@ -197,9 +195,7 @@ def test_an_interrupted_scan_is_kept_as_far_as_it_was_seen(night: Night, store: 
     assert same(list(run.packets()), given)
 
 
-def test_an_interrupted_scan_of_which_nothing_was_seen_has_a_row(
-    night: Night, store: RecordStore, tmp_path: Path
-) -> None:
+def test_interrupted_scan_without_lines_has_a_row(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED), night.state(ScopeState.FREE)])
     run = afspm.open_run(tmp_path)
     (row,) = run.scans
@@ -208,13 +204,13 @@ def test_an_interrupted_scan_of_which_nothing_was_seen_has_a_row(
         run.scan(0)
 
 
-def test_a_scan_that_vanished_is_kept_when_the_next_begins(night: Night, store: RecordStore, tmp_path: Path) -> None:
+def test_scan_without_an_end_is_kept_when_the_next_begins(night: Night, store: RecordStore, tmp_path: Path) -> None:
     store.take([night.state(ScopeState.SCANNING), night.lines(), night.state(ScopeState.UNDEFINED)])
     store.take(night.whole_scan(2))
     assert [row.interrupted for row in afspm.open_run(tmp_path).scans] == [True, False]
 
 
-def test_what_waits_for_the_rest_of_its_scan_is_not_recorded_yet(night: Night, store: RecordStore) -> None:
+def test_incomplete_scan_is_not_recorded_yet(night: Night, store: RecordStore) -> None:
     scanning, first, _, _ = night.whole_scan(1)
     store.take([scanning, first])
     assert store.waiting() == [first[0]]
@@ -222,7 +218,7 @@ def test_what_waits_for_the_rest_of_its_scan_is_not_recorded_yet(night: Night, s
     assert store.waiting() == []
 
 
-def test_a_full_disk_leaves_nothing_behind_and_all_is_recorded_later(
+def test_full_disk_leaves_no_partial_record_and_a_retry_succeeds(
     night: Night, store: RecordStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     given = [night.control(), *night.whole_scan(1)]
@@ -242,7 +238,7 @@ def test_a_full_disk_leaves_nothing_behind_and_all_is_recorded_later(
     assert len(run.scan(0)) == 2
 
 
-def test_a_file_that_was_written_right_before_a_kill_is_not_there_twice(night: Night, tmp_path: Path) -> None:
+def test_file_written_right_before_a_kill_is_not_duplicated(night: Night, tmp_path: Path) -> None:
     given = night.whole_scan(1)
     store = RecordStore(tmp_path, ABOUT)
     store.take([night.state(ScopeState.SCANNING), night.state(ScopeState.INTERRUPTED)])  # it gets number 1
@@ -277,7 +273,7 @@ def test_without_scans_there_is_the_journal_alone(night: Night, tmp_path: Path) 
     assert len(list(run.packets())) == 5
 
 
-def test_the_controllers_header_is_kept_where_its_file_can_be_read(
+def test_controllers_header_is_recorded_if_its_file_is_readable(
     night: Night, store: RecordStore, tmp_path: Path
 ) -> None:
     head = b"Gwyddion Simple Field 1.0\nXRes = 2\nYRes = 2\nXReal = 1e-6\nYReal = 1e-6\nTitle = Mine\n"
@@ -291,7 +287,7 @@ def test_the_controllers_header_is_kept_where_its_file_can_be_read(
 
 
 @pytest.mark.parametrize("filename", ["no-such-disk/" + 300 * "x", 5000 * "x", "a\0b"])
-def test_a_controllers_file_that_can_not_be_looked_for_costs_its_header_alone(
+def test_unreachable_controllers_file_costs_its_header_only(
     night: Night, store: RecordStore, tmp_path: Path, filename: str
 ) -> None:
     scanning, *channels, free = night.whole_scan(1)
@@ -299,7 +295,7 @@ def test_a_controllers_file_that_can_not_be_looked_for_costs_its_header_alone(
     assert len(afspm.open_run(tmp_path).scan(0)) == 2
 
 
-def test_what_no_file_can_be_made_of_is_kept_and_all_else_recorded(
+def test_measurement_without_a_file_is_kept_in_the_journal_and_others_are_recorded(
     night: Night, store: RecordStore, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     scanning, *channels, free = night.whole_scan(1)
@@ -350,7 +346,7 @@ def test_requests_processes_and_log_lines_have_their_tables(night: Night, store:
     assert [line.text for line in run.log] == ["scan 1 of 3"]
 
 
-def test_whether_a_process_has_changed_is_not_looked_for_in_the_whole_night(store: RecordStore) -> None:
+def test_process_change_is_found_without_a_search_of_the_whole_night(store: RecordStore) -> None:
     ((*_, plan),) = store._journal.execute(f"EXPLAIN QUERY PLAN {_PROCESS}", ("series",)).fetchall()
     assert "processes_by_name" in plan
 
@@ -367,6 +363,6 @@ def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
         run._journal.execute("DELETE FROM packets")
 
 
-def test_the_journal_is_on_the_disk_before_its_write_ahead_log_is_begun_anew(store: RecordStore) -> None:
-    """SQLite syncs by itself, and says whether it does: 0 is never."""
+def test_journal_is_synced_before_its_write_ahead_log_is_restarted(store: RecordStore) -> None:
+    # SQLite syncs by itself; its pragma reports whether it does: 0 is never
     assert store._journal.execute("PRAGMA synchronous").fetchone()[0] >= 1

@@ -10,12 +10,12 @@ from afspm.record.timeline import Span
 S = 1_000_000_000
 
 
-def test_a_stretch_is_where_its_time_is() -> None:
+def test_interval_lies_at_its_time() -> None:
     found = stretches([Span("a", 0, 50 * S), Span("b", 50 * S, None)], 0, 100 * S)
     assert [(one.label, one.begin, one.end) for one in found] == [("a", 0, COLUMNS // 2), ("b", COLUMNS // 2, COLUMNS)]
 
 
-def test_a_night_of_many_changes_takes_no_more_room_than_the_picture_has() -> None:
+def test_intervals_are_merged_to_the_columns_of_the_picture() -> None:
     spans = [Span("scanning" if i % 2 else "free", i * S, (i + 1) * S) for i in range(20_000)]
     found = stretches(spans, 0, 20_000 * S)
     assert len(found) <= COLUMNS
@@ -23,12 +23,12 @@ def test_a_night_of_many_changes_takes_no_more_room_than_the_picture_has() -> No
     assert sum(one.count for one in found) == 20_000
 
 
-def test_of_several_in_one_column_the_longest_is_shown() -> None:
+def test_longest_interval_of_a_column_is_shown() -> None:
     spans = [Span("short", 0, S // 1000), Span("long", S // 1000, S // 4), Span("rest", S // 4, None)]
     assert stretches(spans, 0, 1000 * S)[0].label == "long"
 
 
-def test_a_time_in_the_far_future_makes_no_millions_of_ticks() -> None:
+def test_time_in_the_far_future_makes_no_millions_of_ticks() -> None:
     assert 3 <= len(time_ticks(0.0, 3600.0)) <= 8
     assert len(time_ticks(0.0, 1e12)) <= 8
 

@@ -1,4 +1,4 @@
-"""A clock that goes when a test says so, and an instrument on it."""
+"""A clock set by the test, and an instrument on it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults of emulators: when they strike, and how often."""
+"""Faults of emulators: their times and counts."""
 
 from __future__ import annotations
 
@@ -21,46 +21,46 @@ KNOWN = {"no-reply": "", "modal-dialog": "", "crash": ""}
         ("no-reply,count=every", Fault("no-reply", count=EVERY_TIME)),
     ],
 )
-def test_a_fault_of_the_command_line(text: str, fault: Fault) -> None:
+def test_fault_is_parsed_from_the_command_line(text: str, fault: Fault) -> None:
     assert Fault.parse(text) == fault
 
 
 @pytest.mark.parametrize("text", ["no-reply@soon", "no-reply,often", "no-reply,count=0", "no-reply@-1", "x,count=1.5"])
-def test_what_is_no_fault_is_refused(text: str) -> None:
+def test_invalid_fault_is_refused(text: str) -> None:
     with pytest.raises(ConfigError):
         Fault.parse(text)
 
 
-def test_a_fault_of_the_experiment_file() -> None:
+def test_fault_is_read_from_the_experiment_file() -> None:
     assert Fault.of({"kind": "crash", "at_s": 2.0}) == Fault("crash", 2.0)
     with pytest.raises(ConfigError, match="is not a fault"):
         Fault.of({"kind": "crash", "when": 2.0})
 
 
-def test_an_unknown_kind_is_refused_with_the_nearest() -> None:
+def test_unknown_kind_is_refused_with_the_nearest() -> None:
     with pytest.raises(ConfigError, match="no-reply"):
         Faults([Fault("no-replies")], KNOWN, 0.0)
 
 
-def test_it_strikes_from_its_time_on_as_often_as_it_says() -> None:
+def test_fault_strikes_from_its_time_on_up_to_its_count() -> None:
     faults = Faults([Fault("no-reply", 5.0, 2)], KNOWN, 100.0)
     struck = [faults.strikes("no-reply", t_s) is not None for t_s in (104.9, 105.0, 300.0, 301.0)]
     assert struck == [False, True, True, False]
 
 
-def test_kinds_strike_apart() -> None:
+def test_kinds_strike_independently() -> None:
     faults = Faults([Fault("crash")], KNOWN, 0.0)
     assert faults.strikes("no-reply", 1.0) is None
     assert faults.strikes("crash", 1.0) == Fault("crash")
 
 
-def test_a_state_holds_for_its_duration() -> None:
+def test_fault_lasts_for_its_duration() -> None:
     faults = Faults([Fault("modal-dialog", 5.0, duration_s=2.0)], KNOWN, 100.0)
     assert [faults.lasts("modal-dialog", t_s) for t_s in (104.9, 105.0, 106.9, 107.0)] == [False, True, True, False]
     assert [faults.next_s(t_s) for t_s in (100.0, 105.0, 107.0)] == [105.0, 107.0, None]
 
 
-def test_a_fault_on_demand_counts_from_now() -> None:
+def test_fault_on_demand_counts_from_now() -> None:
     faults = Faults([], KNOWN, 100.0)
     faults.demand(Fault("crash", 1.0), 150.0)
     assert faults.strikes("crash", 150.5) is None

@@ -1,4 +1,4 @@
-"""The simulated instrument that emulators are built around."""
+"""The simulated instrument of all emulators."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afspm.simulation.scan_drawing import run_at_once
 from afspm.transport.process.background import in_background
 
 
-def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Instrument, clock: Any) -> None:
+def test_scan_takes_its_time_and_its_lines_appear_one_by_one(rig: Instrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     assert scan.end_s == 1004.0
     told = []
@@ -29,7 +29,7 @@ def test_a_scan_takes_its_time_and_its_lines_come_one_by_one(rig: Instrument, cl
     assert rig.scan is scan
 
 
-def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Instrument) -> None:
+def test_lines_not_yet_scanned_are_missing(rig: Instrument) -> None:
     rig.setup.upwards = False
     scan = rig.start_scan(1000.0)
     unit, height = scan.channels(1001.0)["Height"]
@@ -39,20 +39,20 @@ def test_lines_not_taken_yet_are_missing_on_the_side_it_has_not_reached(rig: Ins
     assert np.array_equal(scan.channels()["Height"][1][6:], height[6:])
 
 
-def test_it_is_the_same_world_as_the_simulators(rig: Instrument) -> None:
+def test_instrument_has_the_world_of_the_simulator(rig: Instrument) -> None:
     theirs = World.from_settings({}, 3, 1000.0).scan(rig.setup.region, (8, 16), 0.5, 1000.0, rig.setup.feedback, 0.1)
     ours = rig.start_scan(1000.0)
     assert np.array_equal(ours.channels()["Height"][1], theirs.channels()["Height"][1])
 
 
-def test_what_is_changed_during_a_scan_is_for_the_next(rig: Instrument) -> None:
+def test_changes_during_a_scan_hold_for_the_next(rig: Instrument) -> None:
     scan = rig.start_scan(1000.0)
     rig.setup.region, rig.setup.shape = Region((1e-6, 0.0), (2e-6, 1e-6)), (4, 4)
     assert scan.region == Region((0.0, 0.0), (1e-6, 1e-6))
     assert scan.channels()["Height"][1].shape == (8, 16)
 
 
-def test_a_stopped_scan_keeps_the_lines_that_it_had(rig: Instrument, clock: Any) -> None:
+def test_stopped_scan_keeps_its_lines(rig: Instrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     clock.t_s = 1001.2
     rig.stop_scan(clock.t_s)
@@ -68,7 +68,7 @@ def test_stopping_a_scan_that_is_over_changes_nothing(rig: Instrument, clock: An
     assert (scan.stopped_s, scan.end_s, scan.lines_done(1010.0)) == (None, 1004.0, 8)
 
 
-def test_a_pause_puts_the_end_off(rig: Instrument) -> None:
+def test_pause_postpones_the_end(rig: Instrument) -> None:
     scan = rig.start_scan(1000.0)
     scan.pause(1001.0)
     assert scan.running(1500.0)
@@ -79,14 +79,14 @@ def test_a_pause_puts_the_end_off(rig: Instrument) -> None:
     assert np.isfinite(scan.channels(1501.5)["Height"][1]).all(axis=1).sum() == 3
 
 
-def test_what_can_not_be_scanned_is_refused_at_once(rig: Instrument) -> None:
+def test_impossible_scan_is_refused_at_once(rig: Instrument) -> None:
     rig.setup.line_s = 0.0
     with pytest.raises(InvalidValue, match="line"):
         rig.start_scan(1000.0)
     assert not rig.busy(1000.0)
 
 
-def test_one_thing_at_a_time(rig: Instrument) -> None:
+def test_second_activity_is_refused(rig: Instrument) -> None:
     rig.start_scan(1000.0)
     now_s = 1000.0
     for other in (
@@ -99,7 +99,7 @@ def test_one_thing_at_a_time(rig: Instrument) -> None:
             other()
 
 
-def test_a_move_takes_as_long_as_the_way_is(rig: Instrument, clock: Any) -> None:
+def test_duration_of_a_move_is_proportional_to_its_length(rig: Instrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((3e-6, 4e-6), clock.t_s)
     clock.t_s = 1002.5
@@ -110,7 +110,7 @@ def test_a_move_takes_as_long_as_the_way_is(rig: Instrument, clock: Any) -> None
     assert not rig.busy(1005.0)
 
 
-def test_a_move_can_be_stopped_on_the_way(rig: Instrument, clock: Any) -> None:
+def test_move_can_be_stopped_on_the_way(rig: Instrument, clock: Any) -> None:
     rig.setup.move_speed_m_s = 1e-6
     rig.move_probe((4e-6, 0.0), clock.t_s)
     clock.t_s = 1001.0
@@ -119,7 +119,7 @@ def test_a_move_can_be_stopped_on_the_way(rig: Instrument, clock: Any) -> None:
     assert not rig.busy(1001.0)
 
 
-def test_a_spectrum_is_taken_where_the_probe_is(rig: Instrument, clock: Any) -> None:
+def test_spectrum_is_taken_where_the_probe_is(rig: Instrument, clock: Any) -> None:
     rig.move_probe((1e-7, 0.0), clock.t_s)
     clock.t_s += 1.0
     spectrum = rig.start_spectrum("IV", clock.t_s)
@@ -130,7 +130,7 @@ def test_a_spectrum_is_taken_where_the_probe_is(rig: Instrument, clock: Any) -> 
     assert spectrum.end_s == 1003.0
 
 
-def test_in_air_everything_can_be_done_and_all_is_noise(rig: Instrument, clock: Any) -> None:
+def test_in_air_every_measurement_is_noise(rig: Instrument, clock: Any) -> None:
     rig.withdraw(clock.t_s)
     assert rig.doing(1000.5) == "approach"
     clock.t_s = 1001.0
@@ -148,7 +148,7 @@ def test_in_air_everything_can_be_done_and_all_is_noise(rig: Instrument, clock: 
     assert np.ptp(rig.start_scan(clock.t_s).channels()["Height"][1]) > 1e-10
 
 
-def test_withdrawing_ends_whatever_is_going_on(rig: Instrument, clock: Any) -> None:
+def test_withdrawing_ends_any_activity(rig: Instrument, clock: Any) -> None:
     scan = rig.start_scan(clock.t_s)
     clock.t_s = 1001.0
     rig.withdraw(clock.t_s)
@@ -156,7 +156,7 @@ def test_withdrawing_ends_whatever_is_going_on(rig: Instrument, clock: Any) -> N
     assert rig.doing(1001.5) == "approach"
 
 
-def test_the_tip_goes_to_and_fro_along_a_turned_line(rig: Instrument) -> None:
+def test_tip_moves_forward_and_back_along_a_turned_line(rig: Instrument) -> None:
     rig.setup.region = Region((1e-6, 2e-6), (2e-6, 1e-6), math.pi / 2)
     rig.start_scan(1000.0)
     # turned by 90 degrees the fast axis runs along +y, the slow one along -x
@@ -165,7 +165,7 @@ def test_the_tip_goes_to_and_fro_along_a_turned_line(rig: Instrument) -> None:
     assert rig.probe_at(1003.75) == pytest.approx((0.5e-6, 3e-6))
 
 
-def test_pulses_and_crashes_happen_to_the_world(rig: Instrument, clock: Any) -> None:
+def test_pulses_and_crashes_change_the_world(rig: Instrument, clock: Any) -> None:
     assert rig.pulse(8.0, 0.1, clock.t_s) in ("cured", "worsened", "unchanged")
     clock.t_s = 1001.0
     rig.crash(depth_m=1e-7, speed_m_s=1e-6, now_s=clock.t_s)
@@ -178,7 +178,7 @@ def test_pulses_and_crashes_happen_to_the_world(rig: Instrument, clock: Any) -> 
     assert shallow["depth_m"] < 1e-9 < deep["depth_m"]
 
 
-def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:
+def test_scan_computed_in_the_background_is_the_same_and_wakes_the_emulator(clock: Any) -> None:
     woken = []
     at_once, meanwhile = (Instrument({}, 3, clock.t_s, run=run) for run in (run_at_once, in_background))
     meanwhile.drawing.wake = lambda: woken.append(True)
@@ -192,7 +192,7 @@ def test_a_picture_drawn_in_the_background_is_the_same_and_wakes_the_emulator(cl
     assert woken
 
 
-def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Instrument, clock: Any) -> None:
+def test_scanner_follows_the_sample_at_the_set_velocity(rig: Instrument, clock: Any) -> None:
     rig.start_scan(clock.t_s)
     rig.follow((2e-9, -1e-9), clock.t_s)
     clock.t_s = 1100.0
@@ -207,7 +207,7 @@ def test_it_follows_the_sample_with_the_velocity_that_it_is_told(rig: Instrument
     assert np.corrcoef(ours.ravel(), elsewhere.ravel())[0, 1] < 0.999
 
 
-def test_a_tip_at_rest_shows_what_a_scan_shows_there_and_looking_changes_nothing(rig: Instrument, clock: Any) -> None:
+def test_tip_at_rest_shows_the_value_of_a_scan_without_changing_the_world(rig: Instrument, clock: Any) -> None:
     rig.setup.region, rig.setup.shape = Region((30e-9, -20e-9), (10e-9, 10e-9)), (9, 9)
     rig.move_probe((30e-9, -20e-9), clock.t_s)
     clock.t_s += 10.0
@@ -265,7 +265,7 @@ def _shift_hz(rig: Instrument, clock: Any) -> float:
     return float(np.mean([rig.signals(clock.t_s)["Frequency Shift"] for _ in range(100)]))
 
 
-def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(
+def test_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_setpoint(
     sensor: Instrument, clock: Any
 ) -> None:
     for setpoint_hz in (-20.0, -5.0):
@@ -277,7 +277,7 @@ def test_a_sensor_at_rest_shows_the_frequency_shift_of_the_picture_and_of_the_se
         assert np.median(picture_hz) == pytest.approx(setpoint_hz, abs=0.2)
 
 
-def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: Instrument, clock: Any) -> None:
+def test_lifted_sensor_shows_the_remaining_attraction(sensor: Instrument, clock: Any) -> None:
     z_m = float(np.mean([sensor.signals(clock.t_s)["Height"] for _ in range(400)]))
     sensor.setup.feedback = replace(sensor.setup.feedback, on=False)
     shifts_hz = []
@@ -291,7 +291,7 @@ def test_a_sensor_that_is_lifted_shows_what_is_left_of_the_attraction(sensor: In
     assert _shift_hz(sensor, clock) == pytest.approx(0.0, abs=0.05)
 
 
-def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
+def test_scan_that_can_not_be_simulated_is_interrupted(
     rig: Instrument, clock: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rig = Instrument({}, 3, clock.t_s)
@@ -309,7 +309,7 @@ def test_a_scan_that_can_not_be_simulated_is_one_broken_off(
     assert "was stopped" in caplog.text
 
 
-def test_what_makes_no_sense_is_refused_before_anything_begins(rig: Instrument, clock: Any) -> None:
+def test_invalid_setup_is_refused_before_any_activity(rig: Instrument, clock: Any) -> None:
     for change in (
         {"feedback": replace(rig.setup.feedback, setpoint=-1.0)},
         {"feedback": replace(rig.setup.feedback, integral_gain=-1.0)},
@@ -347,14 +347,13 @@ def _kept(rig: Instrument) -> Any:
 
 
 def _killed(rig: Instrument) -> Instrument:
-    """Another instrument that goes on from what the first has on disk."""
     again = Instrument({}, 3, 1000.0)
     again.setup = rig.setup
     again.restore(_kept(rig))
     return again
 
 
-def test_killed_instrument_goes_on_with_its_scan_as_if_nothing_had_happened(rig: Instrument) -> None:
+def test_killed_instrument_continues_its_scan_identically(rig: Instrument) -> None:
     rig.pulse(8.0, 0.1, 1000.0)
     rig.start_scan(1001.0)
     again = _killed(rig)
@@ -373,7 +372,7 @@ def test_killed_instrument_goes_on_with_its_scan_as_if_nothing_had_happened(rig:
     assert _kept(rig) == _kept(again)
 
 
-def test_killed_instrument_goes_on_with_whatever_it_did(rig: Instrument) -> None:
+def test_killed_instrument_continues_its_activity(rig: Instrument) -> None:
     for now_s, begin, what in (
         (1000.0, lambda at_s: rig.move_probe((3e-6, 0.0), at_s), "move"),
         (1010.0, lambda at_s: rig.start_spectrum("force", at_s), "spectrum"),
@@ -387,7 +386,7 @@ def test_killed_instrument_goes_on_with_whatever_it_did(rig: Instrument) -> None
             assert np.array_equal(rig.spectrum.values, again.spectrum.values)  # type: ignore[union-attr]
 
 
-def test_velocity_that_is_set_during_a_scan_moves_the_rest_of_it_and_outlives_a_kill(rig: Instrument) -> None:
+def test_velocity_set_during_a_scan_affects_the_rest_and_survives_a_kill(rig: Instrument) -> None:
     rig.setup.upwards = True
     before = rig.start_scan(1000.0).channels()["Height"][1]
     rig.follow((1e-7, 0.0), 1002.0)  # after four of eight lines
@@ -400,7 +399,7 @@ def test_velocity_that_is_set_during_a_scan_moves_the_rest_of_it_and_outlives_a_
     assert rig.world.sample.compensation.at(1100.0)[0] == pytest.approx(again.world.sample.compensation.at(1100.0)[0])
 
 
-def test_feedback_that_is_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Instrument) -> None:
+def test_feedback_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Instrument) -> None:
     before = rig.start_scan(1000.0).channels()["Amplitude"][1]
     rig.setup.feedback = replace(rig.setup.feedback, setpoint=0.3)
     rig.adjust(1002.0)

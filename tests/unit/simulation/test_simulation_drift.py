@@ -22,7 +22,7 @@ def test_drift_is_zero_at_the_start_and_adds_up() -> None:
     assert drift.at(np.full((4, 5), START)).shape == (4, 5, 3)
 
 
-def test_a_walk_asked_for_in_any_order_is_the_same_walk() -> None:
+def test_walk_does_not_depend_on_the_order_of_calls() -> None:
     drift = Drift(DriftSettings(walk_m_per_sqrt_hour=100e-9), 3, START)
     times = START + np.random.default_rng(0).uniform(0, 2e6, 300)
     together = drift.at(times)
@@ -32,7 +32,7 @@ def test_a_walk_asked_for_in_any_order_is_the_same_walk() -> None:
     assert not np.allclose(together[:, :2], other[:, :2])
 
 
-def test_a_walk_spreads_as_the_square_root_of_time() -> None:
+def test_walk_spreads_as_the_square_root_of_time() -> None:
     ends = np.array([random_walk(seed, np.array([100.0, 3600.0, 3600.0 * 40])) for seed in range(600)])
     np.testing.assert_allclose(ends.std(axis=0), np.sqrt([100.0, 3600.0, 3600.0 * 40]), rtol=0.12)
     steps = np.diff(random_walk(5, np.arange(0.0, 20000.0, 10.0)))
@@ -40,20 +40,20 @@ def test_a_walk_spreads_as_the_square_root_of_time() -> None:
     assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 0.08
 
 
-def test_a_walk_is_continuous_across_its_longest_interval() -> None:
+def test_walk_is_continuous_across_its_longest_interval() -> None:
     edge = 2.0**20
     near = random_walk(1, np.array([edge - 1e-3, edge, edge + 1e-3]))
     assert np.ptp(near) < 0.05
 
 
-def test_before_the_start_nothing_is_known() -> None:
+def test_time_before_the_start_is_refused() -> None:
     with pytest.raises(InvalidValue):
         Drift(DriftSettings(), 1, START).at(START - 5)
     with pytest.raises(InvalidValue):
         Drift(DriftSettings(), 1, START).at(float("nan"))
 
 
-def test_a_scanner_that_follows_with_the_right_velocity_sees_no_drift() -> None:
+def test_scanner_that_follows_with_the_right_velocity_sees_no_drift() -> None:
     from afspm.simulation import World
 
     world = World.from_settings({"drift": {"velocity_m_per_s": [1e-9, -2e-9, 0.0]}}, 1, 0.0)
@@ -68,7 +68,7 @@ def test_a_scanner_that_follows_with_the_right_velocity_sees_no_drift() -> None:
     np.testing.assert_array_equal(again.sample.seen_drift_m(5e3), world.sample.seen_drift_m(5e3))
 
 
-def test_a_scanner_has_followed_what_it_was_told_since_whenever_that_is_asked() -> None:
+def test_scanner_compensation_does_not_depend_on_the_order_of_calls() -> None:
     compensation = ScannerCompensation()
     turns = [(10.0, 1e-9), (20.0, 3e-9), (20.0, -2e-9), (35.0, 0.0)]
     for since_s, velocity in turns:

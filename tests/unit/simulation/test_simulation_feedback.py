@@ -1,4 +1,4 @@
-"""The z feedback: gains and setpoint matter."""
+"""The z feedback: effects of gains and setpoint."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def asymmetry(said: dict[str, Any]) -> float:
     return float(np.std(seen["Height"] - seen["Height Retrace"]) / np.std(seen["Height"]))
 
 
-def test_a_loop_settles_on_the_surface_without_error() -> None:
+def test_loop_settles_on_the_surface_without_error() -> None:
     z = loop(integral_gain=1500.0).follow(step(5e-9), DT, np.zeros(1))
     assert z[-1, 0] == pytest.approx(5e-9, rel=1e-3)
     assert z.max() < 5.5e-9
@@ -62,7 +62,7 @@ def test_lower_gains_are_slower_and_higher_ones_overshoot() -> None:
     assert at[50.0].max() <= 5e-9
 
 
-def test_gains_beyond_the_limit_oscillate_for_ever() -> None:
+def test_gains_beyond_the_limit_oscillate() -> None:
     unstable = loop(integral_gain=12000.0)
     assert unstable.oscillates
     assert not loop(integral_gain=1500.0).oscillates
@@ -72,7 +72,7 @@ def test_gains_beyond_the_limit_oscillate_for_ever() -> None:
     assert np.abs(z).max() < 200e-9
 
 
-def test_the_tip_parachutes_down_a_cliff_more_the_softer_the_setpoint() -> None:
+def test_tip_parachutes_down_a_cliff_more_the_softer_the_setpoint() -> None:
     def time_down(setpoint: float) -> int:
         z = loop(setpoint=setpoint, integral_gain=300.0).follow(step(-100e-9, 2000), DT, np.zeros(1))[:, 0]
         return int(np.argmax(z < -90e-9))
@@ -105,7 +105,7 @@ def test_without_feedback_the_height_is_constant_and_the_amplitude_shows_the_sam
     assert off["Amplitude"][1][high].mean() < off["Amplitude"][1][~high].mean() - 0.3
 
 
-def test_a_setpoint_above_the_free_amplitude_never_touches() -> None:
+def test_setpoint_above_the_free_amplitude_never_touches() -> None:
     seen = channels(setpoint=1.2)
     assert seen["Height"].std() < 1e-9
     assert seen["Height"].mean() > 1e-6
@@ -122,7 +122,7 @@ def test_amplitude_phase_and_current_answer_to_the_setpoint() -> None:
 
 
 @pytest.mark.parametrize("said", [{"integral_gain": -1.0}, {"proportional_gain": float("nan")}, {"setpoint": 0.0}])
-def test_feedback_without_sense_is_refused(said: dict[str, float]) -> None:
+def test_invalid_feedback_is_refused(said: dict[str, float]) -> None:
     with pytest.raises(InvalidValue):
         loop(**said)
 
@@ -159,7 +159,7 @@ def test_distance_shift_and_slope_of_a_sensor_belong_together() -> None:
 
 
 @pytest.mark.parametrize("setpoint_hz", [0.0, 20.0, -1e4, float("nan"), float("-inf")])
-def test_a_shift_that_no_sensor_has_is_no_setpoint(setpoint_hz: float) -> None:
+def test_impossible_frequency_shift_is_refused_as_setpoint(setpoint_hz: float) -> None:
     settings = FeedbackSettings(mode="frequency-shift", setpoint=-20.0)
     with pytest.raises(InvalidValue, match="between -18"):
         Loop.of(settings, Feedback(setpoint=setpoint_hz))
@@ -167,7 +167,7 @@ def test_a_shift_that_no_sensor_has_is_no_setpoint(setpoint_hz: float) -> None:
         FeedbackSettings(mode="frequency-shift", setpoint=setpoint_hz)
 
 
-def test_what_the_loop_does_not_follow_is_seen_in_the_frequency_shift() -> None:
+def test_feedback_error_is_seen_in_the_frequency_shift() -> None:
     settings = {"surface": "particles", "feedback": {"mode": "frequency-shift", "setpoint": -20.0}}
     spreads = []
     for gain in (1500.0, 150.0):
@@ -179,7 +179,7 @@ def test_what_the_loop_does_not_follow_is_seen_in_the_frequency_shift() -> None:
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
-def test_a_tip_that_becomes_blunt_in_a_scan_is_attracted_more_from_then_on(direction: str) -> None:
+def test_tip_that_becomes_blunt_in_a_scan_is_attracted_more_from_then_on(direction: str) -> None:
     feedback = {"mode": "current", "setpoint": 100e-12, "qplus": True, "sensor": {"oscillation_m": 100e-12}}
     changes = {"schedule": [[20.0, "blunt"]]}
     settings = {"surface": "lattice", "feedback": feedback, "tip_changes": changes}

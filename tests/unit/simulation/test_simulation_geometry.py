@@ -1,4 +1,4 @@
-"""Where a feature of the sample is found in a scan: axes, frame, drift, rotation, order of lines."""
+"""The position of a sample's feature in a scan: axes, frame, drift, rotation, order of lines."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def relative_error(measured: Any, expected: Any) -> float:
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0, -120.0])
 @pytest.mark.parametrize("center", [(0.0, 0.0), (1.3e-6, -0.7e-6)])
-def test_a_pixel_shows_the_sample_at_its_own_place(angle_deg: float, center: tuple[float, float]) -> None:
+def test_pixel_shows_the_sample_at_its_position(angle_deg: float, center: tuple[float, float]) -> None:
     world = hills()
     region = Region(center, (900e-9, 500e-9), np.radians(angle_deg))
     values = height(world, region)
@@ -51,7 +51,7 @@ def test_a_pixel_shows_the_sample_at_its_own_place(angle_deg: float, center: tup
     assert relative_error(values, half_a_frame) > 0.3
 
 
-def test_the_error_of_place_is_far_below_a_pixel() -> None:
+def test_position_error_is_far_below_a_pixel() -> None:
     world = hills()
     region = Region((0.0, 0.0), (900e-9, 500e-9))
     values = height(world, region, (96, 128))
@@ -62,8 +62,8 @@ def test_the_error_of_place_is_far_below_a_pixel() -> None:
     assert errors[0.0] < errors[0.25]
 
 
-def test_drift_is_where_the_sample_went() -> None:
-    """x_tip = x_sample + drift: what is scanned at x is the sample at x - drift."""
+def test_drift_displaces_the_sample_in_the_scan() -> None:
+    # x_tip = x_sample + drift: a pixel at x shows the sample at x - drift
     drift = {"relaxing": [{"total_m": [310e-9, -120e-9, 0.0], "time_s": 1.0}]}  # over long before the scan
     world = hills(drift=drift)
     region = Region((0.0, 0.0), (900e-9, 500e-9))
@@ -91,15 +91,15 @@ TURNS = {"rotation_rad_per_s": 2e-3, "expansion_per_s": -5e-5, "about_m": [1.2e-
 
 
 def turned(x: Any, y: Any, since_s: Any) -> tuple[Any, Any]:
-    """Where `TURNS` has brought places of the sample, written out."""
+    """Return positions of the sample after `TURNS`, written out."""
     scale, angle, (x0, y0) = np.exp(-5e-5 * since_s), 2e-3 * since_s, (1.2e-6, -0.4e-6)
     cos, sin = scale * np.cos(angle), scale * np.sin(angle)
     return x0 + cos * (x - x0) - sin * (y - y0), y0 + sin * (x - x0) + cos * (y - y0)
 
 
 @pytest.mark.parametrize("start_s", [1000.0, 3000.0])
-def test_a_sample_that_turns_and_shrinks_is_seen_turned_and_smaller(start_s: float) -> None:
-    """Row by row: it moves what is seen by a feature while it is scanned."""
+def test_rotating_and_shrinking_sample_is_seen_turned_and_smaller(start_s: float) -> None:
+    # row by row: the sample moves during the scan
     world = hills(drift={"velocity_m_per_s": [0.3e-9, 0.2e-9, 0.0], **TURNS})
     on_sample = Region((-0.5e-6, 0.8e-6), (900e-9, 500e-9))
     since_s = start_s - 1000.0 + (np.arange(48) + 0.25)[:, None]
@@ -118,7 +118,7 @@ def test_a_sample_that_turns_and_shrinks_is_seen_turned_and_smaller(start_s: flo
     assert relative_error(values, world.sample.surface_m(at_first[..., 0], at_first[..., 1])) > 0.3
 
 
-def test_what_is_done_at_a_place_is_done_where_the_sample_has_turned_to() -> None:
+def test_marks_are_made_at_the_rotated_position_of_the_sample() -> None:
     world = hills(drift=TURNS)
     world.compensate((1e-10, 0.0), 1500.0)
     world.crash((2e-6, 1e-6), 10e-9, 1e-6, 3000.0)
@@ -130,7 +130,7 @@ def test_what_is_done_at_a_place_is_done_where_the_sample_has_turned_to() -> Non
     assert truth["turn"]["about_m"] == [1.2e-6, -0.4e-6]
 
 
-def test_a_sample_that_bursts_is_refused() -> None:
+def test_expansion_beyond_any_sample_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"expansion_per_s: 0\.01 is not between -0\.0001 and 0\.0001 1/s"):
         hills(drift={"expansion_per_s": 1e-2})
     with pytest.raises(ConfigError, match="rotation_rad_per_s"):
@@ -155,7 +155,7 @@ def test_trace_and_retrace_show_the_same_place() -> None:
 
 
 @pytest.mark.parametrize("kind", ["steps", "particles", "stamper", "rough"])
-def test_a_zoom_shows_what_the_wide_scan_showed(kind: str) -> None:
+def test_zoom_agrees_with_the_wide_scan(kind: str) -> None:
     world = World.from_settings({"surface": kind, "noise": QUIET, "tip": {"radius_m": 2e-9}}, seed=4, start_s=0.0)
     wide = height(world, Region((0.0, 0.0), (2e-6, 2e-6)), (201, 201), start_s=0.0)
     zoom = height(world, Region((0.25e-6, -0.25e-6), (1e-6, 1e-6)), (201, 201), start_s=0.0)
@@ -164,7 +164,7 @@ def test_a_zoom_shows_what_the_wide_scan_showed(kind: str) -> None:
     assert np.corrcoef(seen[::-1].ravel(), closer.ravel())[0, 1] < 0.9
 
 
-def test_rows_not_yet_taken_are_left_out() -> None:
+def test_rows_not_yet_scanned_are_missing() -> None:
     world = hills()
     region = Region((0.0, 0.0), (900e-9, 500e-9))
     up = world.scan(region, (10, 12), 2.0, 1000.0)
@@ -176,7 +176,7 @@ def test_rows_not_yet_taken_are_left_out() -> None:
     assert taken.tolist() == [False] * 7 + [True] * 3
 
 
-def test_compensating_the_slope_takes_the_tilt_away() -> None:
+def test_slope_compensation_removes_the_tilt() -> None:
     scanner = {"tilt_x": 0.05, "tilt_y": -0.02}
     world = World.from_settings({"surface": "flat", "noise": QUIET, "scanner": scanner}, seed=1, start_s=0.0)
     region = Region((3e-6, 1e-6), (1e-6, 1e-6))
@@ -193,7 +193,7 @@ def test_scans_of_few_pixels_are_taken(shape: tuple[int, int]) -> None:
         assert np.isfinite(values).all()
 
 
-def test_what_cannot_be_scanned_is_refused() -> None:
+def test_impossible_scan_is_refused() -> None:
     world, region = hills(), Region((0.0, 0.0), (1e-6, 1e-6))
     before = world.state()
     for arguments in (
@@ -215,7 +215,7 @@ def test_what_cannot_be_scanned_is_refused() -> None:
     [("particles", (20e-9, 20e-9), "blunt", 0.0), ("particles", (60e-6, 60e-6), "double", 0.3),
      ("stamper", (100e-6, 1e-9), "sharp", 0.7), ("lattice", (1e-5, 1e-5), "blunt", 0.0)],
 )  # fmt: skip
-def test_odd_requests_cost_no_more_than_a_grid_of_limited_size(
+def test_odd_scans_use_a_grid_of_limited_size(
     surface: str, size: tuple[float, float], condition: str, angle: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from afspm.simulation import measuring

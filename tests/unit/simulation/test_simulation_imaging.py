@@ -1,4 +1,4 @@
-"""The tip on the sample: grey dilation against the definition, and what each flaw of a tip shows."""
+"""Imaging by the tip: grey dilation against the definition, and the effect of each flaw of a tip."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def felt_of(height: np.ndarray, tip: TipShape, blur: float = 0.0) -> np.ndarray:
 
 
 def by_definition(height: np.ndarray, shape_m: np.ndarray) -> np.ndarray:
-    """max over (i, j) of height[r + i, c + j] - tip[i, j], tip given on an odd square about its apex."""
+    """Return max over (i, j) of height[r + i, c + j] - tip[i, j], tip given on an odd square about its apex."""
     reach = shape_m.shape[0] // 2
     padded = np.pad(height, reach, constant_values=-1.0)
     ny, nx = height.shape
@@ -30,7 +30,7 @@ def by_definition(height: np.ndarray, shape_m: np.ndarray) -> np.ndarray:
     return np.max(stack, axis=0)
 
 
-def test_a_parabolic_tip_dilates_as_defined() -> None:
+def test_parabolic_tip_dilates_as_defined() -> None:
     height = np.random.default_rng(1).uniform(0.0, 4e-9, (40, 50))
     tip = TipShape(radius_m=10e-9, half_angle_deg=5.0)  # so slim that the cone never touches
     i = np.arange(-12, 13) * STEP
@@ -38,7 +38,7 @@ def test_a_parabolic_tip_dilates_as_defined() -> None:
     np.testing.assert_allclose(felt_of(height, tip), by_definition(height, shape), atol=1e-14)
 
 
-def test_a_wide_cone_is_felt_beside_a_tall_wall() -> None:
+def test_wide_cone_is_felt_beside_a_tall_wall() -> None:
     height = np.zeros((121, 121))
     height[60, 60] = 60e-9  # a needle draws the tip
     tip = TipShape(radius_m=5e-9, half_angle_deg=30.0)
@@ -55,13 +55,13 @@ def test_a_wide_cone_is_felt_beside_a_tall_wall() -> None:
         assert seen[60 + away, 60 + away] == pytest.approx(diagonal, abs=0.6e-9)
 
 
-def test_the_tip_is_never_inside_the_sample() -> None:
+def test_tip_is_never_inside_the_sample() -> None:
     height = np.random.default_rng(2).normal(0.0, 5e-9, (60, 60))
     for tip in (TipShape(3e-9, 20.0), TipShape(40e-9, 25.0), TipShape(3e-9, 20.0, second_apex_m=(9e-9, 4e-9, -1e-9))):
         assert (felt_of(height, tip) >= height - 1e-13).all()
 
 
-def test_a_second_apex_shows_a_lower_copy_on_the_other_side() -> None:
+def test_second_apex_shows_a_lower_copy_on_the_other_side() -> None:
     height = np.zeros((101, 101))
     height[50, 50] = 20e-9
     seen = felt_of(height, TipShape(1e-9, 5.0, second_apex_m=(20e-9, -12e-9, -3e-9)))
@@ -71,7 +71,7 @@ def test_a_second_apex_shows_a_lower_copy_on_the_other_side() -> None:
     assert seen[38, 70] == pytest.approx(0.0, abs=1e-12)
 
 
-def test_a_spline_read_at_points_is_the_blur_that_was_asked_for() -> None:
+def test_spline_at_points_has_the_requested_blur() -> None:
     x = np.arange(200) * STEP
     wave = 2 * np.pi / (16 * STEP)
     height = np.broadcast_to(1e-9 * np.sin(wave * x), (200, 200))

@@ -1,4 +1,4 @@
-"""Noise has the size and the colour it is asked for, flattening takes lines away."""
+"""Noise has the requested size and spectrum, flattening subtracts lines."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_hum_has_its_frequency() -> None:
     assert peak == pytest.approx(5.0, abs=0.01)
 
 
-def test_scars_and_debris_disturb_stretches_of_lines() -> None:
+def test_scars_and_debris_disturb_parts_of_lines() -> None:
     clean, dirty = TipShape(8e-9, 18.0), TipShape(8e-9, 18.0, debris_m=12e-9, flaws=("contaminated",))
     quiet = NoiseSettings(scar_probability=0.0)
     assert disturbances(quiet, [clean] * 100, 1.0, 64, np.random.default_rng(1)) is None
@@ -51,7 +51,7 @@ def test_scars_and_debris_disturb_stretches_of_lines() -> None:
     assert np.count_nonzero(jumps[50:].any(axis=1)) > 5
 
 
-def test_flattening_takes_the_line_of_each_row_away() -> None:
+def test_flattening_subtracts_the_line_of_each_row() -> None:
     x = np.linspace(0.0, 1.0, 50)
     rows = np.random.default_rng(0).normal(size=(20, 2)) @ np.stack([np.ones(50), x])
     np.testing.assert_allclose(flattened(rows, "line"), 0.0, atol=1e-12)
@@ -59,7 +59,7 @@ def test_flattening_takes_the_line_of_each_row_away() -> None:
     np.testing.assert_array_equal(flattened(rows, "none"), rows)
 
 
-def test_a_world_that_flattens_hands_out_flat_lines_of_height_only() -> None:
+def test_flattening_world_delivers_flat_lines_of_height_only() -> None:
     world = World.from_settings({"surface": "steps", "scanner": {"flatten": "line"}}, seed=1, start_s=0.0)
     scan = world.scan(Region((0.0, 0.0), (1e-6, 1e-6)), (32, 48), 1.0, 0.0).channels()
     for name in ("Height", "Height Retrace"):

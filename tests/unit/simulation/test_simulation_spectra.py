@@ -1,4 +1,4 @@
-"""Curves at a point: physical, and dependent on place and tip."""
+"""Curves at a point: physical, and dependent on position and tip."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_current_is_what_the_feedback_held_and_zero_without_bias() -> None:
         assert (np.diff(curve[:, 1]) > 0).all()
 
 
-def test_a_semiconductor_has_a_gap_where_a_metal_has_none() -> None:
+def test_semiconductor_has_a_gap_where_a_metal_has_none() -> None:
     def in_gap(curve: np.ndarray) -> float:
         return float(np.interp(0.3, curve[:, 0], curve[:, 3]) / np.interp(1.2, curve[:, 0], curve[:, 3]))
 
@@ -44,7 +44,7 @@ def test_a_semiconductor_has_a_gap_where_a_metal_has_none() -> None:
     assert in_gap(iv(1.0)) > 0.5
 
 
-def test_the_tip_shows_in_the_curve() -> None:
+def test_tip_shows_in_the_curve() -> None:
     dirty = TipShape(10e-9, 18.0, debris_m=5e-9, flaws=("contaminated",))
     clean, odd = iv(1.0), iv(1.0, dirty)
     state = np.abs(clean[:, 0] - 0.62).argmin()
@@ -80,7 +80,7 @@ def test_approach_and_retract_differ_by_the_jumps() -> None:
     assert np.all(back <= there + 1e-12)
 
 
-def test_pressed_hard_the_cantilever_gives_way_on_a_stiff_sample() -> None:
+def test_contact_slope_is_nearly_one_on_a_stiff_sample() -> None:
     slopes = []
     for material in (0.0, 1.0):
         curve = force(material)
@@ -92,7 +92,7 @@ def test_pressed_hard_the_cantilever_gives_way_on_a_stiff_sample() -> None:
     np.testing.assert_allclose(force(1.0)[:, 3], 0.4 * force(1.0)[:, 1])
 
 
-def test_curves_depend_on_the_place() -> None:
+def test_curves_depend_on_the_position() -> None:
     world = World.from_settings({"surface": "rough"}, seed=2, start_s=0.0)
     places = [(x * 1e-6, y * 1e-6) for x in range(4) for y in range(3)]
     lowest = [world.spectrum("force", place, 0.0)[2][:, 4].min() for place in places]
@@ -103,7 +103,7 @@ def test_curves_depend_on_the_place() -> None:
     assert values.shape == (256, 4)
 
 
-def test_an_unknown_kind_is_refused() -> None:
+def test_unknown_kind_is_refused() -> None:
     world = World.from_settings({}, seed=2, start_s=0.0)
     with pytest.raises(InvalidValue, match="IV"):
         world.spectrum("VI", (0.0, 0.0), 0.0)

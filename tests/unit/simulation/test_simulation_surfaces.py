@@ -1,4 +1,4 @@
-"""Samples: the same at any resolution and in any order, without bounds, and what they claim to be."""
+"""Samples: independent of resolution and order, without bounds, and with their declared properties."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def extent_m(kind: str) -> float:
 
 @pytest.mark.parametrize("kind", GENERATED)
 @pytest.mark.parametrize("origin", [0.0, -3.7e-5])
-def test_a_grid_and_its_points_one_by_one_show_the_same(kind: str, origin: float) -> None:
+def test_grid_and_its_points_one_by_one_show_the_same(kind: str, origin: float) -> None:
     surface = surface_from(kind)
     x = origin + np.linspace(0.0, extent_m(kind), 60)[None, :]
     y = -origin + np.linspace(0.0, extent_m(kind), 50)[:, None]
@@ -36,7 +36,7 @@ def test_a_grid_and_its_points_one_by_one_show_the_same(kind: str, origin: float
 
 
 @pytest.mark.parametrize("kind", [k for k in GENERATED if k != "flat"])
-def test_a_seed_makes_the_sample(kind: str) -> None:
+def test_seed_determines_the_sample(kind: str) -> None:
     x = np.linspace(0.0, extent_m(kind), 80)[None, :]
     a, again, b = (surface_from(kind).relief(x, x.T, 0.0, seed).height_m for seed in (1, 1, 2))
     np.testing.assert_array_equal(a, again)
@@ -44,7 +44,7 @@ def test_a_seed_makes_the_sample(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["particles", "stamper", "rough"])
-def test_no_part_of_the_sample_comes_again(kind: str) -> None:
+def test_sample_has_no_period(kind: str) -> None:
     surface = surface_from(kind)
     x = np.linspace(0.0, 6e-6, 120)[None, :]
     y = np.linspace(0.0, 6e-6, 120)[:, None]
@@ -63,7 +63,7 @@ def test_bumps_of_a_stamper_are_three_to_eleven_bits_long() -> None:
         assert set(runs) <= set(range(3, 12))
 
 
-def test_a_stamper_has_its_pitch_and_its_height() -> None:
+def test_stamper_has_its_pitch_and_its_height() -> None:
     surface = surface_from({"kind": "stamper", "angle_deg": 0.0, "roughness_rms_m": 0.0})
     x, y = np.linspace(0.0, 60e-6, 1500)[None, :], np.linspace(-0.8e-6, 15.2e-6, 1000)[:, None]
     height = surface.relief(x, y, 0.0, 1).height_m
@@ -83,7 +83,7 @@ def test_steps_are_terraces_one_step_apart() -> None:
     assert len(np.unique(np.round(heights * 2))) > 5
 
 
-def test_a_lattice_has_its_constant() -> None:
+def test_lattice_has_its_constant() -> None:
     surface = surface_from({"kind": "lattice", "angle_deg": 0.0, "defect_fraction": 0.0, "strain_m": 0.0})
     a = 0.246e-9
     x, y = np.linspace(0, 4e-9, 300)[None, :], np.linspace(0, 4e-9, 300)[:, None]
@@ -105,7 +105,7 @@ def test_rough_ground_is_self_affine() -> None:
     assert np.std(profile) == pytest.approx(6e-9, rel=0.3)
 
 
-def test_a_picture_is_scaled_and_stands_upright(tmp_path: Path) -> None:
+def test_picture_is_scaled_and_stands_upright(tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     grey = np.zeros((40, 60), dtype=np.uint8)
     grey[:10, :15] = 200  # top left of the picture
@@ -122,7 +122,7 @@ def test_a_picture_is_scaled_and_stands_upright(tmp_path: Path) -> None:
     np.testing.assert_allclose(beyond, height[:, ::-1], atol=1e-12)  # mirrored
 
 
-def test_a_file_that_does_not_fit_is_refused(tmp_path: Path) -> None:
+def test_invalid_surface_file_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.random.default_rng(0).normal(size=(20, 20)))
     with pytest.raises(ConfigError, match="wide"):
         surface_from({"kind": "file", "path": str(tmp_path / "a.npy")})
@@ -165,14 +165,14 @@ def test_files_of_real_microscopes_are_read(name: str, width_m: float | None, sh
     ("name", "why"),
     [("asylum/fmt-igor-fd_SiN_FD_plot.ibw", "no heights"), ("gxsm/gxsm3/scan002-Xp-ADC1.nc", "no heights")],
 )
-def test_a_real_file_that_holds_no_heights_is_refused(name: str, why: str) -> None:
+def test_real_file_without_heights_is_refused(name: str, why: str) -> None:
     if not (DATA / name).is_file():
         pytest.skip(f"{DATA / name} is missing")
     with pytest.raises(FileError, match=why):
         read(DATA / name)
 
 
-def test_a_wrong_surface_is_refused_with_the_nearest_name() -> None:
+def test_wrong_surface_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(ConfigError, match="particles"):
         surface_from("partikles")
     with pytest.raises(ConfigError, match="pitch_m"):

@@ -1,4 +1,4 @@
-"""What lasts from one measurement to the next: tip, marks, chance, and the saved state."""
+"""The state between measurements: tip, marks, random numbers, and the saved state."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def scan_height(w: World, start_s: float, region: Region = REGION) -> np.ndarray
     return w.scan(region, SHAPE, 1.0, start_s).channels()["Height"][1]
 
 
-def test_the_same_seed_and_calls_give_the_same_night() -> None:
+def test_same_seed_and_calls_give_the_same_night() -> None:
     def night(seed: int) -> list[np.ndarray]:
         w = world(seed, tip_changes={"per_hour": 60.0}, drift={"walk_m_per_sqrt_hour": 100e-9})
         seen = [scan_height(w, 0.0), scan_height(w, 60.0)]
@@ -40,7 +40,7 @@ def test_the_same_seed_and_calls_give_the_same_night() -> None:
     assert not np.array_equal(night(3)[0], night(4)[0])
 
 
-def test_what_is_adjusted_during_a_scan_holds_from_the_next_line_on() -> None:
+def test_adjustment_during_a_scan_holds_from_the_next_line_on() -> None:
     late = Adjustment(20.5, Feedback(setpoint=0.95, proportional_gain=0.01, integral_gain=5.0), 0.1)
     whole, changed = (
         world().scan(REGION, SHAPE, 1.0, 0.0, adjusted=adjusted).channels()["Height"][1] for adjusted in ((), (late,))
@@ -55,7 +55,7 @@ def test_what_is_adjusted_during_a_scan_holds_from_the_next_line_on() -> None:
     assert not np.array_equal(down[0][:27], down[1][:27])
 
 
-def test_a_restored_world_goes_on_as_if_nothing_had_happened() -> None:
+def test_restored_world_continues_identically() -> None:
     settings = {"tip_changes": {"per_hour": 60.0, "schedule": [[70.0, "double"], [150.0, "contaminated"]]}}
     w = world(**settings)
     scan_height(w, 0.0)
@@ -70,7 +70,7 @@ def test_a_restored_world_goes_on_as_if_nothing_had_happened() -> None:
     assert again.truth(200.0) == w.truth(200.0)
 
 
-def test_a_state_of_another_world_is_refused_and_nothing_changes() -> None:
+def test_state_of_another_world_is_refused_and_nothing_changes() -> None:
     w = world(3)
     before = w.state()
     damaged = {**before, "tips": [{"t_s": 0.0}]}
@@ -80,7 +80,7 @@ def test_a_state_of_another_world_is_refused_and_nothing_changes() -> None:
     assert w.state() == before
 
 
-def test_a_scheduled_change_comes_in_the_middle_of_a_scan() -> None:
+def test_scheduled_change_happens_in_the_middle_of_a_scan() -> None:
     plan = {"schedule": [[24.2, "double"]]}
     w, sharp = world(tip_changes=plan), world()
     changed, usual = scan_height(w, 0.0), scan_height(sharp, 0.0)
@@ -93,7 +93,7 @@ def test_a_scheduled_change_comes_in_the_middle_of_a_scan() -> None:
     assert [c["cause"] for c in w.truth(48.0)["tip_changes"]] == ["start", "schedule"]
 
 
-def test_a_scan_that_is_stopped_takes_back_what_was_still_to_come() -> None:
+def test_stopped_scan_revokes_predicted_changes() -> None:
     w = world(tip_changes={"schedule": [[40.0, "blunt"]]})
     scan_height(w, 0.0)
     assert not w.tip.is_sharp
@@ -104,7 +104,7 @@ def test_a_scan_that_is_stopped_takes_back_what_was_still_to_come() -> None:
     assert len([c for c in w.truth(80.0)["tip_changes"] if c["cause"] == "schedule"]) == 1
 
 
-def test_what_is_scheduled_while_nothing_is_done_happens_all_the_same() -> None:
+def test_scheduled_change_happens_without_a_scan() -> None:
     w = world(tip_changes={"schedule": [[0.0, "blunt"], [5.0, "sharp"], [10.0, "double"]]})
     assert w.tip.flaws == ("blunt",)
     w.spectrum("IV", (0.0, 0.0), 7.0)
@@ -120,7 +120,7 @@ def changes_by_chance(scans: int, setpoint: float, **settings: Any) -> int:
     return sum(c["cause"] == "chance" for c in w.truth(scans * 3600.0)["tip_changes"])
 
 
-def test_the_tip_changes_at_the_rate_it_is_told_more_at_a_hard_setpoint() -> None:
+def test_tip_changes_at_the_set_rate_and_more_at_a_hard_setpoint() -> None:
     gentle = changes_by_chance(60, 0.7, per_hour=2.0)
     assert gentle == pytest.approx(120, abs=40)
     hard = changes_by_chance(60, 0.4, per_hour=2.0)
@@ -150,7 +150,7 @@ def test_each_flaw_of_the_tip_shows() -> None:
     assert roughness["sharp"] < 1e-9
 
 
-def test_a_crash_leaves_a_crater_that_later_scans_see_and_earlier_ones_did_not() -> None:
+def test_crash_leaves_a_crater_in_later_scans_only() -> None:
     w = world(surface="flat", drift={"velocity_m_per_s": [1e-9, 0.0, 0.0]}, tip_changes={"crash_cures": 1.0})
     assert np.ptp(scan_height(w, 0.0)) < 3e-9
     w.crash((1.5e-7, -2e-7), 20e-9, 1e-7, 100.0)
@@ -166,7 +166,7 @@ def test_a_crash_leaves_a_crater_that_later_scans_see_and_earlier_ones_did_not()
     assert w.sample.surface_m(np.array([5e-8]), np.array([-2e-7]), t_s=50.0)[0] == 0.0
 
 
-def test_pulses_and_crashes_cure_and_worsen_as_often_as_told() -> None:
+def test_pulses_and_crashes_cure_and_worsen_at_the_set_probability() -> None:
     settings = {"pulse_cures": 0.5, "pulse_worsens": 0.2, "crash_cures": 1.0, "crash_worsens": 0.0}
     outcomes = {"cured": 0, "worsened": 0, "unchanged": 0}
     for seed in range(300):
@@ -184,7 +184,7 @@ def test_pulses_and_crashes_cure_and_worsen_as_often_as_told() -> None:
     assert slow.count("cured") == pytest.approx(10, abs=9)
 
 
-def test_a_deeper_crash_leaves_a_deeper_crater_as_far_as_the_tip_holds_out() -> None:
+def test_deeper_crash_leaves_a_deeper_crater_up_to_the_limit_of_the_tip() -> None:
     def crater_m(depth_m: float, condition: str = "sharp") -> float:
         w = world(surface="flat", tip={"condition": condition})
         w.crash((0.0, 0.0), depth_m, 50e-9, 1.0)
@@ -233,7 +233,7 @@ def test_deeper_crashes_and_longer_pulses_cure_more_tips() -> None:
 
 
 @pytest.mark.parametrize(("depth_m", "speed_m_s"), [(0.0, 1e-7), (-1e-9, 1e-7), (math.nan, 1e-7), (1e-9, 0.0)])
-def test_a_crash_of_no_depth_or_no_speed_is_refused(depth_m: float, speed_m_s: float) -> None:
+def test_crash_of_no_depth_or_no_speed_is_refused(depth_m: float, speed_m_s: float) -> None:
     with pytest.raises(InvalidValue):
         world().crash((0.0, 0.0), depth_m, speed_m_s, 1.0)
 
@@ -272,7 +272,7 @@ def test_settings_are_refused_with_place_and_nearest_name() -> None:
             World.from_settings(settings, seed=1, start_s=0.0)
 
 
-def test_all_settings_that_are_wrong_are_told_together() -> None:
+def test_all_wrong_settings_are_reported_together() -> None:
     wrong = {
         "drif": {},
         "noise": {"whit_m": 1.0, "scar_m": -1.0, "hum_m": "loud"},
@@ -287,7 +287,7 @@ def test_all_settings_that_are_wrong_are_told_together() -> None:
     ]  # fmt: skip
 
 
-def test_a_lattice_is_tunnelled_on_unless_told_otherwise() -> None:
+def test_lattice_is_imaged_by_tunnelling_by_default() -> None:
     w = world(surface="lattice")
     region = Region((0.0, 0.0), (3e-9, 3e-9))
     seen = w.scan(region, (64, 64), 1.0, 0.0, bias_v=-0.2).channels()

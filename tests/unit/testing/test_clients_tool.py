@@ -1,4 +1,4 @@
-"""`make test-clients` says what is missing, and what was wrong."""
+"""`make test-clients` reports missing toolchains and failures."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ def client(folder: Path, needs: str, build: str) -> Path:
     return file
 
 
-def test_a_missing_toolchain_is_skipped_aloud(tool: ModuleType, tmp_path: Path) -> None:
+def test_missing_toolchain_is_reported_as_skipped(tool: ModuleType, tmp_path: Path) -> None:
     said = tool.judged(client(tmp_path, "no-such-compiler", ""))
     assert said == "SKIPPED: there is no no-such-compiler on this computer; install the tool of example.org"
 
 
-def test_a_build_that_fails_is_named(tool: ModuleType, tmp_path: Path) -> None:
+def test_build_that_fails_is_named(tool: ModuleType, tmp_path: Path) -> None:
     python = Path(sys.executable).as_posix()
     said = tool.judged(client(tmp_path, python, f'["{python}", "-c", "raise SystemExit(3)"]'))
     assert said == f"not built: {python} -c raise SystemExit(3)"
 
 
-def test_every_client_says_how_it_is_built_and_judged(tool: ModuleType) -> None:
+def test_every_client_has_a_conformance_file(tool: ModuleType) -> None:
     folders = {file.parent for file in (ROOT / "clients").glob("*/README.md")}
     assert {folder for folder in folders if not (folder / "conformance.toml").exists()} == set()
 
 
-def test_an_unknown_client_is_an_error(tool: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unknown_client_is_an_error(tool: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     assert tool.main(["cobol"]) == 1
     assert "there is no client cobol: " in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""The questions of a commissioning: about a panel that there is, and about one that there is not."""
+"""The questions of a commissioning, with and without a panel."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_choice_without_an_answer_is_unseen_and_a_wrong_one_fails() -> None:
     assert UNSEEN == "unseen"
 
 
-def test_what_a_panel_would_show_and_was_not_seen_is_skipped_and_without_a_panel_passes() -> None:
+def test_unseen_outcome_is_skipped_with_a_panel_and_passes_without() -> None:
     with pytest.raises(Skipped, match="not seen at the panel"):
         guide(Person(), has_panel=True).unseen()
     assert "set and read back" in guide(Person(), has_panel=False).unseen()

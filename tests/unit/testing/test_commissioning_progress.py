@@ -1,4 +1,4 @@
-"""The order of a commissioning's steps: what follows from an outcome, what is resumed, and what the matrix is told."""
+"""The order of a commissioning's steps: consequences of an outcome, resumed steps, and the matrix."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ def walk(progress: CommissioningProgress, outcomes: dict[str, CheckOutcome]) -> 
     return done
 
 
-def test_all_steps_are_done_in_their_order() -> None:
+def test_steps_are_done_in_order() -> None:
     progress = CommissioningProgress(STEPS)
     assert walk(progress, {}) == ["read", "gate", "scan", "late"]
     assert progress.passed
 
 
 @pytest.mark.parametrize("outcome", [CheckOutcome.FAILED, CheckOutcome.DECLINED])
-def test_what_was_not_right_or_not_confirmed_blocks_all_that_needs_it(outcome: CheckOutcome) -> None:
+def test_failed_or_declined_step_blocks_dependent_steps(outcome: CheckOutcome) -> None:
     progress = CommissioningProgress(STEPS)
     assert walk(progress, {"gate": outcome}) == ["read", "gate"]
     assert progress.results["late"].outcome is CheckOutcome.BLOCKED
     assert not progress.passed
 
 
-def test_what_is_not_supported_blocks_nothing() -> None:
+def test_unsupported_step_blocks_nothing() -> None:
     progress = CommissioningProgress(STEPS)
     assert walk(progress, {"read": CheckOutcome.SKIPPED})[1:] == ["gate", "scan", "late"]
     assert progress.passed
 
 
-def test_resumed_it_asks_for_the_tip_again_and_leaves_out_what_has_passed() -> None:
+def test_resumed_commissioning_repeats_steps_of_the_tip_and_skips_passed_ones() -> None:
     first = CommissioningProgress(STEPS)
     walk(first, {"late": CheckOutcome.FAILED})
     again = CommissioningProgress.resumed(STEPS, first.results)
@@ -57,7 +57,7 @@ def test_resumed_it_asks_for_the_tip_again_and_leaves_out_what_has_passed() -> N
     assert walk(CommissioningProgress.resumed(STEPS, again.results), {}) == []
 
 
-def test_the_worst_outcome_of_an_operation_counts_and_nothing_left_out_hides_a_pass() -> None:
+def test_worst_outcome_of_an_operation_counts_and_nothing_left_out_hides_a_pass() -> None:
     progress = CommissioningProgress(STEPS)
     walk(progress, {"late": CheckOutcome.SKIPPED})
     assert progress.operations() == {"scan": "passed"}
@@ -79,7 +79,7 @@ def test_nothing_acts_on_the_microscope_before_the_tip_is_withdrawn() -> None:
     assert {operation for one in steps.values() for operation in one.operations} == set(OPERATIONS)
 
 
-def test_resumed_nothing_is_done_behind_a_gate_that_is_declined() -> None:
+def test_resumed_commissioning_stops_at_a_declined_gate() -> None:
     first = CommissioningProgress(STEPS)
     walk(first, {"late": CheckOutcome.FAILED})
     again = CommissioningProgress.resumed(STEPS, first.results)

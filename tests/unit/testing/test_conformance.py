@@ -32,7 +32,7 @@ from afspm.testing.conformance import (
 
 
 class Bench:
-    """A fixture that knows the failure of one check as that of the controller."""
+    """A fixture that excuses the failure of one check as the controller's."""
 
     def __init__(self) -> None:
         self.clock: Clock = ExperimentClock.real()
@@ -72,7 +72,7 @@ OUTCOMES = [
 
 
 @pytest.mark.parametrize(("check", "outcome", "line"), OUTCOMES, ids=lambda one: getattr(one, "name", None))
-def test_outcome_and_line_follow_from_what_a_check_raises(check: Check, outcome: CheckOutcome, line: str) -> None:
+def test_outcome_and_line_follow_from_the_exception_of_a_check(check: Check, outcome: CheckOutcome, line: str) -> None:
     bench = Bench()
     result = attempt(check, bench)
     assert (result.name, result.outcome, result.line) == (check.name, outcome, line)
@@ -95,7 +95,7 @@ def test_lost_ends_the_checks_and_stands_in_the_written_report(tmp_path: Path) -
     assert (written["lost"], written["passed"]) == ("the process ended", False)
 
 
-def test_interrupted_checks_are_reported_as_far_as_they_came(tmp_path: Path) -> None:
+def test_finished_checks_are_reported_after_an_interruption(tmp_path: Path) -> None:
     report = SuiteReport(str(tmp_path))
 
     def interrupt(bench: Bench) -> None:
@@ -147,7 +147,7 @@ def test_junit_report_counts_failures_skips_and_an_early_end(tmp_path: Path) -> 
     assert "a warning" in (failure.text or "")
 
 
-def test_terminal_shows_line_and_evidence_of_a_failure_and_how_it_ended() -> None:
+def test_terminal_shows_line_and_evidence_of_a_failure_and_the_verdict() -> None:
     console = Console(width=200, record=True, highlight=False)
     report = SuiteReport("runs/one")
     report.run([check for check, _, _ in OUTCOMES[:3]], Bench(), lambda result: show_result(result, console))

@@ -1,4 +1,4 @@
-"""Pictures of one surface, told with wrong axes: which idea of the axes explains them."""
+"""Images of one surface, reported with wrong axes: the idea of the axes that explains them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from afspm.testing.translators.checks.picture import CLEARLY, LIKE, Idea, ScanPi
 from afspm.testing.translators.measuring import FrameSettings
 
 WHOLE = Region((2e-6, -1e-6), (1e-6, 1e-6), math.radians(10.0))
-TOLD = "as told"
+TOLD = "as reported"
 
 
 def surface_m(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Bumps without any symmetry."""
+    """Return bumps without any symmetry."""
     random = np.random.default_rng(3)
     places = random.uniform(-0.75e-6, 0.75e-6, (60, 2)) + WHOLE.center_m
     heights = random.uniform(0.2, 1.0, 60)
@@ -43,14 +43,14 @@ def all_pictures(noise: float = 0.02) -> tuple[ScanPicture, list[ScanPicture]]:
     )
 
 
-def test_right_axes_fit_as_told_and_better_than_any_others() -> None:
+def test_right_axes_fit_better_than_any_others() -> None:
     found = likenesses(*all_pictures())
     assert found[TOLD] > 0.95
     assert max(value for name, value in found.items() if name != TOLD) < found[TOLD] - CLEARLY
 
 
 @pytest.mark.parametrize("name", [name for name in ideas(0.0) if not name.startswith((TOLD, "half", "with x and y s"))])
-def test_wrong_axes_are_found_out(name: str) -> None:
+def test_wrong_axes_are_detected(name: str) -> None:
     wrong: Idea = ideas(WHOLE.angle_rad)[name]  # each is its own inverse
     larger, details = all_pictures()
     found = likenesses(wrong(larger), [wrong(detail) for detail in details])
@@ -59,7 +59,7 @@ def test_wrong_axes_are_found_out(name: str) -> None:
     assert found[TOLD] < found[name] - CLEARLY
 
 
-def test_swapped_axes_are_found_out() -> None:
+def test_swapped_axes_are_detected() -> None:
     larger, details = all_pictures()
 
     def swapped(picture: ScanPicture) -> ScanPicture:
@@ -70,8 +70,8 @@ def test_swapped_axes_are_found_out() -> None:
     assert best_of(found)[0] == "with x and y swapped"
 
 
-def test_half_a_frame_is_found_out() -> None:
-    """Told by its centre where its corner is meant."""
+def test_shift_of_half_a_frame_is_detected() -> None:
+    # its centre is reported as its corner
     larger, details = all_pictures()
 
     def moved(picture: ScanPicture) -> ScanPicture:
@@ -82,5 +82,5 @@ def test_half_a_frame_is_found_out() -> None:
     assert found[TOLD] < LIKE
 
 
-def test_noise_is_like_nothing() -> None:
+def test_noise_resembles_nothing() -> None:
     assert max(likenesses(*all_pictures(noise=5.0)).values()) < LIKE

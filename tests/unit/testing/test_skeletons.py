@@ -12,7 +12,7 @@ from afspm.testing.skeletons import write
 
 
 @pytest.mark.parametrize("name", ["tip_top", "tip-top", " Tip Top "])
-def test_a_package_has_the_name_that_was_asked_for_everywhere(name: str, tmp_path: Path) -> None:
+def test_skeleton_has_the_requested_name_everywhere(name: str, tmp_path: Path) -> None:
     folder = write("driver", name, tmp_path)
     assert folder == tmp_path / "tip_top"
     files = {file.relative_to(folder).as_posix(): file.read_text() for file in folder.rglob("*") if file.is_file()}
@@ -26,13 +26,13 @@ def test_a_package_has_the_name_that_was_asked_for_everywhere(name: str, tmp_pat
 
 
 @pytest.mark.parametrize("name", ["2tips", "", "a.b", "../up", "afspm"])
-def test_what_can_not_be_a_package_is_refused(name: str, tmp_path: Path) -> None:
+def test_invalid_package_name_is_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="can't be the name of a package"):
         write("driver", name, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
+def test_existing_folder_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "work.txt").write_text("of years")
     with pytest.raises(FileError, match="this folder already exists"):
@@ -41,7 +41,7 @@ def test_what_is_there_is_left_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["experiment", "component"])
-def test_what_is_made_has_its_name_and_no_error(kind: str, tmp_path: Path) -> None:
+def test_skeleton_has_its_name_and_no_error(kind: str, tmp_path: Path) -> None:
     folder = write(kind, "height-watch", tmp_path)
     text = "".join(file.read_text() for file in folder.iterdir())
     assert not re.search(f"my_?{kind}", text, re.IGNORECASE)

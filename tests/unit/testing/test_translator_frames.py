@@ -13,7 +13,7 @@ REGION = Region((1e-6, -2e-6), (4e-7, 2e-7), 0.3)
 
 
 @given(st.floats(-3.1, 3.1), st.floats(1e-8, 1e-4), st.floats(0.2, 5.0), st.floats(-1e-4, 1e-4))
-def test_no_frame_reaches_beyond_the_one_that_is_set(angle: float, side_m: float, ratio: float, x_m: float) -> None:
+def test_frames_stay_within_the_set_frame(angle: float, side_m: float, ratio: float, x_m: float) -> None:
     whole = Region((x_m, -x_m), (side_m, side_m * ratio), angle)
     frames = FrameSettings(whole)
     grown = Region(whole.center_m, tuple(1.0001 * size for size in whole.size_m), angle)  # type: ignore[arg-type]
@@ -40,7 +40,7 @@ def test_frames_differ_from_each_other_in_place() -> None:
         (Region(REGION.center_m, REGION.size_m, -0.3), "an angle of -17.19° instead of 17.19°"),
     ],
 )
-def test_what_differs_is_said_in_words(other: Region, said: str) -> None:
+def test_difference_is_described_in_words(other: Region, said: str) -> None:
     found = difference(REGION, other)
     assert found.endswith(said)
     assert bool(found) is bool(said)

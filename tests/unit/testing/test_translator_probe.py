@@ -1,4 +1,4 @@
-"""The suite for translators moves the probe in the frame that it began with, whatever its scans have left."""
+"""The suite for translators moves the probe in its first frame, independently of the frames of its scans."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LEFT = ScanParameters(Region((3e-7, 3e-7), (1e-7, 1e-7)), (16, 64), None)
 
 
 class Client:
-    """A client of a microscope, with what is in force there."""
+    """A client of a microscope, with the settings in force there."""
 
     def __init__(self) -> None:
         self.in_force = WHOLE
@@ -39,7 +39,7 @@ class Client:
 
 
 @pytest.mark.parametrize(("left", "frames"), [(WHOLE, 0), (LEFT, 1)], ids=["as it began", "of a scan that failed"])
-def test_the_probe_is_moved_in_the_first_frame(left: ScanParameters, frames: int) -> None:
+def test_probe_is_moved_in_the_first_frame(left: ScanParameters, frames: int) -> None:
     client = Client()
     kit = CheckMeasurements(cast(CheckClient, client), Support())
     client.in_force = left

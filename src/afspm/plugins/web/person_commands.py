@@ -108,7 +108,7 @@ class PersonCommands:
         response = self._ask(ControlRequest.SET_SCAN_PARAMS, wanted)
         if not response.ok:
             return response
-        self._settle(lambda o: o.scan_parameters is not None and _fits(o.scan_parameters, wanted))
+        self._settle(lambda o: o.readings.scan_parameters is not None and _fits(o.readings.scan_parameters, wanted))
         return None
 
     def prepare_spectrum(self, at_m: XY | None) -> Response | None:
@@ -118,7 +118,7 @@ class PersonCommands:
         response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
         if not response.ok:
             return response
-        self._settle(lambda o: o.probe_position is not None and _near(o.probe_position.xy_m, at_m))
+        self._settle(lambda o: o.readings.probe_position is not None and _near(o.readings.probe_position.xy_m, at_m))
         return None
 
     def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:

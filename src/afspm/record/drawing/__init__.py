@@ -1,1 +1,1 @@
-"""One kit for every picture: notebooks, the report, figures and the dashboard draw with it."""
+"""One drawing kit for notebooks, the report, figures and the dashboard."""

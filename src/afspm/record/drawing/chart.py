@@ -15,12 +15,12 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 8.0, 8.0, 34.0
 _MOST_POINTS = 200
 Size = tuple[int, int]
 FORWARD, BACKWARD = "#c2571a", "#3f7fc4"
-"""Colours that can be told apart on white and on black."""
+"""Colours that are distinct on white and on black."""
 
 
 @dataclass(frozen=True)
 class Axis:
-    """A variable: its name, its unit, and its values from the lowest to the highest."""
+    """A variable with its name, unit and range."""
 
     name: str
     unit: str
@@ -29,7 +29,6 @@ class Axis:
 
     @classmethod
     def over(cls, name: str, unit: str, values: Array) -> Axis:
-        """Return an axis that has room for all finite values."""
         finite = values[np.isfinite(values)]
         low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
         if not high > low:
@@ -39,18 +38,18 @@ class Axis:
 
     @property
     def scaled(self) -> tuple[float, str]:
-        """(factor, label with unit) in which its numbers read well."""
+        """Return (factor, label with unit) that give readable numbers."""
         factor, unit = scale(max(abs(self.low), abs(self.high)), self.unit)
         return factor, f"{self.name} / {unit}" if unit else self.name
 
     def at(self, values: Array, begin: float, end: float) -> Array:
-        """Return values as places between two."""
+        """Map values linearly to [begin, end]."""
         return begin + (end - begin) * (values - self.low) / (self.high - self.low)
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve; `opacity` below 1: one of many, drawn thin. An empty colour is that of the text."""
+    """One curve. `opacity` below 1 marks one of many, drawn thin; an empty colour is the text's."""
 
     x: Array
     y: Array
@@ -60,7 +59,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Band:
-    """An area between two curves, behind all others."""
+    """An area between two curves, drawn behind all curves."""
 
     x: Array
     low: Array
@@ -68,7 +67,7 @@ class Band:
 
 
 def chart(x: Axis, y: Axis, curves: Sequence[Curve], band: Band | None = None, size: Size = (320, 210)) -> str:
-    """Return curves in a frame."""
+    """Return curves in a frame, as SVG."""
     width, height = size
     drawn = [] if band is None else [_band(x, y, band, size)]
     drawn += [_line(x, y, curve, size) for curve in curves]

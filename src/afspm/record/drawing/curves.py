@@ -1,4 +1,4 @@
-"""Curves: fewer points without losing a peak, round ticks, and the profile of a scan along a line."""
+"""Curves: thinning that keeps peaks, round ticks, and the profile of a scan along a line."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Pixel = tuple[float, float]
 
 
 def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
-    """Return at most about `most` points: the lowest and highest of each stretch, so that no peak gets lost."""
+    """Return about `most` points at most: minimum and maximum of each interval, so that peaks survive."""
     if len(x) <= most:
         return x, y
     edges = np.linspace(0, len(x), most // 2 + 1).astype(int)
@@ -30,12 +30,12 @@ def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
 
 
 def round_ticks(low: float, high: float, about: int = 5) -> list[float]:
-    """Return round numbers between two, about so many, and two at least where there are any."""
+    """Return about `about` round ticks in [low, high], at least two where possible."""
     if not high > low:
         return [low]
     power = 10.0 ** math.floor(math.log10((high - low) / about))
     found: list[float] = []
-    for factor in (0.5, 1, 2, 5, 10):  # the widest steps that leave two, or the first that are few enough
+    for factor in (0.5, 1, 2, 5, 10):  # the first step with few enough ticks; a wider one must leave two
         before, found = found, _multiples(power * factor, low, high)
         if len(found) < 2 <= len(before):
             return before
@@ -55,7 +55,7 @@ def profile(values: Array, size_m: tuple[float, float], begin: Pixel, end: Pixel
     Args:
         values: [y, x], y ascending; NaN where nothing was measured.
         size_m: of the scan.
-        begin, end: (column, row), fractions of pixels allowed; what lies outside is moved to the border.
+        begin, end: (column, row), fractions of pixels allowed; positions outside are moved to the border.
     """
     ny, nx = values.shape
     (x0, y0), (x1, y1) = ((min(max(x, 0.0), nx - 1.0), min(max(y, 0.0), ny - 1.0)) for x, y in (begin, end))
@@ -73,7 +73,7 @@ def _interpolated(values: Array, x: Array, y: Array) -> Array:
     right, high = np.minimum(left + 1, nx - 1), np.minimum(low + 1, ny - 1)
     u, v = x - left, y - low
     total = np.zeros(x.shape)
-    # a neighbour of no weight must not spoil it with its NaN
+    # 0 * NaN is NaN: a neighbour without weight must not count
     for rows, columns, weights in (
         (low, left, (1 - u) * (1 - v)),
         (low, right, u * (1 - v)),

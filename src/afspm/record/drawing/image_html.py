@@ -1,4 +1,4 @@
-"""A picture of values as HTML: the image with a scale bar in it, and a colour bar beside it."""
+"""An image of values as HTML, with a scale bar inside and a colour bar beside it."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _PILL = "background:rgba(0,0,0,.55);padding:0 3px;border-radius:2px"
 
 @dataclass(frozen=True)
 class Shown:
-    """Values as a picture.
+    """Values as an image.
 
     Attributes:
         image: a PNG or WebP, y upwards.
-        span: the values at the ends of the colours.
+        span: the values at the ends of the colour map.
     """
 
     image: bytes
@@ -31,10 +31,10 @@ class Shown:
 
 
 def shown(values: Array, largest_px: int, palette: str = PALETTES[0], *, small: bool = False) -> Shown:
-    """Return values [y, x], y ascending, as a picture of at most `largest_px` a side.
+    """Return values [y, x], y ascending, as an image of at most `largest_px` a side.
 
     Args:
-        small: a file of few bytes counts for more than exact colours.
+        small: prefer a small file to exact colours.
     """
     some = reduced(values, largest_px, each_side=True)
     span = value_range(some)
@@ -42,13 +42,13 @@ def shown(values: Array, largest_px: int, palette: str = PALETTES[0], *, small: 
 
 
 def data_url(image: bytes) -> str:
-    """Return a PNG or WebP as an address that needs no file."""
+    """Return a PNG or WebP as a data URL."""
     kind = "webp" if image.startswith(b"RIFF") else "png"
     return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
 
 
 def image_html(image: Shown, size_m: tuple[float, float], unit: str, width: str, palette: str = PALETTES[0]) -> str:
-    """Return a picture with scale bar and colour bar; `width` of the image as CSS has it, e.g. "256px"."""
+    """Return an image with scale bar and colour bar; `width` is a CSS length, e.g. "256px"."""
     return (
         f'<div style="display:flex;gap:6px"><div style="position:relative;width:{width}">'
         f'<img alt="" style="display:block;width:100%;image-rendering:pixelated;'
@@ -64,7 +64,7 @@ def round_length_m(length_m: float) -> float:
 
 
 def scale_bar(size_m: tuple[float, float]) -> str:
-    """Return a bar of a round length, to lie over the lower left corner of a picture of this size."""
+    """Return a bar of round length, positioned in the lower left corner of an image of this size."""
     length_m = round_length_m(size_m[0] / 3.0)
     return (
         f'<div style="position:absolute;left:4%;bottom:4%;width:{100.0 * length_m / size_m[0]:.3g}%">'

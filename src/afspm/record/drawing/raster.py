@@ -1,4 +1,4 @@
-"""Arrays as pictures: the range of values that is shown, indices into a colour map, PNG."""
+"""Arrays as images: the shown range of values, indices into a colour map, PNG."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from PIL import Image
 
 Array = NDArray[np.float64]
-_SAMPLED = 65_536  # values that the range is found from, of a larger picture evenly chosen ones
+_SAMPLED = 65_536  # percentiles of larger images are estimated from an even sample
 _OUTLIERS_PERCENT = 1.0
-_FAST = 1  # of zlib: pictures are made by the dozen, and looked at once
+_FAST = 1  # zlib's fastest level: dozens of images are made, each is viewed once
 _QUALITY = 80
 
 
 class Contrast(Enum):
-    """The values that the ends of the colour map stand for: all but the outer percents, or all."""
+    """The values at the ends of the colour map: the 1st and 99th percentile, or the extremes."""
 
     ROBUST = "robust"
     FULL = "full"
@@ -40,9 +40,9 @@ class ValueRange:
 
 
 def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return the range of the finite values: 0 to 1 if there are none, a range around a single one."""
+    """Return the range of the finite values; 0 to 1 if there are none, a range around a single value."""
     stride = max(1, values.size // _SAMPLED)
-    # a stride that shares no divisor with the width, or it would look at a few columns only
+    # the stride shares no divisor with the width; otherwise it would sample a few columns only
     while stride > 1 and np.gcd(stride, max(values.shape[-1], 1)) != 1:
         stride += 1
     some = values.ravel()[::stride] if contrast is Contrast.ROBUST else values.ravel()
@@ -62,7 +62,7 @@ def value_range(values: Array, contrast: Contrast = Contrast.ROBUST) -> ValueRan
 
 
 def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST) -> ValueRange:
-    """Return the range for pictures that are compared: no smaller than that of any."""
+    """Return one range for compared images: it contains the range of each."""
     spans = [value_range(values, contrast) for values in pictures]
     return ValueRange(min(span.low for span in spans), max(span.high for span in spans))
 
@@ -88,7 +88,7 @@ def png(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
 
 
 def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
-    """Return the same in a third of the bytes, where exact colours don't matter."""
+    """Return the image in a third of the bytes of `png`, with inexact colours."""
     written = io.BytesIO()
     image = _image(levels, palette)
     image.info["transparency"] = UNMEASURED
@@ -97,16 +97,16 @@ def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
 
 
 def reduced(values: Array, largest_px: int, *, each_side: bool = False) -> Array:
-    """Return the means of blocks of pixels, so that at most `largest_px` a side are left; NaN counts for nothing.
+    """Return the means of blocks of pixels, so that at most `largest_px` a side remain; NaN is ignored.
 
     Args:
-        each_side: reduce each side by itself, for pictures that are drawn in the proportions of their region; else
-            blocks are squares of pixels.
+        each_side: reduce each side separately, for images drawn in the proportions of their region; otherwise blocks
+            are squares of pixels.
     """
     steps = [max(1, -(-count // largest_px)) for count in values.shape]
     if max(steps) == 1:
         return values
-    # a few long lines are not put together beyond their number
+    # a block is not larger than the image: a scan of a few long lines keeps at least one row
     across, along = steps if each_side else (min(max(steps), count) for count in values.shape)
     rows, columns = values.shape[0] // across, values.shape[1] // along
     blocks = values[: rows * across, : columns * along].reshape(rows, across, columns, along)

@@ -1,4 +1,4 @@
-"""Time lines as HTML: rows of coloured stretches over a run."""
+"""Timelines as HTML: rows of coloured intervals over a run."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from typing import Protocol
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import duration_text, time_of_day
 
-COLUMNS = 720  # stretches narrower than this part of the run are put together
+COLUMNS = 720  # resolution of a row: intervals within one column are merged
 MOST_PICTURES = 14
 _STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 _DAY_S = _STEPS_S[-1]
 _EDGES = ((0.0, 3.0, 0), (97.0, 100.0, -100))
-"""Percent of the row in which the text of a tick does not lie about the tick: from, to, and its shift."""
+"""(from, to, shift) in percent: near the ends of a row the label of a tick is shifted inwards."""
 
 CSS = """
 .lanes{display:grid;gap:3px}
@@ -39,7 +39,7 @@ CSS = """
 
 
 class Interval(Protocol):
-    """Something that was so for a while; an end of None: it still is."""
+    """An interval of time; an end of None means it continues."""
 
     @property
     def label(self) -> str: ...
@@ -53,7 +53,7 @@ class Interval(Protocol):
 
 @dataclass(frozen=True)
 class TimelineRow:
-    """One row of a time line; `style` gives the class of the style sheet for a label."""
+    """One row of a timeline; `style` gives the CSS class of a label."""
 
     name: str
     spans: Iterable[Interval]
@@ -62,7 +62,7 @@ class TimelineRow:
 
 @dataclass
 class Stretch:
-    """Intervals that share columns of the picture: the longest, and how many there are."""
+    """Intervals that share columns of the image: the longest, and their number."""
 
     begin: int
     end: int
@@ -85,13 +85,13 @@ def timeline_html(
 
     Args:
         zone: of the axis; None: this computer's.
-        local_too: whether there is a second axis with the times of this computer's zone.
-        pictures: the time of each, and its HTML; they stand above the rows. Of those that would overlap, the last does.
+        local_too: add a second axis in this computer's zone.
+        pictures: (time, HTML) of each, shown above the rows; of overlapping pictures only the last is shown.
     """
     read = [(row, tuple(row.spans)) for row in rows]
     starts = [spans[0].start_ns for _, spans in read if spans]
     if not starts:
-        return '<p class="nothing">Nothing has been heard yet.</p>'
+        return '<p class="nothing">No data yet.</p>'
     begin_ns = min(starts) if begin_ns is None else begin_ns
     end_ns = max(end_ns, begin_ns + NS_PER_S)
     body = "".join(_row(row, stretches(spans, begin_ns, end_ns), begin_ns, end_ns, zone) for row, spans in read)
@@ -108,7 +108,7 @@ def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:
     ticks = []
     for s in at_s:
         percent = 100.0 * (s * NS_PER_S - begin_ns) / (end_ns - begin_ns)
-        # the page ends where the row does: what reaches beyond is cut off
+        # the page ends where the row does: labels near the ends are shifted inwards
         within = next((f";transform:translateX({by}%)" for low, high, by in _EDGES if low <= percent <= high), "")
         text = time_of_day(round(s * NS_PER_S), zone, seconds=seconds)
         ticks.append(f'<span style="left:{percent:.2f}%{within}">{text}</span>')
@@ -116,21 +116,21 @@ def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:
 
 
 def tint_class(name: str) -> str:
-    """Return a class of the style sheet that is the same for a name wherever it is shown."""
+    """Return the CSS class of a name, the same in every row."""
     return f"tint-{sum(ord(letter) * (i + 7) for i, letter in enumerate(name)) % 8}"
 
 
 def time_ticks(begin_s: float, end_s: float, about: int = 7) -> list[float]:
-    """Return round times of day between two, seconds since the epoch; never many more than `about`."""
+    """Return about `about` round times of day in [begin_s, end_s], in seconds since the epoch."""
     step = next((s for s in _STEPS_S if (end_s - begin_s) / s <= about), None)
-    if step is None:  # a time that was told wrongly, in the far future, must not make millions of ticks
+    if step is None:  # a wrong time in the far future must not make millions of ticks
         step = _DAY_S * -(-int(end_s - begin_s) // (about * _DAY_S))
     first = -(-begin_s // step) * step
     return [first + i * step for i in range(int((end_s - first) // step) + 1)] if first <= end_s else []
 
 
 def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Stretch]:
-    """Return intervals in columns of the picture. Of several in one column the longest is shown, and says so."""
+    """Return intervals in columns of the image; of several in one column the longest is shown, with their number."""
     width_ns = (end_ns - begin_ns) / COLUMNS
     found: list[Stretch] = []
     for span in spans:
@@ -142,7 +142,6 @@ def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Str
 
 
 def _pictures(pictures: Iterable[tuple[int, str]], begin_ns: int, end_ns: int) -> str:
-    """Return a row of pictures, each ending at its time."""
     width = 100.0 / MOST_PICTURES
     last = {}
     for time_ns, html in pictures:

@@ -1,10 +1,10 @@
-"""A recorded run in the formats of others: `afspm export`.
+"""A recorded run in other file formats: `afspm export`.
 
-An exporter is a module that a package declares by its format. `write(run, row)` yields the ends of the names and the
-contents of the files of a scan or spectrum. Two more functions where the format has such files: `tables(run, scans,
-spectra)` yields names and contents of files about all that was measured, and `grid_file(stack, metadata)` returns the
-spectra of a grid as one file. A format that keeps everything in one file has `archive(run, scans, spectra, folder)`
-instead of `write`: it writes that file, which may be larger than memory, and yields its path.
+An exporter is a module that a package declares by its format. `write(run, row)` yields (suffix, content) of each file
+of a scan or spectrum. Two functions are optional: `tables(run, scans, spectra)` yields (name, content) of files about
+the whole run, and `grid_file(stack, metadata)` returns the spectra of a grid as one file.
+A format that keeps everything in one file has `archive(run, scans, spectra, folder)` instead of `write`: it writes that
+file, which may be larger than memory, and yields its path.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ Writer = Callable[[Run, ScanRow | SpectrumRow], Iterator[tuple[str, bytes]]]
 def export(
     run: Run, to: str, folder: Path, scans: str | None = None, tell: Callable[[str], None] | None = None
 ) -> Iterator[Path]:
-    """Write a run in another format, and yield each file as it is there.
+    """Write a run in another format, and yield the path of each written file.
 
     Args:
         to: a format that a package declares an exporter for.
-        folder: made if it is not there.
+        folder: created if it is missing.
         scans: numbers of scans, as for `chosen`; None: all scans and spectra.
-        tell: is told what is left out, and why; None: a file of the record that is damaged is an error.
+        tell: called with a message for each omitted measurement; None: a damaged file of the record is an error.
 
     Raises:
         InvalidValue: there is no such format, or no such scan.
@@ -60,17 +60,17 @@ def export(
             return
         for name, content in module.tables(run, wanted, spectra) if hasattr(module, "tables") else ():
             yield _written(folder / name, content)
-        yield from _one_by_one(module.write, run, [*wanted, *spectra], folder, tell)
+        yield from _write_each(module.write, run, [*wanted, *spectra], folder, tell)
         for name, stack in grids(run, spectra) if hasattr(module, "grid_file") else ():
             yield _written(folder / f"{name}.{to}", module.grid_file(stack, run.metadata))
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(folder)) from error
 
 
-def _one_by_one(
+def _write_each(
     write: Writer, run: Run, rows: Sequence[ScanRow | SpectrumRow], folder: Path, tell: Callable[[str], None] | None
 ) -> Iterator[Path]:
-    """A file that is damaged costs what is in it, and not all the others."""
+    # a damaged file costs its own measurement, not all others
     for row in rows:
         try:
             for end, content in write(run, row):
@@ -93,10 +93,10 @@ def _written(path: Path, content: bytes) -> Path:
 
 
 def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
-    """The scans that are meant by "3", "1-5,8" or "7-" (from 7 on).
+    """Return the scans selected by "3", "1-5,8" or "7-" (from 7 on).
 
     Raises:
-        InvalidValue: that is no list of numbers, or one of them is none of a scan.
+        InvalidValue: the text is not a list of numbers, or a scan does not exist.
     """
     by_number = {row.number: row for row in rows}
     last = max(by_number, default=0)
@@ -116,9 +116,9 @@ def chosen(rows: list[ScanRow], numbers: str) -> list[ScanRow]:
 
 
 def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, SpectrumStack]]:
-    """Yield each grid of at least two by two spectra that were measured alike, with the name of its file.
+    """Yield each grid of at least two by two equally measured spectra, with the name of its file.
 
-    A spectrum whose file is damaged is left out, as one that was not measured.
+    A spectrum with a damaged file is left out, like an unmeasured one.
     """
     spectra: dict[tuple[str, tuple[str, ...]], list[Spectrum]] = {}
     for row in rows:
@@ -126,7 +126,7 @@ def grids(run: Run, rows: Sequence[SpectrumRow]) -> Iterator[tuple[str, Spectrum
             spectrum = run.spectrum(row)
             spectra.setdefault((spectrum.kind, spectrum.names), []).append(spectrum)
     for number, ((kind, _), alike) in enumerate(spectra.items(), 1):
-        with suppress(InvalidValue):  # not on a grid
+        with suppress(InvalidValue):  # these spectra form no grid
             stack = stacked(alike, interpolate=True)
             if min(len(stack.points.x_m), len(stack.points.y_m)) > 1:
                 name = re.sub(r"[^\w-]+", "-", kind).strip("-") or "spectra"

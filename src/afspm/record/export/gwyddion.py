@@ -1,10 +1,10 @@
 """Gwyddion's own files (.gwy): all channels of a scan, or the curves of a spectrum, in one.
 
 The format: Gwyddion user guide, "Format of Gwyddion files". A file is "GWYP" and an object; an object is its name, the
-size of its components, and these: name, type, value. Numbers are little-endian, texts end with a zero byte.
+size of its components, and the components: name, type, value. Numbers are little-endian, texts end with a zero byte.
 
-Gwyddion's y points down, and so do its rows: a field lies at the mirrored y. Its sides are those of whole pixels, ours
-end at the middles of the outermost.
+Gwyddion's y axis points down: rows are written in reverse and y is negated. A field of Gwyddion extends to the outer
+edges of its pixels; a region of afspm ends at the centres of the outermost pixels.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Item = tuple[str, str, object]
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield the file of a scan or spectrum, with the end of its name."""
+    """Yield (suffix, content) of the file of a scan or spectrum."""
     meta = _meta(run.about(row))
     if isinstance(row, ScanRow):
         yield ".gwy", scan_file(list(run.scan(row).values()), meta)
@@ -38,7 +38,6 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
-    """The channels of one scan."""
     items: list[Item] = []
     for number, scan in enumerate(scans):
         values = scan.values[::-1]
@@ -46,14 +45,14 @@ def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
         items.append((f"/{number}/data", "o", _field(scan, np.where(unknown, _typical(values), values), scan.unit)))
         items.append((f"/{number}/data/title", "s", scan.channel))
         items.append((f"/{number}/data/visible", "b", True))
-        if unknown.any():  # Gwyddion knows no NaN: what was not measured is masked
+        if unknown.any():  # Gwyddion has no NaN: unmeasured pixels are masked
             items.append((f"/{number}/mask", "o", _field(scan, unknown.astype(np.float64), "")))
         items.append((f"/{number}/meta", "o", _object("GwyContainer", [(k, "s", v) for k, v in meta.items()])))
     return _MAGIC + _object("GwyContainer", items)
 
 
 def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
-    """The curves of one spectrum, as a graph for each variable over the first."""
+    """Return one spectrum with a graph for each variable over the first."""
     items: list[Item] = []
     swept, units = spectrum.values[:, 0] if spectrum.names else np.empty(0), spectrum.units
     for number, name in enumerate(spectrum.names[1:], 1):
@@ -78,9 +77,9 @@ def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
 
 
 def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
-    """The spectra of a grid as volume data: a brick for each variable and direction, the mean over repeats.
+    """Return the spectra of a grid as volume data: a brick for each variable and direction, the mean over repeats.
 
-    What was not measured has the median of the brick, since Gwyddion knows no NaN there.
+    Unmeasured points get the median of the brick, since Gwyddion's bricks have no NaN.
     """
     meta = _object("GwyContainer", [(name, "s", text) for name, text in {"kind": stack.kind, **metadata}.items()])
     items: list[Item] = []
@@ -93,7 +92,6 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
 
 
 def _bricks(stack: SpectrumStack) -> Iterator[tuple[str, str, NDArray[np.float64]]]:
-    """Yield title, unit and values, shape (y, x, z), of each variable and direction."""
     for name, curves in stack.curves.items():
         for number, direction in enumerate(stack.directions):
             yield f"{name}, {direction}", stack.units[name], mean_over_repeats(curves)[:, :, number]
@@ -184,17 +182,16 @@ def _typical(values: NDArray[np.float64]) -> float:
 
 
 def _meta(about: PlainMapping) -> dict[str, str]:
-    """Return what is known of a measurement as names and texts, as Gwyddion shows them."""
-    said = {}
+    texts = {}
     for name, value in about.items():
         if name in ("channels", "variables", "content") or value is None:
             continue
         if name == "angle_rad":
-            said["angle"] = f"{math.degrees(value):g} deg"
+            texts["angle"] = f"{math.degrees(value):g} deg"
         elif name == "notes":
-            said |= {f"note {number}": note for number, note in enumerate(value, 1)}
+            texts |= {f"note {number}": note for number, note in enumerate(value, 1)}
         elif isinstance(value, Mapping):
-            said |= {f"{name} {inner}": str(one) for inner, one in value.items()}
+            texts |= {f"{name} {inner}": str(one) for inner, one in value.items()}
         else:
-            said[str(name)] = str(value)
-    return said
+            texts[str(name)] = str(value)
+    return texts

@@ -1,4 +1,4 @@
-"""NetCDF (.nc, classic format): xarray, MATLAB, ncdump … read it. A file for each scan and each spectrum."""
+"""NetCDF (.nc, classic format), for xarray, MATLAB, ncdump …: a file for each scan and each spectrum."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from afspm.record.tables import ScanRow, SpectrumRow
 from afspm.storage.formats.netcdf import Attributes, Variable, encoded
 
 _RENAMED = {"mode": "control_mode", "filename": "controller_file"}
-"""scipy's reader, which xarray uses, has attributes of its own by these names."""
+"""scipy's reader, which xarray uses, has its own attributes with these names."""
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield the file of a scan or spectrum, with the end of its name."""
+    """Yield (suffix, content) of the file of a scan or spectrum."""
     about = run.about(row)
     if isinstance(row, ScanRow):
         yield ".nc", scan_file(run.scan(row), about)
@@ -27,7 +27,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
-    """All channels over (y, x), which are those of the frame before it was turned."""
+    """Return all channels over (y, x), the axes of the unrotated frame."""
     (left, low), (width, height), (rows, columns) = scans.region.top_left_m, scans.region.size_m, scans.first.shape
     variables = {
         "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
@@ -40,7 +40,7 @@ def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
 
 
 def spectrum_file(spectrum: Spectrum, about: Mapping[str, object]) -> bytes:
-    """Every variable over (point)."""
+    """Return every variable over (point)."""
     variables = {
         name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit})
         for number, (name, long_name, unit) in enumerate(
@@ -51,7 +51,7 @@ def spectrum_file(spectrum: Spectrum, about: Mapping[str, object]) -> bytes:
 
 
 def _attributes(about: Mapping[str, object]) -> Attributes:
-    """Texts and numbers as they are; whole numbers as texts, since a float64 has no room for all of them."""
+    # whole numbers are written as texts: float64, the only number type here, can't hold all of them
     made: dict[str, str | float] = {}
     for name, value in about.items():
         if value is not None and name not in ("channels", "variables"):

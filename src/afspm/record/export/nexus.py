@@ -20,7 +20,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 
 def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
-    """The spectra of a grid: an NXdata over (y, x, swept variable) for each direction, the mean over repeats."""
+    """Return the spectra of a grid: an NXdata over (y, x, swept variable) a direction, the mean over repeats."""
     import h5py
 
     content = io.BytesIO()
@@ -47,7 +47,7 @@ def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
 
 
 def _about_grid(stack: SpectrumStack, swept: str, fields: Mapping[str, str]) -> dict[str, object]:
-    """Return what `afspm.read` makes the spectra from; `ways`: the directions that a column is in."""
+    # `afspm.read` rebuilds the spectra from this; `ways` lists the directions present in a column
     columns = {
         column: {"name": column, "unit": stack.units[name], "field": fields[name], "ways": [direction]}
         for direction, one in zip(stack.directions, stack.columns, strict=False)
@@ -67,7 +67,7 @@ def _about_grid(stack: SpectrumStack, swept: str, fields: Mapping[str, str]) -> 
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield the file of a scan or spectrum, with the end of its name."""
+    """Yield (suffix, content) of the file of a scan or spectrum."""
     import h5py
 
     run.about(row)  # raises where the file is damaged

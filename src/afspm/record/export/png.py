@@ -1,4 +1,4 @@
-"""Pictures (.png): one for each channel of a scan, with scale bar and colour bar, and one for each spectrum."""
+"""Images (.png): one for each channel of a scan, with scale bar and colour bar, and one for each spectrum."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DPI = 150
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield a picture for each channel of a scan, or of a spectrum, with the end of its name. Needs matplotlib."""
+    """Yield (suffix, content) of an image for each channel of a scan, or of a spectrum. Needs matplotlib."""
     time = f"{iso_utc(row.time_ns)[:19].replace('T', ' ')} UTC"
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
@@ -34,7 +34,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def scan_figure(scan: Scan, title: str) -> Figure:
-    """The values as they are, not levelled, with a colour bar and a scale bar."""
+    """Return a figure of the raw values, not levelled, with colour bar and scale bar."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(5.2, 4.6), layout="constrained")
@@ -46,7 +46,7 @@ def scan_figure(scan: Scan, title: str) -> Figure:
 
 
 def spectrum_figure(spectrum: Spectrum, title: str) -> Figure:
-    """Every variable over the first, one above the other."""
+    """Return a figure of every variable over the first, one above the other."""
     from matplotlib.figure import Figure
 
     others = list(zip(spectrum.names, spectrum.units, spectrum.values.T, strict=True))[1:]

@@ -1,4 +1,4 @@
-"""Tables (.csv): what was measured and what happened, and the curves of each spectrum."""
+"""Tables (.csv): measurements, events, and the curves of each spectrum."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.record.tables import ScanRow, SpectrumRow, Table
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield the curves of a spectrum, with the end of the file's name."""
+    """Yield (suffix, content) of the curves of a spectrum; nothing for a scan."""
     if isinstance(row, SpectrumRow):
         spectrum = run.spectrum(row)
         header = [f"{name} [{unit}]" for name, unit in zip(spectrum.names, spectrum.units, strict=True)]
@@ -21,7 +21,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterator[tuple[str, bytes]]:
-    """Yield a table of each kind, with the name of its file."""
+    """Yield (name, content) of a table of each kind."""
     by_name: dict[str, Table[Any]] = {
         "scans": Table(scans, ScanRow),
         "spectra": Table(spectra, SpectrumRow),
@@ -36,12 +36,11 @@ def tables(run: Run, scans: list[ScanRow], spectra: list[SpectrumRow]) -> Iterat
     }
     for name, table in by_name.items():
         columns = table.columns()
-        rows = zip(*(_told(column, values) for column, values in columns.items()), strict=True)
+        rows = zip(*(_cells(column, values) for column, values in columns.items()), strict=True)
         yield f"{name}.csv", _csv([column.removesuffix("_ns") for column in columns], rows)
 
 
-def _told(column: str, values: list[Any]) -> list[object]:
-    """Times as ISO 8601 in UTC, what is not known as nothing."""
+def _cells(column: str, values: list[Any]) -> list[object]:
     if column.endswith("_ns"):
         return ["" if value is None else iso_utc(value) for value in values]
     return ["" if value is None else value for value in values]

@@ -1,4 +1,4 @@
-"""The morning report: `report.html`, one file that needs no other, and figures beside it, of a recorded run."""
+"""The morning report of a recorded run: `report.html`, one self-contained file, and figures beside it."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ REPORT_FILE = "report.html"
 
 
 def write(folder: str | Path) -> Path:
-    """Write `report.html` and the figures that are not there yet; returns the file.
+    """Write `report.html` and missing figures; return the path of the report.
 
     Needs the extra `record`; the figures need `plot`.
 
     Args:
-        folder: of a run, which may still go on; or of all runs: its newest is meant.
+        folder: of a run, which may still go on; or of all runs: then the newest run.
 
     Raises:
         FileError: there is no record, or the report can't be written.
     """
     with open_run(folder) as run:
-        told = story.read(run)
-        bad_ns = pictures.bad_ns(run, told)
-        shown = pictures.of_scans(run, pictures.chosen(told.scans, kept_ns=bad_ns), bad_ns)
+        contents = story.read(run)
+        bad_ns = pictures.bad_ns(run, contents)
+        shown = pictures.of_scans(run, pictures.chosen(contents.scans, kept_ns=bad_ns), bad_ns)
         target = run.folder / REPORT_FILE
         try:
-            pictures.draw(run, told, shown)
-            text = page.html(told, shown, curves.read(run), pictures.of_figures(run.folder))
+            pictures.draw(run, contents, shown)
+            text = page.html(contents, shown, curves.read(run), pictures.of_figures(run.folder))
             replace_file(target, [text.encode()], synced=False)
         except OSError as error:
             raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error

@@ -1,4 +1,4 @@
-"""The spectra of a report: for each kind all curves with their mean and spread, and small ones that enlarge."""
+"""The spectra of a report: for each kind all curves with mean and spread, and small charts that enlarge."""
 
 from __future__ import annotations
 
@@ -32,24 +32,23 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SpectrumCurves:
-    """A spectrum, and its row."""
+    """A spectrum with its row."""
 
     row: SpectrumRow
     spectrum: Spectrum
 
     @property
     def curves(self) -> dict[str, Array]:
-        """The variables on the way there, by name."""
+        """The variables of the forward sweep, by name."""
         return ways(self.spectrum)[1][0]
 
     @property
     def back(self) -> dict[str, Array]:
-        """Those that were measured on the way back, too."""
+        """The variables measured on the backward sweep too."""
         directions = ways(self.spectrum)[1]
         return directions[1] if len(directions) > 1 else {}
 
     def values(self, name: str) -> Array:
-        """Return all values of a variable, of both ways."""
         return np.concatenate([way[name] for way in (self.curves, self.back) if name in way])
 
     @property
@@ -59,7 +58,7 @@ class SpectrumCurves:
 
 @dataclass(frozen=True)
 class SpectrumGroup:
-    """Spectra of one kind and of the same variables; `count`: with those that were not read."""
+    """Spectra of one kind with the same variables; `count` includes unread ones."""
 
     measured: Sequence[SpectrumCurves]
     count: int
@@ -74,7 +73,7 @@ class SpectrumGroup:
 
     @property
     def axes(self) -> tuple[Axis, dict[str, Axis]]:
-        """The axis of what was swept, and that of each variable, with room for all curves."""
+        """Return the axis of the sweep and an axis for each variable, in range of all curves."""
         first = self.first
         units = dict(zip(first.names, first.units, strict=True))
         swept = np.concatenate([one.swept for one in self.measured])
@@ -86,7 +85,7 @@ class SpectrumGroup:
 
 
 def read(run: Run) -> list[SpectrumGroup]:
-    """Read the spectra of a run, of too many some evenly among them."""
+    """Read the spectra of a run; beyond the limit, an even selection."""
     rows: dict[tuple[object, ...], list[SpectrumRow]] = {}
     for row in run.spectra:
         if len(row.names) > 1:
@@ -100,7 +99,7 @@ def read(run: Run) -> list[SpectrumGroup]:
 
 
 def html(groups: Sequence[SpectrumGroup], clock: PageTimes) -> str:
-    """Return all spectra; nothing if there are none."""
+    """Return all spectra; empty if there are none."""
     return "".join(_group(group, number, clock) for number, group in enumerate(groups, 1))
 
 
@@ -123,7 +122,6 @@ def _group(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
 
 
 def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
-    """Return the curves of one variable, thin, and over them their mean, with a band of one standard deviation."""
     measured = group.measured
     if len(measured) < _LEAST_AVERAGED:
         return chart(x, y, [curve for one in measured for curve in _both_ways(one, name)])
@@ -140,14 +138,13 @@ def _all(group: SpectrumGroup, x: Axis, y: Axis, name: str) -> str:
 
 
 def _both_ways(one: SpectrumCurves, name: str) -> Iterator[Curve]:
-    """Yield the curve of the way back, if there is one, and over it that of the way there."""
     if name in one.back:
         yield Curve(one.swept, one.back[name], BACKWARD)
     yield Curve(one.swept, one.curves[name])
 
 
 def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
-    """Return values that all were swept over; None if that is less than half of what any was."""
+    # None where the common range is less than half of the widest sweep
     try:
         common = common_sweep([one.swept for one in measured])
     except InvalidValue:
@@ -156,18 +153,17 @@ def _common(measured: Sequence[SpectrumCurves]) -> Array | None:
 
 
 def _legend(group: SpectrumGroup) -> str:
-    told = []
+    sentences = []
     if len(group.measured) >= _LEAST_AVERAGED:
-        told.append("Thin: single curves. Thick: their mean; the band is one standard deviation.")
+        sentences.append("Thin: single curves. Thick: their mean; the band is one standard deviation.")
     if any(one.back for one in group.measured):
-        told.append("Orange: on the way there; blue: on the way back.")
+        sentences.append("Orange: on the way there; blue: on the way back.")
     if left_out := group.count - len(group.measured):
-        told.append(f"{left_out} more are not read.")
-    return " ".join(told)
+        sentences.append(f"{left_out} more are not read.")
+    return " ".join(sentences)
 
 
 def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
-    """Return each spectrum small; those of a grid as they lie on the sample."""
     shown = group.measured[:MOST_SMALL]
     if len(shown) < 2:
         return ""
@@ -178,14 +174,13 @@ def _small(group: SpectrumGroup, number: int, clock: PageTimes) -> str:
         _figure(one, axes, clock, names[k : k + 3], places[k] if places else "") for k, one in enumerate(shown)
     )
     style = f' style="grid-template-columns:repeat({columns},minmax(0,1fr));gap:.3rem"' if places else ""
-    told = "Each lies where it was measured on the grid, y upwards. " if places else ""
+    position = "Each lies where it was measured on the grid, y upwards. " if places else ""
     more = f" {group.count - len(shown)} more are not shown." if group.count > len(shown) else ""
-    note = f'<p class="note">{told}Click a curve to enlarge it; all have the same axes.{more}</p>'
+    note = f'<p class="note">{position}Click a curve to enlarge it; all have the same axes.{more}</p>'
     return f'<div class="sheet"{style}>{figures}</div>{note}'
 
 
 def _places(shown: Sequence[SpectrumCurves]) -> tuple[list[str], int]:
-    """Return the place of each in a grid of the page, and its columns; none if they form no grid."""
     positions = [one.spectrum.position_m for one in shown]
     try:
         points = grid([position for position in positions if position is not None])
@@ -209,7 +204,7 @@ def _figure(
         "finished": clock.whole(row.time_ns),
         "at": where,
         "points": str(row.points),
-        "in control": escape(row.holder or "nobody"),
+        "in control": escape(row.holder or "none"),
         "problems": escape(", ".join(row.problems)),
         "file": escape(row.file),
         "variables": f'<div class="charts">{"".join(charts[1:])}</div>' if charts[1:] else "",

@@ -1,4 +1,4 @@
-"""The parts that the page is made of: sections, tables, pictures that enlarge; times in UTC with local ones beside."""
+"""Building blocks of the page: sections, tables, enlarging pictures, and times in UTC with local ones beside."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _DAY_NS = 86_400 * NS_PER_S
 
 
 class PageTimes:
-    """Times of a run as the page tells them: in UTC, and in this computer's zone where that is another.
+    """Formats times of a run: in UTC, and in this computer's zone where that differs.
 
     Args:
         start_ns, end_ns: of the run.
@@ -26,35 +26,35 @@ class PageTimes:
         self.zone = utc_time(start_ns).astimezone().strftime("%Z") or "local"
 
     def utc(self, time_ns: int) -> str:
-        """Return a time in UTC; with the day, where there are several."""
+        """Return a time in UTC, with the day if the run spans several days."""
         time = time_of_day(time_ns, UTC)
         return f"{day(time_ns, UTC)} {time}" if self._days else time
 
     def both(self, time_ns: int) -> str:
-        """Return a time as HTML, the local one small below."""
+        """Return a time as HTML, with the local time small below."""
         local = f"<small>{time_of_day(time_ns)} {escape(self.zone)}</small>" if self.is_local else ""
         return f"{self.utc(time_ns)}{local}"
 
     def whole(self, time_ns: int) -> str:
-        """Return day and time, and the local ones."""
+        """Return day and time in UTC, with the local time in brackets."""
         local = f" ({time_of_day(time_ns)} {self.zone})" if self.is_local else ""
         return f"{day_and_time(time_ns, UTC)}{local}"
 
     def period(self) -> str:
-        """Return the time of the run."""
+        """Return the period of the run."""
         local = f" ({period_text(self._start_ns, self._end_ns)} {self.zone})" if self.is_local else ""
         return f"{period_text(self._start_ns, self._end_ns, UTC)}{local}"
 
 
 def section(heading: str, content: str) -> str:
-    """Return a part of the page; nothing without content."""
+    """Return a section of the page; empty without content."""
     if not content:
         return ""
     return f"<section>{f'<h2>{escape(heading)}</h2>' if heading else ''}{content}</section>"
 
 
 def table(heads: Iterable[str], rows: Sequence[Sequence[str]]) -> str:
-    """Return a table of cells that are HTML already; empty without rows."""
+    """Return a table of cells, which are HTML already; empty without rows."""
     if not rows:
         return ""
     head = "".join(f"<th>{escape(one)}</th>" for one in heads)
@@ -74,23 +74,23 @@ def figure(
     ratio: float = 1.0,
     place: str = "",
 ) -> str:
-    """Return a figure that fills the page while its name is in the address.
+    """Return a figure that fills the page while its name is the anchor in the address.
 
     Args:
         name: of the figure on the page.
         shown, caption: HTML of the picture, and of the line below it.
-        facts: what is told beside it when it is large: names, and HTML.
-        beside: names of those before and after it; empty: there is none.
-        style: classes; ratio: width by height; place: in a grid, as CSS has it.
+        facts: shown beside the enlarged picture: names, and HTML.
+        beside: names of the previous and next figure; empty if there is none.
+        style: CSS classes; ratio: width by height; place: in a grid, as CSS.
     """
-    told = "".join(f"<dt>{escape(head)}</dt><dd>{text}</dd>" for head, text in facts.items() if text)
+    entries = "".join(f"<dt>{escape(head)}</dt><dd>{text}</dd>" for head, text in facts.items() if text)
     steps = "".join(
         f'<a href="#{other}">{word}</a>' for word, other in zip(("‹ before", "next ›"), beside, strict=True) if other
     )
     return (
         f'<figure id="{name}" class="{style}" style="--ratio:{ratio:.5g};{place}"><div class="view">'
         f'<a class="back more" href="#close" aria-label="close"></a><a class="open" href="#{name}">{shown}</a>'
-        f'<div class="more"><dl>{told}</dl><div class="steps">{steps}<a href="#close">close</a></div></div></div>'
+        f'<div class="more"><dl>{entries}</dl><div class="steps">{steps}<a href="#close">close</a></div></div></div>'
         f"<figcaption>{caption}</figcaption></figure>"
     )
 

@@ -1,4 +1,4 @@
-"""The report as one HTML page: no script, nothing from elsewhere, light and dark, and fit to be printed."""
+"""The report as one HTML page: without scripts and external files, light and dark, and printable."""
 
 from __future__ import annotations
 
@@ -28,13 +28,12 @@ def html(
     spectra: Sequence[SpectrumGroup],
     figures: Sequence[FigurePicture],
 ) -> str:
-    """The whole page."""
     clock = PageTimes(story.start_ns, story.end_ns)
     title = f"{escape(story.name)}, {day(story.start_ns, UTC)}"
     badge = '<span class="badge">SIMULATED</span>' if story.simulated else ""
     places = [position for group in spectra for position in group.positions]
     body = [
-        f"<header><h1>{escape(story.name)}{badge}</h1>{_what(story)}{_when(story, clock)}</header>",
+        f"<header><h1>{escape(story.name)}{badge}</h1>{_sample_line(story)}{_duration_line(story, clock)}</header>",
         section("", _cards(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
@@ -66,26 +65,24 @@ def _zones(clock: PageTimes) -> str:
     return f'<p class="note">Times in UTC, as the experiment had them.{local if clock.is_local else ""}</p>'
 
 
-def _what(story: RunStory) -> str:
-    """The sample, by whom it was measured, and for what, as far as that is known."""
-    told = [text for name in ("sample", "person", "project") if (text := story.metadata.get(name))]
-    return f"<p>{escape(' · '.join(told))}</p>" if told else ""
+def _sample_line(story: RunStory) -> str:
+    known = [text for name in ("sample", "person", "project") if (text := story.metadata.get(name))]
+    return f"<p>{escape(' · '.join(known))}</p>" if known else ""
 
 
-def _when(story: RunStory, clock: PageTimes) -> str:
-    told = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
-    if story.speed != 1.0 and story.real_s is not None:
-        told += f" ({duration_text(story.real_s)} real)"
+def _duration_line(story: RunStory, clock: PageTimes) -> str:
+    period = f"{clock.period()}, {duration_text(story.lasted_ns / NS_PER_S)}"
+    if story.real_s is not None:
+        period += f" ({duration_text(story.real_s)} real)"
     end = story.end
     ended = story.ended
-    if end is not None and component_of(end.who) != SUPERVISOR:  # else nothing was left to run, as `ended` says
+    if end is not None and component_of(end.who) != SUPERVISOR:  # otherwise `ended` states why: nothing was left to run
         reason = f": {end.reason}" if end.reason else ""
         ended = f"{end.who} ended the experiment at {clock.whole(end.time_ns)}{reason}"
-    return f"<p>{escape(told)}; {escape(ended)}</p>"
+    return f"<p>{escape(period)}; {escape(ended)}</p>"
 
 
 def _figures(figures: Sequence[FigurePicture]) -> str:
-    """The figures that components have drawn."""
     names = ["", *(f"figure-{number}" for number in range(len(figures))), ""]
     made = [
         markup.figure(
@@ -125,7 +122,6 @@ def _registered(story: RunStory) -> list[tuple[str, int, str]]:
 
 
 def _drift(story: RunStory, clock: PageTimes) -> str:
-    """The scans whose position is not known well, with its uncertainty and the reason."""
     if not story.overview.drift:
         return ""
     rows = [
@@ -143,19 +139,19 @@ def _drift(story: RunStory, clock: PageTimes) -> str:
     failed = (
         f" The estimator failed over {counted(errors, 'pair')}: an error of its own; see the log." if errors else ""
     )
-    told = f"<p>{escape(story.overview.registration.capitalize())}.{failed}</p>"
+    summary = f"<p>{escape(story.overview.registration.capitalize())}.{failed}</p>"
     left_out = len(story.unregistered) - len(rows)
     more = f'<p class="note">{left_out} more are in the record.</p>' if left_out else ""
-    return told + table(["scan", "key", "finished", "registration", "standard deviation", "why"], rows) + more
+    return summary + table(["scan", "key", "finished", "registration", "standard deviation", "why"], rows) + more
 
 
 def _shares(story: RunStory) -> str:
     seen, styles = story.overview, colours(story)
     return '<div class="shares">' + "".join(
         [
-            _share_table(story, "in control", seen.controls, styles),
-            _share_table(story, "microscope", seen.states, {}),
-            _share_table(story, "mode", seen.modes, {"manual": "manual"}),
+            _share_table(story, "in control", seen.timelines.control, styles),
+            _share_table(story, "microscope", seen.timelines.scope_state, {}),
+            _share_table(story, "mode", seen.timelines.mode, {"manual": "manual"}),
         ]
     ) + "</div>"  # fmt: skip
 
@@ -181,7 +177,7 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
                 escape(span.label),
                 clock.both(span.start_ns),
                 escape(span.by or "not known"),
-                escape(", ".join(story.repairs(span)) or "nobody"),
+                escape(", ".join(story.repairs(span)) or "none"),
                 escape(", ".join(story.done_meanwhile(span))),
                 duration_text((end_ns - span.start_ns) / NS_PER_S),
                 "<b>not solved</b>" if span.end_ns is None else clock.both(end_ns),

@@ -1,4 +1,4 @@
-"""Scans as small pictures, and the figures beside the report, from what is kept of a run."""
+"""Thumbnails of scans, and the figures beside the report, from the files of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LARGEST_PX = 192
 FIGURE_PX = 1400
 _QUALITY = 80
 NIGHT, OFFSET = "night.png", "drift_offset.png"
-"""As components draw them."""
+"""File names of figures drawn by components."""
 OWN_NIGHT, OWN_OFFSET = "report.png", "report_drift.png"
 _TOPOGRAPHY = ("height", "topo", "z ", "z")
 _log = logging.getLogger("afspm.report")
@@ -35,12 +35,12 @@ _log = logging.getLogger("afspm.report")
 
 @dataclass(frozen=True)
 class TopographyPicture:
-    """A scan, and pictures of its topography; None if its values can't be had.
+    """A scan with images of its topography; None if its values can't be read.
 
     Attributes:
         image: in colour, levelled.
         grey: for the figure of the night: indices into a colour map, [y, x] with y upwards.
-        is_bad: whether it is framed.
+        is_bad: drawn with a frame.
     """
 
     row: ScanRow
@@ -53,7 +53,7 @@ class TopographyPicture:
 
 @dataclass(frozen=True)
 class FigurePicture:
-    """A figure that a component has drawn, as it is put into the page; `ratio`: width by height."""
+    """A figure drawn by a component, as embedded in the page; `ratio`: width by height."""
 
     name: str
     image: bytes
@@ -61,20 +61,19 @@ class FigurePicture:
 
 
 def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) -> list[TopographyPicture]:
-    """Return the scans with pictures; `bad_ns`: the times of the scans to frame."""
+    """Return the scans with pictures; `bad_ns`: the times of the bad scans."""
     return [replace(one, is_bad=one.row.time_ns in bad_ns) for one in _read(run, rows)]
 
 
 def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
-    """Return the times of the scans that are bad."""
-    lanes = story.overview.problem_timelines.items()
+    lanes = story.overview.timelines.problems.items()
     flagged_ns = {number: [span.start_ns for span in lane.spans] for number, lane in lanes}
     interrupted_ns = [row.time_ns for row in story.scans if row.interrupted]
     return bad_scans([row.time_ns for row in story.scans], run.verdicts(), flagged_ns, interrupted_ns)
 
 
 def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
-    """Return at most `most` rows in their order: the scans of these times, and some evenly among the rest."""
+    """Return at most `most` rows in order: the scans of `kept_ns`, and an even selection of the rest."""
     if len(rows) <= most:
         return list(rows)
     odd = [k for k, row in enumerate(rows) if row.time_ns in kept_ns][: most // 2]
@@ -98,12 +97,12 @@ def _read(run: Run, rows: Sequence[ScanRow]) -> Iterator[TopographyPicture]:
 
 
 def topography(scans: ScanSet) -> str:
-    """The channel that is shown of a scan: one that is named like a height, else the first."""
+    """Return the displayed channel of a scan: one named like a height, else the first."""
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
 
 
 def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> None:
-    """Draw the night where no component has, and the figures that packages declare."""
+    """Draw the night unless a component has, and the figures that packages declare."""
     if is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.grey is not None for one in pictures):
         from afspm.record import night_figure
 
@@ -114,7 +113,7 @@ def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> No
     for name in entry_points.names(entry_points.FIGURES):
         try:
             entry_points.load(entry_points.FIGURES, name)(run, title)
-        except Exception as error:  # of a package: the report goes without its figure
+        except Exception as error:  # a package's code may raise anything: the report does without its figure
             _log.warning("the figure %s is not drawn: %s: %s", name, type(error).__name__, error)
 
 
@@ -127,7 +126,7 @@ def is_ours(folder: Path, own: str, components: str) -> bool:
 
 
 def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> NightRecord:
-    """Return the record that the picture of the night shows."""
+    """Return the data for the picture of the night."""
     record = NightRecord(end_ns=story.end_ns, scans_taken=len(story.scans))
     record.shots = [
         Shot(one.row.time_ns, one.row.began_ns, one.row.holder, one.grey) for one in pictures if one.grey is not None
@@ -147,21 +146,21 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
 
 
 def of_figures(folder: Path) -> list[FigurePicture]:
-    """The figures for the page: the night first, then drift, then all others in the run folder."""
-    found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page has all that is in that
+    """Return the figures for the page: the night first, then drift, then all others in the run folder."""
+    found = [path for path in folder.glob("*.png") if path.name != OWN_NIGHT]  # the page itself shows the same
     first = (NIGHT, OFFSET, OWN_OFFSET)
     found.sort(key=lambda path: (first.index(path.name) if path.name in first else len(first), path.name))
     return [made for path in found if (made := _reduced(path)) is not None]
 
 
 def _reduced(path: Path) -> FigurePicture | None:
-    """A figure with as many pixels as a page shows, and a tenth of the bytes; None if it is no picture."""
+    # at the resolution that a page shows, a figure takes a tenth of the bytes
     from PIL import Image
 
     try:
         with Image.open(path) as image:
             small = image.convert("RGB")
-    except OSError as error:  # also of what is no picture
+    except OSError as error:  # also raised for a file that is not an image
         _log.warning("%s is not shown: %s", path.name, error)
         return None
     small.thumbnail((FIGURE_PX, FIGURE_PX))

@@ -1,4 +1,4 @@
-"""The scans of a report as a sheet of pictures, and on a map where they lie on the sample."""
+"""The scans of a report as a contact sheet, and on a map of the sample."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LEGEND = (
     "one height, without its plane."
 )
 _MARGIN = 0.04
-_HIDDEN_BEHIND = 40  # places of a run that are drawn at most where one lies over the other
+_HIDDEN_BEHIND = 40  # most pictures on the map: older ones disappear beneath newer ones
 
 
 def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes) -> str:
@@ -43,7 +43,7 @@ def sheet(story: RunStory, shown: Sequence[TopographyPicture], clock: PageTimes)
 
 
 def sample_map(shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], frame: Frame) -> str:
-    """Return where pictures and spectra lie on the sample, the newest on top; nothing where no place is known."""
+    """Return a map of pictures and spectra on the sample, the newest on top; empty if no position is known."""
     pictures = _topmost(shown)
     corners = [one.row.region.corners_m() for one in pictures if one.row.region is not None]
     corners += [np.array([position]) for position in spectra_m]
@@ -60,7 +60,7 @@ def sample_map(shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], fram
 
 
 class _View:
-    """From places in m to those on the map, in percent of its width and height."""
+    """Maps positions in m to percent of the width and height of the map."""
 
     def __init__(self, places_m: NDArray[np.float64]) -> None:
         low, high = places_m.min(axis=0), places_m.max(axis=0)
@@ -111,7 +111,6 @@ class _View:
 
 
 def _topmost(shown: Sequence[TopographyPicture]) -> list[TopographyPicture]:
-    """Return the newest picture of each place, in the order of time."""
     newest = {one.row.region: one for one in shown if one.image is not None and one.row.region is not None}
     return sorted(newest.values(), key=lambda one: one.row.number)[-_HIDDEN_BEHIND:]
 
@@ -166,7 +165,7 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
     if one.image is not None:
         span = one.image.span
         yield "shown", f"{escape(one.channel)}, {quantity(span.high - span.low, one.unit, 3)} from dark to light"
-    yield "in control", escape(row.holder or "nobody")
+    yield "in control", escape(row.holder or "none")
     yield "problems", escape(", ".join(row.problems))
     yield "interrupted", "yes" if row.interrupted else ""
     notes = [note for note in story.notes if note.scan == row.number]
@@ -175,5 +174,4 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
 
 
 def name_of(row: ScanRow) -> str:
-    """Return the anchor of a scan in the page."""
     return f"scan-{row.number}"

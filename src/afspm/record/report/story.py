@@ -1,4 +1,4 @@
-"""The contents of a run's report, independent of how they are shown."""
+"""The contents of a run's report, independent of its layout."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
 
-COLOURS = 5  # of those in control, in turn: the classes c0 to c4 of the page
+COLOURS = 5  # of holders, repeated in turn: the CSS classes c0 to c4
 MOST_ROWS = 200
 _PROCESS_TROUBLE = frozenset({ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP})
 
 
 @dataclass(frozen=True, slots=True)
 class Refusals:
-    """Requests of one kind that were refused for one reason: how often, and when first and last."""
+    """Equal requests refused for one reason: their number, the first and the last time."""
 
     who: str
     what: str
@@ -45,16 +45,15 @@ class Refusals:
 
 @dataclass(frozen=True)
 class RunStory:
-    """A run, reckoned up. Times in ns of experiment time since the Unix epoch.
+    """A run, summed up. Times in ns of experiment time since the Unix epoch.
 
     Attributes:
-        start_ns: the first that is known of it.
-        speed: experiment seconds in a real second.
-        real_s: how long it took in real time; None: that is not known.
-        ended: how it ended, in words; that it goes on, or was cut off.
-        frame: of all places.
-        problems: spans of all problems in the order of time, but for routine ones.
-        actions: what was done to the tip, e.g. pulses.
+        start_ns: the first known time of the run.
+        real_s: the duration in real time; None if it is unknown, or the clock ran at real speed.
+        ended: how the run ended, in words; or that it goes on, or was cut off.
+        frame: of all positions.
+        problems: spans of all problems except routine ones, in the order of time.
+        actions: treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
     """
 
@@ -63,7 +62,6 @@ class RunStory:
     metadata: Mapping[str, str]
     simulated: bool
     start_ns: int
-    speed: float
     real_s: float | None
     ended: str
     frame: Frame
@@ -77,7 +75,7 @@ class RunStory:
 
     @property
     def end_ns(self) -> int:
-        """When the experiment ended, else the last that is known of it; the drawing at the end is no part of it."""
+        """The end of the experiment, or the last known time; figures drawn at the end don't count."""
         return max(self.overview.ended_ns or self.overview.newest_ns, self.start_ns)
 
     @property
@@ -86,27 +84,24 @@ class RunStory:
 
     @property
     def end(self) -> JournalEntry | None:
-        """The journal's entry of the end: the component or person that asked for it, and why; None: none did."""
+        """The journal entry of the end, with its author and reason; None if the run was not ended by request."""
         entries = reversed(self.overview.entries)
         return next((one for one in entries if one.event is ControlEvent.EXPERIMENT_ENDED), None)
 
     @property
     def restarts(self) -> list[ProcessRestart]:
-        return list(self.overview.restarts)
+        return list(self.overview.process_history.restarts)
 
     @property
     def given_up(self) -> list[str]:
-        """Return the processes that were given up."""
         states = self.overview.processes.items()
         return [name for name, state in states if state.condition is ProcessCondition.GIVEN_UP]
 
     def problem_name(self, entry: JournalEntry) -> str:
-        """Return the name of the problem that an entry is about."""
         return self.overview.problems.name(entry.problem or 0)
 
     @property
     def interrupted(self) -> int:
-        """Return how many scans were interrupted."""
         return sum(scan.interrupted for scan in self.scans)
 
     @property
@@ -115,18 +110,18 @@ class RunStory:
 
     @property
     def unregistered(self) -> list[ScanRow]:
-        """Return the scans whose position is not known well: dead reckoning, or a coarse estimate."""
+        """The scans with uncertain position: dead reckoning, or a coarse estimate."""
         well = (None, RegistrationOutcome.REGISTERED)
         return [scan for scan in self.scans if scan.registration not in well]
 
     def why_unregistered(self, scan: ScanRow) -> str:
-        """Return why the position of a scan is not known well."""
+        """Return why the position of a scan is uncertain."""
         began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
         points = (point for point in self.overview.drift if began_ns <= point.time_ns <= scan.time_ns)
         return next((point.reason for point in points), "")
 
     def shares(self, lane: Timeline) -> list[tuple[str, int]]:
-        """For how long altogether, in ns, each thing of a lane was so: the longest first."""
+        """Return (label, total time in ns) of a timeline, the longest first."""
         return sorted(lane.lasted_ns(self.end_ns).items(), key=lambda share: -share[1])
 
     def done_meanwhile(self, problem: Span) -> list[str]:
@@ -136,21 +131,20 @@ class RunStory:
         return [f"{count} × {what.removeprefix('x-')}" for what, count in Counter(done).items()]
 
     def repairs(self, problem: Span) -> list[str]:
-        """Return the holders while a problem was flagged, in the order in which they came."""
+        """Return the holders while a problem was flagged, in the order of their first control."""
         end_ns = self.end_ns if problem.end_ns is None else problem.end_ns
         during = [
             span.label
-            for span in self.overview.controls.spans
+            for span in self.overview.timelines.control.spans
             if span.start_ns < end_ns and (span.end_ns is None or span.end_ns > problem.start_ns)
         ]
         return list(dict.fromkeys(during))
 
 
 def read(run: Run) -> RunStory:
-    """Return the story of a run. Raises FileError: the record is damaged."""
     overview, scans, late = run.overview(), run.scans, _late_flags(run.journal)
     clock = run.facts.get("clock") or {}
-    # the clock of a run that was resumed is that of its last part
+    # a resumed run has recorded only the clock of its last part
     starts_ns = [*_first_ns(overview, scans), *([round(float(clock["start_s"]) * 1e9)] if clock else [])]
     start_ns = min(starts_ns, default=0)
     return RunStory(
@@ -159,8 +153,7 @@ def read(run: Run) -> RunStory:
         metadata=run.metadata,
         simulated=run.simulated,
         start_ns=start_ns,
-        speed=float(clock.get("speed", 1.0)),
-        real_s=run.facts.get(REAL_S),
+        real_s=None if float(clock.get("speed", 1.0)) == 1.0 else run.facts.get(REAL_S),
         ended=describe_state(run.folder),
         frame=run.frame,
         overview=overview,
@@ -174,20 +167,18 @@ def read(run: Run) -> RunStory:
 
 
 def _without_routine(scan: ScanRow, overview: Overview) -> ScanRow:
-    """Leave out the problem of a scan that is taken in the normal course of a run; see `Overview.is_routine`."""
     began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
     routine = {s.label for s in overview.routine_spans if s.start_ns <= began_ns <= (s.end_ns or began_ns)}
     return replace(scan, problems=tuple(name for name in scan.problems if name not in routine))
 
 
 def _late_flags(journal: Iterable[JournalEntry]) -> list[JournalEntry]:
-    """Return the requests to flag a problem that came after the end."""
     after_the_end = itertools.dropwhile(lambda entry: entry.event is not ControlEvent.EXPERIMENT_ENDED, journal)
     return [entry for entry in after_the_end if entry.request == ControlRequest.ADD_EXP_PRBLM and entry.refused]
 
 
 def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
-    """Return equal refusals grouped, in the order in which each came first."""
+    """Return equal refusals grouped, in the order of their first occurrence."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for entry in refusals:
         groups.setdefault((entry.who, entry.what, entry.reason), []).append(entry.time_ns)
@@ -195,7 +186,7 @@ def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
 
 
 def sentence(story: RunStory) -> str:
-    """Return the run in one sentence."""
+    """Summarise the run in one sentence."""
     parts = [counted(len(story.scans) - story.interrupted, "scan")]
     if story.interrupted:
         parts.append(f"{story.interrupted} interrupted")
@@ -217,46 +208,50 @@ def _times(count: int) -> str:
 
 
 def _first_ns(overview: Overview, scans: Sequence[ScanRow]) -> list[int]:
-    lanes = (overview.controls, overview.modes, overview.states)
+    lanes = (overview.timelines.control, overview.timelines.mode, overview.timelines.scope_state)
     times = [lane.spans[0].start_ns for lane in lanes if lane.spans]
     return times + [scan.began_ns or scan.time_ns for scan in scans[:1]]
 
 
 def states_in_words(label: str) -> str:
-    """A lane's label of the scope state as people say it."""
+    """Return a scope state's label in everyday words."""
     known = {ScopeState.SPEC.name.lower(): "spectrum", ScopeState.BUSY_PARAM.name.lower(): "setting parameters"}
     return known.get(label, label.replace("_", " "))
 
 
 def in_trouble(lane: Timeline) -> list[Span]:
-    """Return the spans in which a process was not well."""
+    """Return the spans in which a process was silent, restarting or given up."""
     labels = {condition.name.lower().replace("_", " ") for condition in _PROCESS_TROUBLE}
     return [span for span in lane.spans if span.label in labels]
 
 
 def colours(story: RunStory) -> dict[str, str]:
-    """Return the class of each component that was in control."""
-    holders = dict.fromkeys(span.label for span in story.overview.controls.spans)
+    """Return the CSS class of each holder."""
+    holders = dict.fromkeys(span.label for span in story.overview.timelines.control.spans)
     return {holder: f"c{number % COLOURS}" for number, holder in enumerate(holders)}
 
 
 def timeline_rows(story: RunStory) -> Iterator[TimelineRow]:
-    """Yield a row for each in control, mode, problem, state, and process that was not well."""
+    """Yield a row for each holder, mode, problem, state, and process in trouble."""
     seen = story.overview
     for holder, style in colours(story).items():
-        yield _row(holder, style, (span for span in seen.controls.spans if span.label == holder))
-    manual = [span for span in seen.modes.spans if span.label == "manual"]
+        yield _row(holder, style, (span for span in seen.timelines.control.spans if span.label == holder))
+    manual = [span for span in seen.timelines.mode.spans if span.label == "manual"]
     if manual:
         yield _row("MANUAL", "manual", manual)
     for name, spans in itertools.groupby(sorted(story.problems, key=lambda s: s.label), lambda span: span.label):
         yield _row(name, "problem", spans)
     if seen.routine_spans:
         yield _row("first scan both ways", "marked", seen.routine_spans)
-    for label in dict.fromkeys(span.label for span in seen.states.spans):
+    for label in dict.fromkeys(span.label for span in seen.timelines.scope_state.spans):
         if label not in ("free", "undefined"):
             style = "problem" if label == "interrupted" else "state"
-            yield _row(states_in_words(label), style, (span for span in seen.states.spans if span.label == label))
-    for name, lane in seen.process_timelines.items():
+            yield _row(
+                states_in_words(label),
+                style,
+                (span for span in seen.timelines.scope_state.spans if span.label == label),
+            )
+    for name, lane in seen.process_history.timelines.items():
         if trouble := in_trouble(lane):
             yield _row(f"{name} not well", "problem", trouble)
     again = [Span(f"{one.name} started again: {one.last_exit}", one.time_ns, one.time_ns) for one in story.restarts]

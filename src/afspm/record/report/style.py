@@ -1,8 +1,8 @@
-"""The style sheet of the report: light and dark, narrow and wide, on paper."""
+"""The style sheet of the report, for light and dark, narrow and wide screens, and paper."""
 
 from afspm.record.drawing import timeline
 
-# P. Tol's bright scheme: told apart by everybody, red kept for problems
+# P. Tol's bright scheme, safe for colour-blind readers; red is reserved for problems
 CSS = (
     timeline.CSS
     + """

@@ -1,3 +1,3 @@
-"""Vendors' controllers without a vendor: each speaks a real protocol, with the simulated physics behind it."""
+"""Emulated controllers of vendors: each speaks a real protocol, with the simulated instrument behind it."""
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import logging
 import math
 import sys
@@ -12,11 +13,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
+from afspm.basics import entry_points
 from afspm.basics.addresses import Listens
 from afspm.basics.clock import Clock, ExperimentClock
-from afspm.basics.errors import AfspmError, ErrorCollector, TransportError
+from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, TransportError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.requirements import require
@@ -35,18 +38,18 @@ if TYPE_CHECKING:
 LOOPBACK = "127.0.0.1"
 LONGEST_WAIT_S = 60.0
 _AGAIN_S = 1.0
-"""After an error that nobody foresaw, `tick` is called again after so long, experiment time."""
+"""Delay of the next `tick` after an unexpected error, experiment time."""
 _TAKEN = {100, 10013, 10048} if sys.platform == "win32" else {errno.EADDRINUSE}
-"""The errors of a port that another program has. On Windows those of its C library, which ZeroMQ hands on, and of its
-sockets: WSAEACCES, where the other has it for itself alone, and WSAEADDRINUSE."""
+"""Error numbers of a port in use. On Windows they come from the C library, as ZeroMQ reports them, and from its
+sockets: WSAEACCES, if the other program uses the port exclusively, and WSAEADDRINUSE."""
 _LOOKS_S = 0.2
-"""While a button can be pressed, its file is looked for so often, real time."""
+"""Interval between checks of a button's file, real time."""
 FAREWELL_S = 0.5
-"""So long, real time, a controller stays there when the experiment has ended: the translator stops the tip first."""
+"""Real seconds that a controller stays after the end of the experiment, so that the translator can stop the tip."""
 
 
 class Crashed(AfspmError):
-    """The emulated controller is to vanish without another word, as one that crashes does."""
+    """Raised to end the emulated controller without any further answer, like a crash."""
 
     code = "emulator-crashed"
 
@@ -77,34 +80,33 @@ class Emulator(ABC):
 
     Args:
         port: to listen on; 0: any free one.
-        seed: everything that is left to chance follows from it.
+        seed: of all random numbers.
         faults: each a text as on the command line (`KIND[@SECONDS][,count=N][,duration=SECONDS]`) or a table of
             `kind`, `at_s`, `count`, `duration_s`.
         world: `surface`, `tip`, `drift` … of the simulated world, as of the Simulator.
 
     Attributes:
-        clock, log: of the experiment; given before `open`, as is all of the following.
+        clock, log: of the experiment; set before `open`, like all following attributes.
         folder: where the controller saves its files.
         rig: the instrument.
-        faults: to ask at each point where something can go wrong.
-        woken: register its `fileno` with whatever `serve` waits by; it becomes readable when `serve` is to return.
-        listening: to be told of a new address, and of none ("") before the old one is let go of, if it does not listen
-            at one address all along.
+        faults: queried at each point where something can go wrong.
+        woken: becomes readable when `serve` must return; include its `fileno` in the wait of `serve`.
+        listening: call it with each new address, and with "" before the old one is closed, if the address changes.
     """
 
     vendor: ClassVar[str]
     usual: ClassVar[PlainMapping] = {}
-    """Settings by which it is found where the vendor's own controller is: for `afspm emulate` alone, and on request."""
+    """Settings that put it at the address of the vendor's own controller: for `afspm emulate` alone, on request."""
     fault_kinds: ClassVar[Mapping[str, str]] = {}
-    """The faults of the maker's program, with the effect of each; `all_faults` has those of all emulators, too."""
+    """The faults of the maker's program, with the effect of each; `all_faults` adds the common ones."""
 
     modes: ClassVar[Sequence[str]] = ("amplitude", "current", "frequency-shift")
-    """Of the simulated feedback: those that the controller has."""
+    """The modes of the simulated feedback that the controller supports."""
 
     emulated: ClassVar[bool] = True
-    """An experiment with it is a simulated one: its clock may go at another speed than the real one."""
+    """An experiment with it counts as simulated: its clock may run at another speed."""
     listens: ClassVar[tuple[str, ...]] = ()
-    """It takes no part in the experiment but to end with it."""
+    """It receives only the end of the experiment."""
 
     clock: Clock
     log: logging.Logger
@@ -134,7 +136,7 @@ class Emulator(ABC):
         """Check the settings.
 
         Raises:
-            ConfigError: of the world or the faults, or a package is missing. FileError: a sample that can't be read.
+            ConfigError: invalid world or faults, or a missing package. FileError: a sample that can't be read.
         """
         from afspm.simulation import World
         from afspm.simulation.settings import one_of
@@ -151,54 +153,54 @@ class Emulator(ABC):
 
     @classmethod
     def all_faults(cls) -> dict[str, str]:
-        """Return every fault that there is, with its effect: those of the class, and those of all emulators."""
+        """Return every fault with its effect: those of the class, and those common to all emulators."""
         return {**cls.fault_kinds, "hang": "the whole program hangs for the duration (real time)"}
 
     # -- what one writes
 
     @abstractmethod
     def open(self) -> str:
-        """Begin to listen. Returns where: what a client is given as the address."""
+        """Start to listen; return the address for clients."""
 
     @abstractmethod
     def serve(self, timeout_s: float) -> None:
-        """Wait up to so many real seconds for clients or `woken`, and answer what has come.
+        """Wait up to `timeout_s` real seconds for clients or `woken`, and answer received requests.
 
-        Answer each request on its own, with an error of the vendor's where anything is raised: what gets as far as the
-        base is logged, and that client goes without an answer.
+        Answer each request on its own, and catch its errors with the vendor's own error: an exception that reaches the
+        base class is logged, and that client gets no answer.
 
         Raises:
-            Crashed: to vanish without an answer.
+            Crashed: to end without an answer.
         """
 
     def tick(self, now_s: float) -> float | None:
         """Advance to now, in experiment time: end scans, write files.
 
-        Called before every `serve`, so also right after whatever was served.
+        Called before every `serve`, so also right after each request.
 
         Returns:
-            when something else will, besides what the rig and the faults know of themselves.
+            the time of the next event, except events of the rig and the faults.
         """
         return None
 
     @abstractmethod
     def close(self) -> None:
-        """Listen no more. Also called if `open` failed."""
+        """Stop listening. Also called if `open` failed."""
 
     def abandon(self) -> None:
-        """Give up what goes on, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
+        """Drop the present activity, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
         self.rig.abandon(self.clock.now_s())
 
     # -- what is there for it
 
     def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
-        """Show a button until it is pressed or taken away; there is one at a time.
+        """Show a button until it is pressed or removed; there is one at a time.
 
-        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so it can be pressed from
-        any program and any computer that sees the folder, alone as well as in an experiment.
+        A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so any program on any
+        computer with access to the folder can press it, alone as well as in an experiment.
 
         Args:
-            why: it has to be pressed, for the log and the file.
+            why: the reason to press it, for the log and the file.
         """
         self.take_button_away()
         file = self.folder / f"delete-to-{name}.txt"
@@ -211,20 +213,20 @@ class Emulator(ABC):
         self.log.warning("%s: delete %s to press the button", why, file)
 
     def take_button_away(self) -> None:
-        """Show no button any more."""
+        """Remove the button."""
         button, self._button = self._button, None
         if button is not None:
-            with suppress(OSError):  # a file that can't be deleted presses nothing any more
+            with suppress(OSError):  # the button is gone: a file that stays has no effect
                 button.file.unlink()
 
     def run(self, clock: Clock, folder: Path, log: logging.Logger, listening: Callable[[str], None]) -> None:
-        """Be the controller until `stop`.
+        """Run the controller until `stop`.
 
         Args:
-            listening: told the address, once there is one; empty: none for now.
+            listening: called with the address, once there is one; empty: none for now.
 
         Raises:
-            Crashed: it was told to.
+            Crashed: an emulated crash.
             TransportError: another program listens at its port.
         """
         self.clock, self.folder, self.log, self.listening = clock, folder, log, listening
@@ -237,7 +239,7 @@ class Emulator(ABC):
         try:
             listening(self._open())
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
-                self._survive(self.serve, self._wait_s())
+                self._call_guarded(self.serve, self._wait_s())
                 self.woken.take()
         finally:
             self.close()
@@ -247,7 +249,7 @@ class Emulator(ABC):
     def _open(self) -> str:
         try:
             return self.open()
-        except Exception as error:
+        except Exception as error:  # servers raise OSError or zmq.ZMQError: the error number decides
             if _TAKEN.isdisjoint((getattr(error, "errno", None), getattr(error, "winerror", None))):
                 raise
             hint = "end that program or choose another port; without --port and --usual a free port is chosen"
@@ -256,20 +258,20 @@ class Emulator(ABC):
             ) from error
 
     def stop(self) -> None:
-        """End `run` soon. From any thread, also before it began."""
+        """End `run` soon. Thread-safe, also before its start."""
         self._stop.set()
         self._wake()
 
     def _wake(self) -> None:
-        if hasattr(self, "woken"):  # it is made when it runs
+        if hasattr(self, "woken"):  # it exists only while running
             self.woken.post()
 
     @contextmanager
     def running(self, folder: Path, clock: Clock | None = None) -> Iterator[str]:
-        """Run in a thread while in the block, for tests and scripts; gives the address.
+        """Run in a thread while in the block, for tests and scripts; yields the address.
 
         Raises:
-            whatever `run` raised before it listened, or by the end of the block; an emulated crash is none.
+            any exception of `run` before it listened, or up to the end of the block, except an emulated crash.
         """
         opened: list[str] = []
         failed: list[BaseException] = []
@@ -286,7 +288,7 @@ class Emulator(ABC):
                 )
             except Crashed:
                 pass
-            except BaseException as error:
+            except BaseException as error:  # raised again by the thread that waits for the start
                 failed.append(error)
             finally:
                 settled.set()
@@ -305,9 +307,9 @@ class Emulator(ABC):
             raise failed[0]
 
     def run_process(self, context: ProcessContext) -> int:
-        """Be a process of an experiment (what the host calls): with its clock, and its files in the run's folder."""
+        """Run as a process of an experiment (called by the host): with its clock, and files in its run folder."""
         context.when_stopping(self.stop)
-        threading.Thread(target=self._until_the_end_of, args=(context,), name="experiment", daemon=True).start()
+        threading.Thread(target=self._await_experiment_end, args=(context,), name="experiment", daemon=True).start()
 
         with ExitStack() as stack:
             launch, notice = context.launch, None
@@ -331,8 +333,8 @@ class Emulator(ABC):
             return ExitCode.CRASHED
         return ExitCode.ORPHAN if self._stop.is_set() else ExitCode.ENDED
 
-    def _until_the_end_of(self, context: ProcessContext) -> None:
-        """Hears of the end of the experiment; in a thread of its own, since `serve` waits for the vendor's clients."""
+    def _await_experiment_end(self, context: ProcessContext) -> None:
+        # in a thread of its own: `serve` waits for the maker's clients, not for the experiment
         port = open_port(context.launch, context.clock)
         while not any(isinstance(incoming, Killed) for incoming in port.poll(None)):
             pass
@@ -340,30 +342,24 @@ class Emulator(ABC):
         self._wake()
         port.close()
 
-    def _survive(self, do: Callable[[float], float | None], argument: float) -> float | None:
-        """Call it; an error that nobody foresaw ends what goes on, not the emulator: nothing that a client sends may.
-
-        Raises:
-            Crashed: as it was told to.
-        """
+    def _call_guarded(self, do: Callable[[float], float | None], argument: float) -> float | None:
         try:
             return do(argument)
         except Crashed:
             raise
-        except Exception:
+        except Exception:  # no request of a client may end the emulator: any error ends its activity only
             self.log.exception("the emulated %s failed and dropped its current activity", self.vendor)
             self.abandon()
             return self.clock.now_s() + _AGAIN_S
 
     def _wait_s(self) -> float:
-        """Real seconds until something happens by itself."""
         self._look_for_button()
         hang = self.faults.strikes("hang", self.clock.now_s())
         if hang is not None:
             self.log.warning("an emulated fault: %s", hang)
             self._stop.wait(hang.duration_s)
         now_s = self.clock.now_s()
-        times = (self._survive(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
+        times = (self._call_guarded(self.tick, now_s), self.rig.next_change_s(now_s), self.faults.next_s(now_s))
         due_s = min((at_s for at_s in times if at_s is not None), default=math.inf)
         leave_in_s = self._leave_at_s - self.clock.monotonic_s()
         longest_s = LONGEST_WAIT_S if self._button is None else _LOOKS_S
@@ -378,4 +374,43 @@ class Emulator(ABC):
             def press(now_s: float) -> None:
                 button.pressed()
 
-            self._survive(press, self.clock.now_s())
+            self._call_guarded(press, self.clock.now_s())
+
+
+def emulator_names() -> list[str]:
+    """Return the short names of all emulators that installed packages declare: "nanonis" for `NanonisEmulator`."""
+    return sorted(map(_short_name, entry_points.names(entry_points.EMULATORS)))
+
+
+def find_emulator(name: str) -> type[Emulator]:
+    """Return the emulator of a short name, or a user's own by "module.Class".
+
+    Raises:
+        ConfigError: there is none, or its module can't be imported.
+    """
+    module_name, _, class_name = name.rpartition(".")
+    if module_name:
+        found = getattr(_imported(module_name, name), class_name, None)
+    else:
+        declared = {_short_name(one): one for one in entry_points.names(entry_points.EMULATORS)}
+        if name not in declared:
+            raise ConfigError(f"there is no emulator {name!r}", hint=f"there are {', '.join(declared) or 'none'}")
+        found = entry_points.load(entry_points.EMULATORS, declared[name])
+    if not (isinstance(found, type) and issubclass(found, Emulator)):
+        raise ConfigError(
+            f"{name} is not an emulator", hint="a class derived from afspm.simulation.emulation.emulator.Emulator"
+        )
+    return found
+
+
+def _short_name(class_name: str) -> str:
+    return class_name.removesuffix("Emulator").lower()
+
+
+def _imported(module: str, name: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"the emulator {name} can't be imported: {error}", hint="is it installed, or on the path?"
+        ) from error

@@ -1,4 +1,4 @@
-"""The files that a controller still has to write: late, and in two parts."""
+"""Files that a controller writes late, and in two parts."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class FilePart:
-    """A part of a file, to be written at a time (experiment s)."""
+    """A part of a file, due at a time (experiment s)."""
 
     at_s: float
     path: Path
@@ -18,19 +18,19 @@ class FilePart:
 
 
 class PendingWrites:
-    """The file parts that are still to be written."""
+    """The file parts to be written."""
 
     def __init__(self) -> None:
         self._writes: list[FilePart] = []
 
     def save(self, path: Path, content: bytes, at_s: float, rest_at_s: float) -> None:
-        """Half of a file at one time, the other half at another."""
+        """Schedule half of a file at one time, the other half at another."""
         half = len(content) // 2
         self._writes += [FilePart(at_s, path, content[:half]), FilePart(rest_at_s, path, content[half:], begins=False)]
         self._writes.sort(key=lambda write: write.at_s)
 
     def advance(self, now_s: float, *, there: bool) -> float | None:
-        """Write what is due, if the drive is `there`; returns when there is more."""
+        """Write all due parts, if the drive is `there`; return the time of the next part."""
         while self._writes and self._writes[0].at_s <= now_s:
             write = self._writes.pop(0)
             with contextlib.suppress(OSError):

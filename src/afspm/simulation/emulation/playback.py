@@ -1,8 +1,9 @@
-"""Playback of a trace: what to answer to what is asked, and where that first differs from the recording. Pure.
+"""Playback of a trace: the answer to each question, and the first difference from the recording. Pure.
 
-What carries out a request (`TracedExchange.command`) has to be asked as it was recorded, in the same order. What only
-looks at the controller may be asked more or less often and in another order: how often depends on the time that things
-take. The ids that a client counts its questions by are not compared, and secrets are left out: they differ each time.
+A request (`TracedExchange.command`) must be repeated as it was recorded, in the same order. A read of the controller
+may be repeated more or less often and in another order: its frequency depends on timing. Request ids of the client are
+not
+compared, and secrets are left out: they differ each time.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _SHOWN: Final = 200
 
 
 class Deviation(Exception):
-    """The client asks something else than what was recorded; the text says where, and both."""
+    """The client differs from the recording; the text gives the place, and both questions."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class PlayedAnswer:
 
 @dataclass
 class _Cursor:
-    """How far one connection has got: the index of its next exchange among its own."""
+    """The progress of one connection: the index of its next exchange among its own."""
 
     exchanges: Sequence[tuple[int, TracedExchange]]
     next: int = 0
@@ -64,32 +65,32 @@ class Playback:
 
     @property
     def transport(self) -> str:
-        """The transport of the recorded controller; empty: nothing was said."""
+        """The transport of the recorded controller; empty without exchanges."""
         return next((one[1].transport for exchanges in self._recorded for one in exchanges), "")
 
     @property
     def missing(self) -> list[tuple[int, TracedExchange]]:
-        """The recorded exchanges of requests that have not been asked, with their lines."""
+        """The recorded exchanges of requests that have not been repeated, with their lines."""
         begun = [entry for cursor in self._cursors for entry in cursor.exchanges[cursor.next :]]
         unopened = [entry for exchanges in self._recorded[len(self._cursors) :] for entry in exchanges]
         return [entry for entry in begun + unopened if entry[1].command]
 
     def connect(self) -> int:
-        """Return the number of a connection that a client has just made."""
+        """Register a new connection; return its number."""
         number = len(self._cursors)
         self._cursors.append(_Cursor(self._recorded[number] if number < len(self._recorded) else []))
         return number
 
     def ask(self, connection: int, content: bytes) -> PlayedAnswer | None:
-        """Return what to answer; None: the answer is to come later, or the question is not whole yet.
+        """Return the answer to a question; None if it is due later, or the question is incomplete.
 
         Raises:
-            Deviation: it was recorded otherwise.
+            Deviation: the recording differs.
         """
         cursor = self._cursors[connection]
         found = self._match(cursor, content)
         if found is None:
-            if self._may_go_on(cursor, content):
+            if self._may_continue(cursor, content):
                 return None
             raise Deviation(self._difference(cursor, content))
         index, (line, exchange) = found
@@ -98,7 +99,7 @@ class Playback:
             if exchange.after < line - 1 and not self._has_passed(connection, exchange.after, line):
                 return None
             if exchange.lost and line == self._last_line:
-                return None  # by the end of the recording, and not by the controller
+                return None  # cut by the end of the recording, not by the controller
             cursor.next = index + 1
             self._reached = max(self._reached, line)
         if exchange.lost and not exchange.answered:
@@ -106,25 +107,24 @@ class Playback:
         return PlayedAnswer(line, _with_ids_of(content, exchange.answered))
 
     def files(self) -> list[TracedFile]:
-        """Return the files that the controller has written since the last call, by how far the playback has got."""
+        """Return the files that the controller has written since the last call, at this point of the recording."""
         due = [file for file in self._files if self._last_before(*file) <= self._reached]
         self._files = [file for file in self._files if file not in due]
         return [file for _, file in due]
 
     def _last_before(self, line: int, file: TracedFile) -> int:
-        """Return the line of the last exchange before a file was written."""
         said = [entry for exchanges in self._recorded for entry in exchanges]
         return max((number for number, one in said if number < line and one.at_s + one.took_s <= file.at_s), default=0)
 
     def _has_passed(self, connection: int, after: int, line: int) -> bool:
-        """Return True if what was said on other connections between two lines has been said again."""
+        # the order between connections is part of the recording
         others = [cursor for number, cursor in enumerate(self._cursors) if number != connection]
         meanwhile = [one for cursor in others for one, _ in cursor.exchanges if after < one < line]
         return not meanwhile or self._reached >= max(meanwhile)
 
     def _match(self, cursor: _Cursor, content: bytes) -> tuple[int, tuple[int, TracedExchange]] | None:
-        """Return the recorded exchange that answers: the next, past others that only look; else one of the same look
-        before."""
+        # the next recorded exchange, skipping reads; otherwise an earlier answer to the same read: a client may read
+        # more or less often than it did in the recording
         exchanges, wanted = cursor.exchanges, _compared(content)
         for index in range(cursor.next, len(exchanges)):
             exchange = exchanges[index][1]
@@ -140,8 +140,7 @@ class Playback:
                     return min(index, cursor.next - 1), exchanges[index]
         return None
 
-    def _may_go_on(self, cursor: _Cursor, content: bytes) -> bool:
-        """Return True if more bytes may make this a question that was recorded."""
+    def _may_continue(self, cursor: _Cursor, content: bytes) -> bool:
         rest = cursor.exchanges[cursor.next :]
         questions = {one.asked for _, one in cursor.exchanges if one.asked is not None and not one.command}
         questions |= {one.asked for _, one in rest if one.asked is not None}
@@ -158,12 +157,12 @@ class Playback:
 
 
 def _line_before(cursor: _Cursor, index: int) -> int:
-    """Return the line of the exchange before one. The client is past it, though it may have looked less often."""
+    # the client is past it, though it may have read less often
     return cursor.exchanges[index - 1][0] if index else 0
 
 
 def _compared(asked: bytes | None) -> bytes:
-    """Return a question without the ids by which its client counts."""
+    # without the ids that a client gives its requests
     found = _json(asked or b"")
     if found is None or not any(key in found for key in _IDS):
         return asked or b""
@@ -171,7 +170,6 @@ def _compared(asked: bytes | None) -> bytes:
 
 
 def _with_ids_of(asked: bytes, answer: bytes) -> bytes:
-    """Return an answer with the ids of the question that it is now given to."""
     question, found = _json(asked), _json(answer)
     if question is None or found is None:
         return answer

@@ -1,4 +1,4 @@
-"""`MakerProgram`: what a maker's program does around the instrument. Scans and curves are begun, end and are saved."""
+"""`MakerProgram`: a maker's program around the instrument, which starts, ends and saves scans and curves."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ class MakerProgram(ABC):
     """The program, without its protocol. For one thread at a time.
 
     Args:
-        folder: that files are saved to.
-        start_s: how long the ramp to the first line takes, experiment time.
-        file_s: how long after the end a file begins to appear; its other half appears as much later.
+        folder: for saved files.
+        start_s: duration of the ramp to the first line, experiment time.
+        file_s: delay between the end and the first half of a file; the second half follows after the same delay.
 
     Attributes:
         rig: the instrument.
-        repeats: whether another scan begins when one has ended.
-        saves_partial: whether a scan is saved that was broken off.
+        repeats: another scan starts when one has ended.
+        saves_partial: an interrupted scan is saved.
     """
 
     def __init__(
@@ -61,40 +61,39 @@ class MakerProgram(ABC):
 
     @abstractmethod
     def prepare_scan(self) -> None:
-        """Put the panel's values into `rig.setup`, right before a scan. Raises AfspmError: they can't be scanned."""
+        """Copy the panel's values to `rig.setup`, right before a scan. Raises AfspmError: they are invalid."""
 
     @abstractmethod
     def prepare_curve(self) -> None:
-        """The same before a curve."""
+        """Copy the panel's values to `rig.setup`, right before a curve."""
 
     @abstractmethod
     def scan_files(self, scan: ScanActivity, now_s: float) -> Sequence[NamedFile]:
-        """Return the files of a scan that has ended; none: it is not saved."""
+        """Return the files of an ended scan; empty if it is not saved."""
 
     @abstractmethod
     def curve_files(self, curve: SpectrumActivity, now_s: float) -> Sequence[NamedFile]:
-        """Return the files of a curve that has ended; none: it is not saved."""
+        """Return the files of an ended curve; empty if it is not saved."""
 
     # -- what goes on
 
     @property
     def now_s(self) -> float:
-        """Experiment time."""
         return self.clock.now_s()
 
     @property
     def scanning(self) -> bool:
-        """True from the command to scan to the end of the scan."""
+        """True from the scan command to the end of the scan."""
         return self._scan is not None or math.isfinite(self._starts_at_s)
 
     @property
     def measuring_curve(self) -> bool:
-        """True from the command to take a curve to its end."""
+        """True from the command to the end of a curve."""
         return self._curve is not None
 
     @property
     def engages(self) -> bool:
-        """True while the tip is about to go to the sample."""
+        """True while the approach is due but not started."""
         return self._engages
 
     @property
@@ -103,7 +102,7 @@ class MakerProgram(ABC):
         return self.rig.engaged or self._engages
 
     def advance(self, now_s: float) -> float | None:
-        """Advance to now; return when something else happens, besides what the rig knows of itself."""
+        """Advance to now; return the time of the next event, except events of the rig."""
         if self._engages and not self.rig.busy(now_s):
             self._engages = False
             self.rig.engage(now_s)
@@ -119,13 +118,12 @@ class MakerProgram(ABC):
         return min((at_s for at_s in (due_s, self._starts_at_s) if at_s is not None and at_s > now_s), default=None)
 
     def start_scan(self, now_s: float) -> None:
-        """Begin a scan. Raises InstrumentBusy."""
+        """Start a scan. Raises InstrumentBusy."""
         self._refuse_busy()
         if not self.faults.strikes("scan-refused", now_s):
             self._starts_at_s = now_s + self._start_s
 
     def stop_scan(self, now_s: float) -> None:
-        """Break the scan off."""
         self._starts_at_s = math.inf
         ended, self._scan = self._scan, None
         if ended is not None:
@@ -134,39 +132,38 @@ class MakerProgram(ABC):
                 self._save(self.scan_files(ended, now_s), now_s)
 
     def start_curve(self, kind: str, now_s: float) -> None:
-        """Take a curve where the tip is. Raises InstrumentBusy, InvalidValue."""
+        """Take a curve at the position of the tip. Raises InstrumentBusy, InvalidValue."""
         self._refuse_busy()
         if not self.faults.strikes("spectrum-refused", now_s):
             self.prepare_curve()
             self._curve = self.rig.start_spectrum(kind, now_s)
 
     def stop_curve(self) -> None:
-        """Break the curve off."""
         if self._curve is not None:
             self._curve = None
             self.rig.stop_spectrum(self.now_s)
 
     def engage(self) -> None:
-        """Bring the tip to the sample, once it has finished going away. Raises InstrumentBusy."""
+        """Approach the sample, after a running withdrawal. Raises InstrumentBusy."""
         if self.scanning or self.measuring_curve:
             raise InstrumentBusy("a measurement is running")
         self._engages = True
 
     def stop_engaging(self) -> None:
-        """Leave the tip where it is on its way to the sample: away from it."""
+        """Stop the approach; the tip stays away from the sample."""
         if self._engages or self.rig.doing(self.now_s) == "approach":
             self._engages = False
             self.rig.stop("approach", self.now_s)
             self.rig.engaged = False
 
     def withdraw(self, now_s: float) -> None:
-        """End what goes on, and take the tip away from the sample."""
+        """End the activity, and withdraw the tip."""
         self.stop_scan(now_s)
         self._engages, self._curve = False, None
         self.rig.withdraw(now_s)
 
     def abandon(self) -> None:
-        """Forget what goes on, as an error that nobody foresaw ended it."""
+        """Drop the activity after an unexpected error."""
         self._starts_at_s, self._scan, self._curve, self._engages = math.inf, None, None, False
 
     # -- inside
@@ -177,7 +174,7 @@ class MakerProgram(ABC):
             raise InstrumentBusy(f"the instrument is busy with a {doing or 'approach'}")
 
     def _begin_scan(self, now_s: float) -> None:
-        """Begin the scan; with values that no scan can be taken with, it ends as if stopped at the panel."""
+        # with values that can't be scanned, the scan ends as if stopped at the panel
         try:
             self.prepare_scan()
             self._scan = self.rig.start_scan(now_s)

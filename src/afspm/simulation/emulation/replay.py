@@ -1,4 +1,4 @@
-"""A controller that says what a recorded one said: a trace played back, for a bug report that becomes a test."""
+"""`TraceReplay`: an emulated controller that plays back a recorded trace, so that a bug report becomes a test."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ReplayClient:
     """A client: of TCP by its socket, of ZeroMQ by its identity.
 
     Attributes:
-        introduction: that has to be over before its questions are answered; None: there is none.
+        introduction: the greeting that precedes its questions; None without one.
     """
 
     number: int
@@ -42,16 +42,16 @@ class ReplayClient:
 
 
 class TraceReplay(Emulator):
-    """Plays a trace back: it answers what was answered, and tells where the questions first differ.
+    """Plays a trace back: gives the recorded answers, and reports the first different question.
 
     Args:
         trace: the file (`afspm trace`).
-        files: the folder for the controller's files; left out: that of the emulator. The translator has to look there:
+        files: the folder for the controller's files; by default the emulator's. The translator must look there:
             session_dir, folders or scan_dir in its section.
         common: as of every emulator.
 
     Attributes:
-        deviation: the first difference; empty: none so far.
+        deviation: the first difference; empty if there is none so far.
     """
 
     vendor: ClassVar[str] = "replayed"
@@ -92,7 +92,7 @@ class TraceReplay(Emulator):
         else:
             self._serve_tcp(timeout_s)
         while any(self._answer(client) for client in self._clients):
-            pass  # an answer to one may be what another one's waits for
+            pass  # repeated, since the answer to one client may release the answer to another
         self._write_files()
 
     def _serve_tcp(self, timeout_s: float) -> None:
@@ -137,7 +137,6 @@ class TraceReplay(Emulator):
         client.received[:] = frames[-1]
 
     def _answer(self, client: ReplayClient) -> bool:
-        """Answer what a client has asked, or end its connection; False: there is nothing to answer yet."""
         is_stranger = client.introduction is not None and not client.introduction.is_over
         if not client.received or is_stranger:
             return False
@@ -161,15 +160,14 @@ class TraceReplay(Emulator):
         return True
 
     def _drop(self, client: ReplayClient) -> None:
-        """End a connection. Of ZeroMQ there is none to end: the client gets no answer."""
+        # ZeroMQ has no connection to end: its client gets no answer
         client.received.clear()
         if client.tcp is not None:
             self._selector.unregister(client.tcp)
             client.tcp.close()
             client.tcp = None
 
-    def _tell(self) -> None:
-        """Say how it went, for people and in `replay.json`."""
+    def _write_result(self) -> None:
         left = len(self.playback.missing)
         if not self.deviation:
             state = f"{left} exchanges of requests were not asked again" if left else "all was asked again"
@@ -186,7 +184,7 @@ class TraceReplay(Emulator):
     def close(self) -> None:
         if not hasattr(self, "playback"):
             return
-        self._tell()
+        self._write_result()
         if self.playback.transport == ZEROMQ:
             self._context.destroy(linger=0)
             return

@@ -1,7 +1,7 @@
-"""`ScriptedEmulator`: a controller whose clients send it scripts, and get a value for each.
+"""`ScriptedEmulator`: a controller whose clients send scripts, and get a value for each.
 
-The maker's emulator gives the wire (`open_wire`), the interpreter (`answer`) and the words of an error (`failure`);
-the queue of requests, replies that wait, and everything that goes wrong on the way are here.
+The maker's emulator provides the wire (`open_wire`), the interpreter (`answer`) and the text of an error (`failure`);
+this module provides the queue of requests, waiting replies, and all faults of communication.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ SCRIPT_FAULTS: Final = {
 }
 
 Client = Hashable
-"""A client, as its wire tells it from others."""
+"""The wire's identification of a client."""
 OnRequest = Callable[[Client, bytes], None]
 
 
 class ScriptWire(Protocol):
-    """The socket of a controller, that takes scripts and sends values.
+    """The socket of a controller, which receives scripts and sends values.
 
     Attributes:
-        address: as a client is given it.
-        port: that it listens at.
+        address: for clients.
+        port: of the listening socket.
     """
 
     @property
@@ -52,20 +52,19 @@ class ScriptWire(Protocol):
     def port(self) -> int: ...
 
     def poll(self, timeout_s: float) -> None:
-        """Wait up to so many real seconds for requests or to be woken, and call `OnRequest` with each."""
+        """Wait up to `timeout_s` real seconds for requests or a wake-up; call `OnRequest` with each request."""
 
     def send(self, client: Client, reply: bytes) -> None:
-        """Send a reply to a client, if it is still there."""
+        """Send a reply to a client, unless it is gone."""
 
     def send_half(self, client: Client, reply: bytes) -> None:
-        """Send half a reply, as the wire can."""
+        """Send half a reply, in the way of the wire."""
 
-    def close(self) -> None:
-        """Listen no more."""
+    def close(self) -> None: ...
 
 
 class ScriptFailed(AfspmError):
-    """A script can't be run: what the interpreter says becomes the reply."""
+    """A script can't be run; the interpreter's message becomes the reply."""
 
     code = "script-failed"
 
@@ -75,7 +74,7 @@ class Unfinished:
     """The reply to a script that waits for the instrument.
 
     Attributes:
-        resume: return the reply, or what it goes on waiting for. Called whenever something may have changed.
+        resume: returns the reply, or the next `Unfinished`. Called after every possible change.
     """
 
     resume: Callable[[], bytes | Unfinished]
@@ -83,7 +82,7 @@ class Unfinished:
 
 @dataclass
 class Waiting:
-    """A client whose reply is not sent yet: it waits for a time, or for its script to end."""
+    """A client with a pending reply: for a time, or for the end of its script."""
 
     client: Client
     reply: bytes | Unfinished
@@ -94,7 +93,7 @@ class ScriptedEmulator(Emulator):
     """A controller that answers scripts. Write the abstract methods; all are called from one thread.
 
     Attributes:
-        program: the maker's program behind the interpreter, made by `make_program`.
+        program: the maker's program behind the interpreter, created by `make_program`.
     """
 
     fault_kinds: ClassVar[dict[str, str]] = SCRIPT_FAULTS
@@ -104,7 +103,7 @@ class ScriptedEmulator(Emulator):
 
     @abstractmethod
     def make_program(self) -> MakerProgram:
-        """Make the program, with its interpreter. `rig`, `faults`, `folder`, `clock` and `log` are there."""
+        """Create the program, with its interpreter. `rig`, `faults`, `folder`, `clock` and `log` exist."""
 
     @abstractmethod
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
@@ -124,12 +123,12 @@ class ScriptedEmulator(Emulator):
 
     @abstractmethod
     def not_a_number(self, request: bytes) -> bytes:
-        """Return the reply that says NaN."""
+        """Return a reply with the value NaN."""
 
     # -- what is done with it
 
     def open(self) -> str:
-        """Make the program, and listen."""
+        """Create the program, and listen."""
         self._queue: deque[tuple[Client, bytes]] = deque()
         self._waiting: list[Waiting] = []
         self._open_again_at_s = math.inf
@@ -139,7 +138,7 @@ class ScriptedEmulator(Emulator):
         return self._wire.address
 
     def serve(self, timeout_s: float) -> None:
-        """Take what was asked, and answer it."""
+        """Receive requests and answer them."""
         if self._wire is None:
             select.select([self.woken], [], [], timeout_s)
             return
@@ -149,25 +148,24 @@ class ScriptedEmulator(Emulator):
             self.program.advance(self.clock.now_s())
 
     def tick(self, now_s: float) -> float | None:
-        """Advance the program, and send what was waited for."""
+        """Advance the program, and send replies that have become ready."""
         self._restart(now_s)
         again_s = self.program.advance(now_s)
         if not self._has_dialog():
             waiting, self._waiting = self._waiting, []
             for one in waiting:
-                self._go_on(one, now_s)
+                self._send_if_due(one, now_s)
         if self._queue and not self._has_dialog():
             return now_s
         times = [again_s, self._open_again_at_s, *(one.at_s for one in self._waiting)]
         return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
 
     def abandon(self) -> None:
-        """Give up what the program does, too."""
+        """Drop the program's activity, too."""
         super().abandon()
         self.program.abandon()
 
     def close(self) -> None:
-        """Listen no more."""
         wire: ScriptWire | None = getattr(self, "_wire", None)
         if wire is not None:
             wire.close()
@@ -203,15 +201,14 @@ class ScriptedEmulator(Emulator):
             reply = self._answered(request, lambda: self.answer(client, request))
         if not isinstance(reply, Unfinished) and self.faults.strikes("nan", now_s):
             reply = self.not_a_number(request)
-        self._go_on(Waiting(client, self._guarded(request, reply)), now_s)
+        self._send_if_due(Waiting(client, self._guarded(request, reply)), now_s)
 
     def _answered(self, request: bytes, answer: Callable[[], Any]) -> Any:
-        """Answer; an error is a reply, too."""
         try:
             return answer()
         except Crashed:
             raise
-        except Exception as error:  # whatever a client asks for, the program stays
+        except Exception as error:  # no request of a client may end the program
             if not isinstance(error, AfspmError):
                 self.log.exception("a script failed")
             return self.failure(request, str(error))
@@ -222,8 +219,7 @@ class ScriptedEmulator(Emulator):
         resume = reply.resume
         return Unfinished(lambda: self._guarded(request, self._answered(request, resume)))
 
-    def _go_on(self, one: Waiting, now_s: float) -> None:
-        """Send a reply that is there and due; keep what is not."""
+    def _send_if_due(self, one: Waiting, now_s: float) -> None:
         if isinstance(one.reply, Unfinished):
             one.reply = one.reply.resume()
         if isinstance(one.reply, Unfinished) or one.at_s > now_s:
@@ -236,7 +232,6 @@ class ScriptedEmulator(Emulator):
         self._send(one.client, one.reply, now_s)
 
     def _send(self, client: Client, reply: bytes, now_s: float) -> None:
-        """Send a reply, or what goes wrong with it."""
         if self._wire is None or self.faults.strikes("no-reply", now_s):
             return
         if self.faults.strikes("half-reply", now_s):

@@ -1,4 +1,4 @@
-"""The connections of clients: requests in, replies out, one after the other on each, and all that goes wrong there."""
+"""TCP connections of clients: requests in, replies out, in order on each, with emulated faults of communication."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class ClientConnection:
     """One client.
 
     Attributes:
-        received: what has not been answered yet; sending: what has not been sent yet.
-        waits_for: what the reply to the current request is waiting for; nothing else is answered meanwhile.
-        closing: nothing more is answered; it ends once all has been sent.
-        memory: what the controller remembers of the client.
+        received: bytes not yet answered; sending: bytes not yet sent.
+        waits_for: the condition of the reply to the current request; no other request is answered meanwhile.
+        closing: no more answers; the connection ends once all bytes are sent.
+        memory: the controller's state about the client.
     """
 
     socket: socket.socket
@@ -34,14 +34,14 @@ class ClientConnection:
 
 
 class TcpServer:
-    """Ports and connections, without a thread: everything happens in `poll`.
+    """Ports and connections, without a thread: `poll` does all the work.
 
     Args:
         ports: to listen on; 0: any free one.
-        stream_port: whoever connects there only reads; 0: any free one, None: there is none.
-        one_each: a port serves one client at a time; another waits until that has gone.
-        wakes: something with a `fileno` that ends `poll`.
-        on_bytes: called with a connection that has more in `received`.
+        stream_port: for clients that only read; 0: any free one, None: there is none.
+        one_each: a port serves one client at a time; others wait until it has gone.
+        wakes: an object with a `fileno` that ends `poll`.
+        on_bytes: called with a connection after new bytes in `received`.
     """
 
     def __init__(
@@ -71,26 +71,26 @@ class TcpServer:
 
     @property
     def ports(self) -> list[int]:
-        """Ports that listen for requests."""
+        """The ports that listen for requests."""
         return [int(listener.getsockname()[1]) for listener in self._listeners]
 
     @property
     def stream_port(self) -> int:
-        """Port of the stream; 0 without one."""
+        """The port of the stream; 0 without one."""
         return 0 if self._stream is None else int(self._stream.getsockname()[1])
 
     @property
     def connections(self) -> list[ClientConnection]:
-        """Connections of clients that send requests."""
+        """The connections of clients that send requests."""
         return [connection for connection, listener in self._of.items() if listener is not self._stream]
 
     @property
     def readers(self) -> list[ClientConnection]:
-        """Connections of clients that read the stream."""
+        """The connections of clients that read the stream."""
         return [connection for connection, listener in self._of.items() if listener is self._stream]
 
     def poll(self, timeout_s: float) -> None:
-        """Wait for clients up to so many real seconds, and deal with what has come."""
+        """Wait up to `timeout_s` real seconds for clients, and process their bytes."""
         for key, events in self._selector.select(timeout_s):
             if isinstance(key.data, ClientConnection):
                 if events & selectors.EVENT_READ:
@@ -101,7 +101,7 @@ class TcpServer:
                 self._accept(key.data)
 
     def send(self, connection: ClientConnection, content: bytes = b"") -> None:
-        """Send what the client takes now, and the rest later."""
+        """Send as much as the client accepts now, and the rest later."""
         connection.sending += content
         try:
             while connection.sending:
@@ -119,7 +119,6 @@ class TcpServer:
         self._selector.modify(connection.socket, events, connection)
 
     def cut(self, connection: ClientConnection) -> None:
-        """End a connection."""
         listener = self._of.pop(connection, None)
         if listener is None:
             return

@@ -1,7 +1,7 @@
 """A simulated microscope: the physics of `afspm.simulation` behind a controller with all the base actions.
 
-It runs on the experiment clock, so that a night passes in a minute, and keeps its state over a kill: it is the same
-instrument afterwards, with the same tip, and what it was measuring has gone on meanwhile.
+It runs on the experiment clock, so that a night passes in a minute. Its state survives a kill: the same tip continues,
+and a measurement has gone on meanwhile.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 Table = dict[str, object]
-"""Settings as the experiment file has them."""
+"""Settings in the form of the experiment file."""
 Rows = dict[str, Table]
 
 FAULT_KINDS: Final[Mapping[str, str]] = {
@@ -80,15 +80,13 @@ _AT_FIRST: Table = {
 }
 
 
-def _told(
+def _controller_action(
     name: str,
     do: Callable[[SimulatedController, float], None],
     *,
     state: ScopeState | None = None,
     refuses: bool = True,
 ) -> Callable[[Simulator], None]:
-    """Return the action that has the controller do something now, unless a simulated fault refuses."""
-
     @action(name, state=state)
     def act(self: Simulator) -> None:
         do(self._reached(refuses=refuses), self.clock.now_s())
@@ -100,19 +98,19 @@ class Simulator(Driver):
     """The simulated microscope.
 
     Args:
-        seed: the seed of every random number.
+        seed: of all random numbers.
         surface: a kind, or a table of `kind` and its settings.
         tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: a table of its own settings.
         initial: values of parameters at the start, by their generic names.
-        approach_s: how long engaging and retracting take.
+        approach_s: duration of engaging and retracting.
         faults: faults and their times, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
-        fault_action: whether the action "x-fault" makes faults on demand.
-        panel: what a person does at the controller's panel, each a table of `at_s` with `set` or `action`.
+        fault_action: enable the action "x-fault", which triggers faults on demand.
+        panel: actions of a person at the controller's panel, each a table of `at_s` with `set` or `action`.
         parameters: rows added to the table of parameters, or changed in it.
         actions: generic actions added: `{name = {set = {<parameter> = <value>}}}`.
-        poll_period_s: how often its state is read, in real seconds, while nothing is due.
-        result_timeout_s: how long after a scan or spectrum its file may take to appear.
-        live_lines_s: how often lines of a running scan are published, 0: not at all; by default twice a real second.
+        poll_period_s: interval between reads of its state, in real seconds, while nothing is due.
+        result_timeout_s: longest delay of the file after the end of a scan or spectrum.
+        live_lines_s: interval between publications of lines of a running scan, 0: none; by default twice a real second.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -186,12 +184,12 @@ class Simulator(Driver):
             )
             if not fault_action:
                 self.table = self.table.without(_FAULT_PARAMETERS)
-            if loop is not None:  # else it can't be said what a setpoint is
+            if loop is not None:  # an invalid feedback leaves the unit of the setpoint unknown
                 self._check_values(loop, initial or {}, errors)
         errors.raise_all()
 
     def _check_values(self, loop: FeedbackSettings, initial: PlainMapping, errors: ErrorCollector) -> None:
-        """Values of parameters that are set by themselves: at the start, and by a person at the panel."""
+        # `initial` and the panel set parameters without a request, so nothing else would check these values
         in_force = {
             FEEDBACK_ON: loop.on,
             names.ZCTRL_PGAIN: loop.proportional_gain,
@@ -221,13 +219,13 @@ class Simulator(Driver):
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
     def connect(self) -> None:
-        """Switch the instrument on, or find it as it was."""
+        """Switch the instrument on, or restore its state."""
         if self._controller is None:
             self._controller = self._switch_on()
         self._reached(refuses=False)
 
     def _switch_on(self) -> SimulatedController:
-        import_module("scipy.io")  # which saves files: the first is not to be later than others
+        import_module("scipy.io")  # imported in advance: otherwise the first saved file would be late
         kept = self.memory
         if "start_s" not in kept:
             values = {name: self.table[name].to_vendor(value) for name, value in self._initial.items()}
@@ -247,7 +245,6 @@ class Simulator(Driver):
         )
 
     def _reached(self, *, refuses: bool) -> SimulatedController:
-        """Return the controller, unless a fault is in the way."""
         now_s, faults, controller = self.clock.now_s(), self.faults, self._controller
         if controller is None or faults is None or faults.lasts("restart", now_s):
             raise ControllerLost("the simulated controller can't be reached")
@@ -271,7 +268,7 @@ class Simulator(Driver):
         return value
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set values; the frame and the probe are moved at the move speed."""
+        """Set values; frame and probe move at the move speed."""
         for vendor in values:
             self.get(vendor)
         controller = self._reached(refuses=not set(values) <= set(_FAULT_PARAMETERS))
@@ -286,18 +283,20 @@ class Simulator(Driver):
     def lines(self, start: int) -> Sequence[ScanLines]:
         return self._reached(refuses=False).lines(start, self.clock.now_s())
 
-    start_scan = _told(names.START_SCAN, SimulatedController.start_scan)
-    stop_scan = _told(names.STOP_SCAN, SimulatedController.stop)
-    start_spec = _told(names.START_SPEC, SimulatedController.start_spectrum)
-    stop_spec = _told(names.STOP_SPEC, SimulatedController.stop)
-    pulse = _told(names.PULSE, SimulatedController.pulse, state=ScopeState.BUSY_PARAM)
-    crash = _told(names.CRASH, SimulatedController.crash, state=ScopeState.MOVING)
-    engage = _told(names.ENGAGE, SimulatedController.engage, state=ScopeState.COARSE_MOTOR)
-    retract = _told(names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False)
+    start_scan = _controller_action(names.START_SCAN, SimulatedController.start_scan)
+    stop_scan = _controller_action(names.STOP_SCAN, SimulatedController.stop)
+    start_spec = _controller_action(names.START_SPEC, SimulatedController.start_spectrum)
+    stop_spec = _controller_action(names.STOP_SPEC, SimulatedController.stop)
+    pulse = _controller_action(names.PULSE, SimulatedController.pulse, state=ScopeState.BUSY_PARAM)
+    crash = _controller_action(names.CRASH, SimulatedController.crash, state=ScopeState.MOVING)
+    engage = _controller_action(names.ENGAGE, SimulatedController.engage, state=ScopeState.COARSE_MOTOR)
+    retract = _controller_action(
+        names.RETRACT, SimulatedController.retract, state=ScopeState.COARSE_MOTOR, refuses=False
+    )
 
     @action(_FAULT, while_busy=True)
     def fault(self) -> None:
-        """Make the fault that the parameters "x-fault-…" describe."""
+        """Trigger the fault of the parameters "x-fault-…"."""
         kind, count, duration_s = (self.memory["values"][name] for name in _FAULT_PARAMETERS)
         self.demanded = Fault(str(kind), 0.0, int(count), float(duration_s))
 
@@ -306,7 +305,7 @@ class Simulator(Driver):
         return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
 
     def run_process(self, context: ProcessContext) -> int:
-        """Be the translator, with the faults that are not the controller's."""
+        """Run the translator, with faults that are not the controller's."""
         from afspm.simulation.simulator.faulty import FaultyTranslator
         from afspm.translator.translator import run_translator
 
@@ -321,7 +320,6 @@ _SETPOINTS: Final[Rows] = {
 
 
 def _rows_for(mode: str) -> Rows:
-    """Return the rows that depend on the operating mode: what its setpoint is."""
     return {names.ZCTRL_SETPOINT: _SETPOINTS[mode], names.SPEC_KIND: {"choices": ["IV", "force"]}}
 
 
@@ -329,13 +327,13 @@ def _merged(*tables: Mapping[str, Mapping[str, object]]) -> Rows:
     merged: Rows = {}
     for table in tables:
         for name, row in table.items():
-            # what is no table is for the table of parameters to refuse
+            # the table of parameters refuses a row that is not a table
             merged[name] = {**merged.get(name, {}), **row} if isinstance(row, Mapping) else row
     return merged
 
 
 def _loop_of(settings: Mapping[str, object]) -> FeedbackSettings | None:
-    """The feedback at the start, whatever is wrong with the rest of the world; None: it is itself."""
+    # None if the feedback itself is invalid; errors elsewhere in the world don't matter here
     of_it = {name: settings[name] for name in ("surface", "feedback") if settings.get(name) is not None}
     try:
         return read_settings(of_it)[1].feedback

@@ -1,7 +1,7 @@
-"""The simulated controller: values in force, a panel, and the files of what the simulated instrument measures.
+"""The simulated controller: settings in force, a panel, and files of the simulated instrument's measurements.
 
-All that lasts is kept as "this, with these values, since then": a process that is restarted finds a measurement still
-running or finished, as with a controller that has a life of its own.
+Every activity is saved with its settings and its start time, so that a restarted process finds a measurement running or
+finished, as with a real controller.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from afspm.translator.state import Kept
 
 LISTED_RESULTS = 16
 ADJUSTED: Final = (names.ZCTRL_SETPOINT, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.TIP_BIAS_VOLTAGE)
-"""What holds from the next line on, when it is set during a scan."""
+"""Parameters that take effect from the next line on when set during a scan."""
 
 _STATES: Final = {
     "": ScopeState.FREE,
@@ -62,8 +62,8 @@ class SimulatedController:
     """The controller.
 
     Args:
-        kept: everything that lasts, JSON-able. It is brought up to date by every call.
-        folder: for the files that it saves.
+        kept: the saved state, JSON-able; every call updates it.
+        folder: for saved files.
         panel: actions of a person, in any order.
     """
 
@@ -104,7 +104,7 @@ class SimulatedController:
     # --- what is going on ---
 
     def state(self, now_s: float) -> ScopeState:
-        """Return the state of the instrument, after everything has happened that was to happen until now."""
+        """Return the state of the instrument, after all events up to now."""
         self._advance(now_s)
         if self._instrument.doing(now_s) == "scan":
             if self._faults.strikes("stopped", now_s):
@@ -114,7 +114,7 @@ class SimulatedController:
         return _STATES[self._instrument.doing(now_s)]
 
     def next_change_s(self) -> float | None:
-        """When the next thing happens by itself; None if nothing will, or the drawing of a scan wakes the driver."""
+        """Return the time of the next event; None without one, or if the computation of a scan wakes the driver."""
         times = (self._panel_s(), self._files.whole_s(), self._instrument.ends_s)
         return min((at_s for at_s in times if at_s is not None), default=None)
 
@@ -123,7 +123,7 @@ class SimulatedController:
         return list(self._kept["results"])
 
     def lines(self, start: int, now_s: float) -> list[ScanLines]:
-        """The lines of the running scan beyond the first `start`, as far as they are complete."""
+        """Return the complete lines of the running scan after the first `start`."""
         scan = self._instrument.scan
         if scan is None or scan.drawing or self._instrument.doing(now_s) != "scan":
             return []
@@ -152,7 +152,7 @@ class SimulatedController:
             elif isinstance(ended, SpectrumActivity):
                 self._save_spectrum(ended)
         except AfspmError as error:
-            # as with a controller that fails: it is free again, and there is no file
+            # like a controller that fails: free again, without a file
             self._log.error("the simulated measurement failed: %s; it has no file", error)
         self._keep()
 
@@ -162,7 +162,7 @@ class SimulatedController:
     # --- values ---
 
     def set(self, values: dict[str, Value], now_s: float) -> None:
-        """Change values, by their generic names, in the table's units; a new frame or position is moved to."""
+        """Change values, by their generic names, in the table's units; move to a new frame or position."""
         before = self._si()
         self._kept["values"].update(values)
         after = self._si()
@@ -170,11 +170,11 @@ class SimulatedController:
         rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
             self._instrument.follow(rate_m_s, now_s)
-        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a driver may lack some
+        if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a table of parameters may lack some
             self._instrument.adjust(now_s)
         way_m = _distance(before, after, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
         if way_m > 0.0 or _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y) > 0.0:
-            self.stop(now_s)  # as far as that is allowed, it ends what is being measured
+            self.stop(now_s)  # a change allowed at this moment ends the measurement
             place_m = (float(after[names.PROBE_POS_X]), float(after[names.PROBE_POS_Y]))
             with _refusing():
                 self._instrument.move_probe(place_m, now_s, way_m=way_m)
@@ -198,7 +198,7 @@ class SimulatedController:
     # --- actions ---
 
     def start_scan(self, now_s: float) -> None:
-        """Scan the frame: every line there and back at the scan speed."""
+        """Scan the frame, trace and retrace at the scan speed."""
         self._prepare(now_s)
         if not self._faults.strikes("scan-refused", now_s):
             with _refusing():
@@ -206,7 +206,7 @@ class SimulatedController:
             self._measures()
 
     def start_spectrum(self, now_s: float) -> None:
-        """Take a curve of the kind that is set, where the probe is."""
+        """Take a curve of the set kind, at the probe's position."""
         self._prepare(now_s)
         if not self._faults.strikes("spectrum-refused", now_s):
             with _refusing():
@@ -214,13 +214,13 @@ class SimulatedController:
             self._measures()
 
     def stop(self, now_s: float) -> None:
-        """Break the measurement off; it has no result."""
+        """Interrupt the measurement; it has no result."""
         self._instrument.stop_scan(now_s)
         self._instrument.stop_spectrum(now_s)
         self._keep()
 
     def pulse(self, now_s: float) -> None:
-        """A bias pulse where the probe is."""
+        """Pulse the bias at the probe's position."""
         self._prepare(now_s)
         values = self._si()
         with _refusing():
@@ -228,7 +228,7 @@ class SimulatedController:
         self._keep()
 
     def crash(self, now_s: float) -> None:
-        """Drive the tip into the sample where the probe is, and out again."""
+        """Drive the tip into the sample at the probe's position, and out again."""
         self._prepare(now_s)
         values = self._si()
         with _refusing():
@@ -236,13 +236,13 @@ class SimulatedController:
         self._keep()
 
     def retract(self, now_s: float) -> None:
-        """End the activity, and take the tip away from the sample."""
+        """End the activity, and withdraw the tip."""
         self._kept["values"][names.ENGAGED] = False
         self._instrument.withdraw(now_s)
         self._keep()
 
     def engage(self, now_s: float) -> None:
-        """Bring the tip to the sample."""
+        """Approach the sample."""
         self.stop(now_s)
         with _refusing():
             self._instrument.engage(now_s)
@@ -250,7 +250,6 @@ class SimulatedController:
         self._keep()
 
     def _prepare(self, now_s: float) -> None:
-        """Raises Refused if the tip can't be used now."""
         self._advance(now_s)
         doing = self._instrument.doing(now_s)
         if doing:
@@ -306,7 +305,6 @@ class SimulatedController:
 
 @contextmanager
 def _refusing() -> Iterator[None]:
-    """Turn what the instrument refuses into the refusal of a request."""
     try:
         yield
     except InstrumentBusy as busy:
@@ -320,7 +318,7 @@ def _distance(before: dict[str, Value], after: dict[str, Value], *axes: str) -> 
 
 
 class SavedFiles:
-    """The files that the simulated controller saves, some of them late, or half at first."""
+    """The files of the simulated controller; faults make some late or incomplete at first."""
 
     def __init__(self, folder: Path, kept: Kept, faults: Faults) -> None:
         self._folder = folder
@@ -344,12 +342,12 @@ class SavedFiles:
         self._kept["results"] = [*self._kept["results"], str(path)][-LISTED_RESULTS:]
 
     def whole_s(self) -> float | None:
-        """Return when a file appears that is late, or half; None: none is."""
+        """Return the time at which a late or incomplete file becomes complete, or None."""
         late = self._kept.get("late")
         return None if late is None else float(late[1])
 
     def complete(self) -> None:
-        """Put the whole file where it belongs."""
+        """Complete the late file."""
         path = Path(self._kept.pop("late")[0])
         try:
             _hidden(path).replace(path)

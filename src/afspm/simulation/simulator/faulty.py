@@ -1,4 +1,4 @@
-"""A translator with the faults that are not the controller's: late and missing answers, hanging, dying."""
+"""A translator with faults that are not the controller's: late and missing answers, hangs, crashes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class FaultyTranslator(Translator):
-    """`Translator` with the faults that its simulated microscope is to have."""
+    """`Translator` with the faults of its simulated microscope."""
 
     _late: tuple[float, Response] | None = None
 
@@ -30,7 +30,8 @@ class FaultyTranslator(Translator):
             response, self._late = self._late[1], None
             super().reply(response)
         simulator = self._simulator
-        if simulator.faults is not None and simulator.demanded is not None:  # only now: not at the request for it
+        # only now, so that the request that demands the fault is still answered
+        if simulator.faults is not None and simulator.demanded is not None:
             simulator.faults.demand(simulator.demanded, self._clock.now_s())
             simulator.demanded = None
         if self._strikes("crash"):
@@ -55,7 +56,7 @@ class FaultyTranslator(Translator):
         fault = None if faults is None else faults.strikes(kind, self._clock.now_s())
         if fault is not None:
             self._log.warning("a simulated fault: %s", fault)
-            self.state.save()  # it strikes once, also where this process ends by it
+            self.state.save()  # saved at once: a crash must not strike again after the restart
         return fault
 
     def reply(self, response: Response, level: int = logging.INFO) -> None:

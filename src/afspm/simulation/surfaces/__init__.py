@@ -1,4 +1,4 @@
-"""Samples to scan: generated ones without bounds, and those taken from a file."""
+"""Samples to scan: generated without bounds, or read from a file."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ __all__ = ["KINDS", "Relief", "Surface", "surface_from"]
 
 
 def surface_from(settings: object, where: str = "surface") -> Surface:
-    """The surface that a table asks for: its `kind` and the settings of that kind.
+    """Return the surface of a table: its `kind` and the settings of that kind.
 
     Raises:
-        ConfigError: an unknown kind or setting, or a value without sense.
-        FileError: a surface of a file that cannot be read.
+        ConfigError: an unknown kind or setting, or an invalid value.
+        FileError: the surface's file can't be read.
     """
     if isinstance(settings, str):
         settings = {"kind": settings}

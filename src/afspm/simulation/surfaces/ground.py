@@ -1,4 +1,4 @@
-"""Irregular surfaces: terraces between meandering steps, rough and flat ground, strewn nanoparticles."""
+"""Irregular surfaces: terraces between meandering steps, rough and flat ground, scattered nanoparticles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Steps:
 
     Attributes:
         angle_deg: direction of the rise, counter-clockwise from x.
-        meander: how far the edges wander, in terrace widths.
+        meander: amplitude of the edges' meandering, in terrace widths.
         edge_m: width of an edge.
     """
 
@@ -75,7 +75,7 @@ class Rough:
 
 @dataclass(frozen=True)
 class Flat:
-    """A flat surface, to measure noise."""
+    """A flat surface, for noise measurements."""
 
     roughness_rms_m: float = 0.0
 
@@ -114,7 +114,7 @@ class Particles:
         ground = np.zeros(shape) + grain(seed, x_m, y_m, self.roughness_rms_m, 60e-9, resolution_m)
         height_m, material = ground.copy(), np.zeros(shape)
         if self.radius_m * _LARGEST < resolution_m / 4:
-            return Relief(height_m, material)  # far too small to be seen one by one
+            return Relief(height_m, material)  # far below the resolution
         sites = self._present(seed + 10, x_m, y_m)
         radii = self.radius_m * np.exp(self.spread * chance.normal(seed + 11, sites.key))
         radii = np.minimum(radii, _LARGEST * self.radius_m)
@@ -138,7 +138,7 @@ def _rest(
     height_m: Array, material: Array, ground: Array, x_m: Array, y_m: Array,
     sphere: tuple[float, float, float], resolution_m: float,
 ) -> None:  # fmt: skip
-    """Puts a sphere (x, y, radius) on the ground; one that is too small to be resolved is spread, its volume kept."""
+    # a sphere is (x, y, radius); one below the resolution is spread at constant volume
     x0, y0, radius = sphere
     seen = max(radius, 0.75 * resolution_m)
     for index, dx, dy in around(x_m, y_m, x0, y0, seen):
@@ -151,7 +151,7 @@ def _rest(
 
 
 def _strew(relief: Relief, x_m: Array, y_m: Array, sites: Sites, radii_m: Array, resolution_m: float) -> None:
-    """All particles smaller than a step of the grid at once: each adds its volume to the point next to it."""
+    # for particles smaller than a step of the grid: each adds its volume to the nearest point
     column, row = np.searchsorted(x_m[0], sites.x_m), np.searchsorted(y_m[:, 0], sites.y_m)
     inside = (radii_m > 0) & (column < x_m.size) & (row < y_m.size) & (column > 0) & (row > 0)
     radii_m = radii_m[inside]

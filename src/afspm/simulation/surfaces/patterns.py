@@ -1,4 +1,4 @@
-"""Regular surfaces: a hexagonal lattice with defects, and the stamper that compact discs are pressed with."""
+"""Regular surfaces: a hexagonal lattice with defects, and the stamper for pressing compact discs."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Lattice:
         return Relief(height_m, material)
 
     def _atoms(self, x_m: Array, y_m: Array) -> Array:
-        """From 0 (hollow) to 1 (top): the first star of Fourier components."""
+        # from 0 (hollow) to 1 (top): the first star of Fourier components
         wave = 4.0 * math.pi / (math.sqrt(3.0) * self.constant_m)
         total: Array = np.zeros(x_m.shape)
         for direction in (30.0, 90.0, 150.0):
@@ -66,7 +66,7 @@ class Lattice:
                 material[index] += (1.0 - material[index]) * smooth_step(1.5 * bump)
 
     def _defects(self, seed: int, x_m: Array, y_m: Array, margin_m: float) -> list[tuple[float, float, float]]:
-        """(x, y, draw) of the defects in view."""
+        # (x, y, random number) of each defect in view
         angle = math.radians(self.angle_deg)
         first = self.constant_m * np.array([math.cos(angle), math.sin(angle)])
         second = self.constant_m * np.array([math.cos(angle + math.pi / 3), math.sin(angle + math.pi / 3)])
@@ -84,7 +84,7 @@ class Lattice:
 
 
 def _contrast_left(pixels_a_constant: float) -> float:
-    """Return how much of the corrugation is left when a pixel averages over this part of the lattice constant."""
+    # a pixel averages over this fraction of the lattice constant
     return float(np.clip(2.0 * (1.0 - pixels_a_constant), 0.0, 1.0))
 
 
@@ -130,7 +130,7 @@ class Stamper:
         return Relief(height_m, np.asarray(0.35 + 0.3 * bump))
 
     def _inside_m(self, seed: int, track: int, along: Array, offset: Array) -> Array:
-        """Return how far inside a bump of this track each position lies; negative outside. Ends are round."""
+        # the distance to the edge of the bump, negative outside; ends are round
         shift = float(chance.uniform(seed, track)[()]) * _FRAME
         bits = along / self.bit_m + shift
         first, last = int(np.floor(bits.min() / _FRAME)) - 1, int(np.floor(bits.max() / _FRAME)) + 1
@@ -147,7 +147,7 @@ class Stamper:
 
 @lru_cache(maxsize=4096)
 def _frame_edges(seed: int, track: int, frame: int) -> Array:
-    """Where runs begin in one frame, in bits: an even number of runs of 3 to 11 bits that fill it, bump first."""
+    # starts of runs in bits: an even number of runs of 3 to 11 bits that fill the frame, bump first
     random = chance.generator(seed, track, frame)
     runs: list[int] = [11, 11]  # the synchronisation pattern
     left = _FRAME - sum(runs)
@@ -161,7 +161,7 @@ def _frame_edges(seed: int, track: int, frame: int) -> Array:
 
 
 def _fill(bits: int, random: np.random.Generator) -> list[int]:
-    """Four runs of 3 to 11 bits (two, when few bits are left) that sum to `bits`."""
+    # four runs of 3 to 11 bits that sum to `bits`; two when few bits remain
     count = 2 if bits <= 18 else 4
     runs = [3] * count
     for _ in range(bits - sum(runs)):

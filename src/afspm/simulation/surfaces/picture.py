@@ -1,4 +1,4 @@
-"""A surface taken from a file: a picture, or a scan of a real microscope."""
+"""A surface read from a file: an image, or a scan of a real microscope."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Heightmap:
     """Heights [y, x], both ascending.
 
     Attributes:
-        height_m: in m if `size_m` is known, else in any unit (a picture's grey levels).
-        size_m: (x, y) from first to last pixel; None if the file does not say.
+        height_m: in m if `size_m` is known, else in any unit (grey levels of an image).
+        size_m: (x, y) from first to last pixel; None if the file does not contain it.
     """
 
     height_m: Array
@@ -33,7 +33,7 @@ Reader = Callable[[Path], Heightmap]
 
 
 def read(path: Path) -> Heightmap:
-    """The heights in a file, gaps (lines that were not scanned) filled with the mean.
+    """Return the heights in a file; gaps (lines that were not scanned) are filled with the mean.
 
     Raises:
         FileError: missing, not readable, or a format without a reader.
@@ -45,7 +45,7 @@ def read(path: Path) -> Heightmap:
         found = reader(path)
     except FileError:
         raise
-    except Exception as error:  # a reader may stumble in any way over a broken file
+    except Exception as error:  # a reader may raise anything on a broken file
         raise FileError(f"not readable as {path.suffix or 'a picture'}: {error}", where=str(path)) from error
     heights = np.asarray(found.height_m, dtype=np.float64)
     if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).any():
@@ -54,7 +54,7 @@ def read(path: Path) -> Heightmap:
 
 
 def read_picture(path: Path) -> Heightmap:
-    """Any picture that pillow reads: bright is high, its top at large y."""
+    """Return the heights of any image that pillow reads: bright is high, its top at large y."""
     from PIL import Image
 
     with Image.open(path) as image:
@@ -63,12 +63,12 @@ def read_picture(path: Path) -> Heightmap:
 
 
 def read_array(path: Path) -> Heightmap:
-    """A numpy file of heights [y, x]."""
+    """Return the heights [y, x] of a numpy file."""
     return Heightmap(np.load(path, allow_pickle=False))
 
 
 def read_scan(path: Path) -> Heightmap:
-    """The heights of a scan file of any controller that afspm reads."""
+    """Return the heights of a scan file of any controller that afspm reads."""
     content = files.read(path)
     scan = content.topography
     if scan is None:
@@ -89,7 +89,7 @@ class Picture:
 
     Attributes:
         path: an image (bright is high) or an SPM file.
-        width_m: of the picture, first to last pixel; 0: as in the SPM file. An image needs it.
+        width_m: first to last pixel; 0: as in the SPM file. An image needs it.
         height_range_m: from lowest to highest; 0: as in the SPM file.
     """
 
@@ -116,13 +116,13 @@ class Picture:
         return Relief(height_m, np.clip((height_m - low) / ((high - low) or 1.0), 0.0, 1.0))
 
     def load(self) -> None:
-        """Reads the file now, so that a wrong path is found before anything is scanned."""
+        """Read the file now, so that a wrong path is detected before the first scan."""
         _load(self)
 
 
 @lru_cache(maxsize=4)
 def _load(picture: Picture) -> tuple[tuple[Array, ...], tuple[float, float]]:
-    """The picture and its halvings, and its size (x, y) in m."""
+    # the picture with its successive halvings, and its size (x, y) in m
     found = read(Path(picture.path))
     heights, size_m = found.height_m, found.size_m
     pixels_y, pixels_x = heights.shape
@@ -149,7 +149,7 @@ def _mirrored(index: Array, count: int) -> Array:
 
 
 def _taps(position: Array, count: int) -> list[tuple[Array, Array]]:
-    """Indices and weights of the four neighbours (Catmull and Rom's cubic, which meets the pixels)."""
+    # indices and weights of the four neighbours (cubic of Catmull and Rom, which passes through the pixels)
     whole = np.floor(position)
     t = position - whole
     weights = (

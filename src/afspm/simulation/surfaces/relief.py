@@ -1,4 +1,4 @@
-"""The interface of all surfaces, and what the kinds of surface share."""
+"""The interface of all surfaces, and functions shared by them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.simulation.fields import Array, is_separable, rough_field, smooth_fie
 class Relief:
     """A piece of surface: heights in m and material from 0 to 1, of one shape.
 
-    The material is what phase and current see of the sample besides its height.
+    The material determines phase and current independently of the height.
     """
 
     height_m: Array
@@ -25,26 +25,26 @@ class Relief:
 
 
 class Surface(Protocol):
-    """A sample without bounds: what lies at a place depends on the seed and the place alone."""
+    """A sample without bounds; its relief depends on the seed and the position only."""
 
     def relief(self, x_m: Array, y_m: Array, resolution_m: float, seed: int) -> Relief:
-        """The sample at positions in sample coordinates.
+        """Return the sample at positions in sample coordinates.
 
         Args:
             x_m, y_m: arrays that broadcast; one row and one column (a grid) are fastest.
-            resolution_m: edges are not drawn sharper, nor roughness finer, than this; 0 for the sample as it is.
+            resolution_m: edges and roughness are not finer than this; 0 for the sample as it is.
         """
         ...
 
 
 def smooth_step(t: Array) -> Array:
-    """0 below 0, 1 above 1, a smooth rise between."""
+    """Return 0 below 0, 1 above 1, and a smooth rise in between."""
     t = np.clip(t, 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 
 
 def turned(x_m: Array, y_m: Array, angle_deg: float) -> tuple[Array, Array]:
-    """Coordinates along and across a direction; a grid stays a grid where it can."""
+    """Return coordinates along and across a direction; a grid stays a grid where possible."""
     if angle_deg == 0.0:
         return x_m, y_m
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
@@ -52,7 +52,7 @@ def turned(x_m: Array, y_m: Array, angle_deg: float) -> tuple[Array, Array]:
 
 
 def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolution_m: float) -> Array | float:
-    """Fine roughness of the given rms whose largest grains are `size_m` wide."""
+    """Return fine roughness of this rms, with largest grains `size_m` wide."""
     if rms_m == 0.0:
         return 0.0
     field = rough_field(seed, x_m, y_m, largest_m=size_m, smallest_m=size_m / 4, hurst=0.6, resolution_m=resolution_m)
@@ -60,12 +60,12 @@ def grain(seed: int, x_m: Array, y_m: Array, rms_m: float, size_m: float, resolu
 
 
 def patches(seed: int, x_m: Array, y_m: Array, size_m: float) -> Array:
-    """Two materials in patches with soft borders, from 0 to 1."""
+    """Return two materials in patches with soft borders, from 0 to 1."""
     return smooth_step(0.5 + 2.0 * smooth_field(seed, x_m, y_m, size_m))
 
 
 def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> Iterator[tuple[Any, Array, Array]]:
-    """Where the positions come within reach of a point: at most one (index, x - x0, y - y0).
+    """Yield (index, x - x0, y - y0) of the positions within reach of a point; nothing if there are none.
 
     `index` selects those positions from the broadcast array.
     """
@@ -83,7 +83,7 @@ def around(x_m: Array, y_m: Array, x0_m: float, y0_m: float, reach_m: float) -> 
 
 @dataclass(frozen=True)
 class Sites:
-    """Points strewn at random: positions and, for each, a whole number to draw its properties with."""
+    """Random points: positions and, for each, a whole number that seeds its properties."""
 
     x_m: Array
     y_m: Array
@@ -91,7 +91,7 @@ class Sites:
 
     @classmethod
     def within(cls, seed: int, x_m: Array, y_m: Array, margin_m: float, spacing_m: float) -> Sites:
-        """Those in view: one a cell of `spacing_m` on average (none, one or two), anywhere in it."""
+        """Return the points in view: on average one (none, one or two) in each cell of `spacing_m`, anywhere in it."""
         i = np.arange(
             math.floor((x_m.min() - margin_m) / spacing_m), math.floor((x_m.max() + margin_m) / spacing_m) + 1
         )
@@ -99,7 +99,7 @@ class Sites:
             math.floor((y_m.min() - margin_m) / spacing_m), math.floor((y_m.max() + margin_m) / spacing_m) + 1
         )
         column, row, copy = (a.ravel() for a in np.meshgrid(i, j, np.arange(3), indexing="ij"))
-        # 0, 1, 2, 3 with the probabilities of a Poisson number of mean 1 (what is above 3 counted as 3)
+        # 0, 1, 2, 3 with the probabilities of a Poisson number of mean 1 (larger ones counted as 3)
         count = np.searchsorted([0.3679, 0.7358, 0.9197], chance.uniform(seed, column, row))
         there = copy < count
         column, row, copy = column[there], row[there], copy[there]

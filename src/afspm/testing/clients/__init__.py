@@ -1,7 +1,7 @@
 """Conformance suite for clients: a client in any language takes part in real and scripted experiments.
 
-`afspm test-client -- COMMAND` starts the client's conformance program, gives it steps, and compares what it does and
-tells with what was published and sent. `docs/reference/client-conformance.md` is the page for those who write one.
+`afspm test-client -- COMMAND` starts the client's conformance program, gives it steps, and compares its actions and
+answers with published packets and sent requests. `docs/reference/client-conformance.md` describes the program.
 """
 
 from __future__ import annotations

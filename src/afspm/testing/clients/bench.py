@@ -1,4 +1,4 @@
-"""The bench on which a client is judged: a scripted scheduler, or a real experiment, and the client beside it."""
+"""The test bench of a client: a scripted scheduler or a real experiment, with the client beside it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LOG_FILE = "client.txt"
 
 @dataclass
 class JudgedClient:
-    """A started client, and its heartbeats."""
+    """A started client with the recorder of its heartbeats."""
 
     program: ClientProgram
     beats: BeatRecorder
@@ -39,7 +39,7 @@ class JudgedClient:
 
 @dataclass
 class ScriptedRun:
-    """A client with a scripted scheduler."""
+    """A client connected to a scripted scheduler."""
 
     scheduler: ScriptedScheduler
     client: ClientProgram
@@ -47,11 +47,11 @@ class ScriptedRun:
 
 
 class ClientBench:
-    """All that checks need.
+    """The fixture of the client checks.
 
     Args:
         command: the conformance program.
-        folder: where logs and the runs' files go.
+        folder: for logs and files of the runs.
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
@@ -65,7 +65,7 @@ class ClientBench:
 
     @property
     def experiment(self) -> JudgedExperiment:
-        """A real experiment, encrypted, that several checks share; another if the last one has ended."""
+        """A real, encrypted experiment that several checks share; replaced once it has ended."""
         if self._experiment is not None and self._experiment.ended:
             self.begin_anew()
         if self._experiment is None:
@@ -73,30 +73,32 @@ class ClientBench:
         return self._experiment
 
     def new_experiment(self, security: Security = Security.EVERYWHERE) -> JudgedExperiment:
-        """Start a real experiment, which is the caller's to close."""
+        """Start a real experiment, which the caller closes."""
         return JudgedExperiment(self.folder / f"run-{next(self._runs)}", security)
 
     def perform(self, check: Check) -> str | None:
-        """Do a check. Raises Failed, also for an answer that can't be read, and an experiment that goes wrong."""
+        """Run a check. Raises Failed, also for an unreadable answer, and for errors in the experiment."""
         try:
-            told: str | None = check.do(self)
-            return told
+            remark: str | None = check.do(self)
+            return remark
+        # the conformance program can't be started: no check is possible
         except ConfigError:
             raise
-        except AfspmError as error:  # something that the judge itself did was not possible, with this client beside it
+        except AfspmError as error:  # the judge's own request failed, with this client beside it
             raise Failed("an experiment that goes on with the client in it", str(error)) from error
-        except (LookupError, TypeError, ValueError, AttributeError) as error:  # by indexing and converting an answer
+        # an answer has the wrong type or lacks a field
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise Failed(
                 "an answer as the page of steps describes it", f"one that can't be read ({error!r})"
             ) from error
 
     def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
-        """Return the remedy; the next check gets an experiment of its own."""
+        """Return the remedy; the next check gets a new experiment."""
         self.begin_anew()
         return (f"→ {check.remedy}",)
 
     def begin_anew(self) -> None:
-        """End the shared experiment: what it has gone through is not the next check's fault."""
+        """End the shared experiment, so that its history does not affect the next check."""
         if self._experiment is not None:
             self._experiment.close()
         self._experiment = None
@@ -112,7 +114,7 @@ class ClientBench:
         """Start a client in an experiment.
 
         Args:
-            ready: wait until it is.
+            ready: wait until it is ready.
             changes: to its launch line.
         """
         with self._started(replace(experiment.launch, **changes), experiment.pump, experiment.wake) as client:
@@ -127,9 +129,9 @@ class ClientBench:
         """Start a client with a scripted scheduler.
 
         Args:
-            ready: wait until it is.
-            owner: whose keys the scheduler has; None: none at all.
-            also: the address of another publisher, the judge's.
+            ready: wait until it is ready.
+            owner: the owner of the scheduler's keys; None: no encryption.
+            also: the address of a second publisher, the judge's.
             changes: to the client's launch line.
         """
         control, publish = self._ports.address(), self._ports.address()
@@ -145,7 +147,7 @@ class ClientBench:
 
     @contextmanager
     def second_publisher(self) -> Iterator[tuple[str, Callable[..., object]]]:
-        """Bind a plain publisher of the judge's; yield its address, and what sends frames."""
+        """Bind a PUB socket of the judge, without replay; yield its address and a function that sends frames."""
         network = Network(keys.load(self._keys, JUDGE))
         try:
             socket = network.socket(zmq.PUB)

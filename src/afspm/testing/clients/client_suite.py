@@ -14,7 +14,8 @@ Judging = Callable[["ClientBench"], str | None]
 CLIENT_SUITE: Final = Suite[Check](
     "afspm test-client",
     f"{__package__}.checks",
-    ("wire", "launch", "replay", "requests", "measure", "control", "keys"),  # a check relies on what earlier ones check
+    # in this order, since checks rely on earlier ones
+    ("wire", "launch", "replay", "requests", "measure", "control", "keys"),
 )
 
 

@@ -68,11 +68,11 @@ max = "3 V"
 
 
 class Security(Enum):
-    """The ways in which an experiment is encrypted; each is a section of its file."""
+    """The kinds of encryption of an experiment; each is a section of its file."""
 
     EVERYWHERE = f'[security]\nkeys = "{KEYS}"\n'
     REQUESTS = ""
-    """As every run on one computer is by default: with keys that are made for it. Packets are plain."""
+    """The default on one computer: requests are encrypted with keys generated for the run, packets are plain."""
     NONE = "[security]\ninsecure = true\n"
 
 
@@ -80,7 +80,7 @@ _NOTHING = logging.CRITICAL + 1
 
 
 class Judge(Component):
-    """The judge's part in the experiment. It is wired like any other component, and not started as one."""
+    """The judge's component in the experiment: wired like any other, but not started as a process."""
 
 
 class JudgedExperiment:
@@ -88,10 +88,10 @@ class JudgedExperiment:
 
     Args:
         folder: of this run.
-        security: what is encrypted.
+        security: the encrypted connections.
 
     Attributes:
-        launch: of the client; the heartbeat's address is to be added.
+        launch: of the client; the caller adds the heartbeat's address.
         scope: the judge's.
         clock: of the experiment.
         seen: every packet that the scheduler has published since the judge joined.
@@ -139,34 +139,34 @@ class JudgedExperiment:
 
     @property
     def ended(self) -> bool:
-        """True if nothing more can be judged with it."""
+        """True if the experiment can't be used for another check."""
         return self._link.ended or bool(self.processes.ended)
 
     def pump(self, done: Callable[[], bool], within_s: float) -> bool:
-        """Take in what is published until `done()`; False if that takes longer."""
+        """Process publications until `done()`; return False on a timeout."""
         try:
             return self._link.wait(done, self._link.until(within_s))
+        # the link is over, but the client still has to end: its threads notify `_woken`
         except ExperimentEnded:
             with self._woken:
                 return self._woken.wait_for(done, within_s)
 
     def wake(self) -> None:
-        """Have `pump` look again. May be called from any thread."""
+        """Make `pump` evaluate its condition again. Thread-safe."""
         self._port.wake_up()
         with self._woken:
             self._woken.notify_all()
 
     def packets(self, message: str) -> list[Packet]:
-        """Return what was published of a message so far."""
+        """Return all published packets of a message."""
         return [packet for packet in self.seen if packet.envelope.split("_", 1)[0] == message]
 
     def restart(self, name: str) -> None:
-        """Kill a process as a crash would, and start it again."""
+        """Kill a process, like a crash, and start it again."""
         self.processes.kill(name)
         self.processes.start_again(name)
 
     def close(self) -> None:
-        """End everything."""
         self._port.close()
         self.processes.close()
         self._log.close()

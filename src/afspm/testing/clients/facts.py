@@ -1,4 +1,4 @@
-"""The facts of a packet, as a client must tell them."""
+"""The facts of a packet, as a client must report them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Facts = Plain
 
 
 def facts_of(packet: Packet) -> Facts:
-    """Return the facts of a packet that can be compared."""
+    """Return the comparable facts of a packet."""
     message = wire.message_of(packet.envelope)
     facts: Facts = {"envelope": packet.envelope, "message": message, "timestamp_ns": packet.time_ns}
     if wire.declaration(message).has_values:
@@ -62,14 +62,14 @@ def _values(values: NDArray[np.float64]) -> Facts:
     }
 
 
-def compare(told: Facts, packet: Packet) -> None:
-    """Compare what a client tells of a packet with the packet. Raises Failed."""
+def compare(reported: Facts, packet: Packet) -> None:
+    """Compare a client's report of a packet with the packet. Raises Failed."""
     for name, right in facts_of(packet).items():
-        came = told.get(name)
+        came = reported.get(name)
         if name == "values":
             _compare_values(packet.envelope, right, came)
         elif not _same(right, came):
-            raise Failed(f"{packet.envelope} with {name} = {right!r}", repr(came) if name in told else "none")
+            raise Failed(f"{packet.envelope} with {name} = {right!r}", repr(came) if name in reported else "none")
 
 
 def _compare_values(envelope: str, right: Facts, came: object) -> None:

@@ -1,4 +1,4 @@
-"""The reference bytes of the wire format, of an installed package as of a clone."""
+"""The reference bytes of the wire format, from an installed package or a clone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hears the heartbeats of a client, each with the time at which it came."""
+"""`BeatRecorder`: receives the heartbeats of a client and records their times."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from afspm.wire import CLOSING
 
 
 @dataclass(frozen=True)
-class HeardBeat:
-    """One beat, in real seconds, as it came."""
+class ReceivedBeat:
+    """One received beat; times in real seconds."""
 
     at_s: float
     frames: list[bytes]
@@ -29,19 +29,19 @@ class HeardBeat:
 
 
 class BeatRecorder:
-    """Listens at an address of its own, in a thread of its own, until it is closed.
+    """Receives heartbeats at its own address, in its own thread, until it is closed.
 
     Args:
-        heard: called in that thread after each beat.
+        on_beat: called in that thread after each beat.
     """
 
-    def __init__(self, clock: Clock, heard: Callable[[], None]) -> None:
-        self._clock, self._heard = clock, heard
+    def __init__(self, clock: Clock, on_beat: Callable[[], None]) -> None:
+        self._clock, self._on_beat = clock, on_beat
         self._network = Network()
         self._socket = self._network.socket(zmq.SUB)
         self._socket.setsockopt(zmq.SUBSCRIBE, b"")
         self.address = self._network.bind(self._socket, "tcp://127.0.0.1:0")
-        self.beats: list[HeardBeat] = []
+        self.beats: list[ReceivedBeat] = []
         self._stop: WakeUp[None] = WakeUp()
         self._thread = threading.Thread(target=self._run, name="beats", daemon=True)
         self._thread.start()
@@ -57,8 +57,8 @@ class BeatRecorder:
         poller.register(self._stop.fileno(), zmq.POLLIN)
         while self._stop.fileno() not in dict(poller.poll()):
             while frames := receive_frames(self._socket):
-                self.beats.append(HeardBeat(self._clock.monotonic_s(), [frame.bytes for frame in frames]))
-                self._heard()
+                self.beats.append(ReceivedBeat(self._clock.monotonic_s(), [frame.bytes for frame in frames]))
+                self._on_beat()
 
     def close(self) -> None:
         self._stop.post()

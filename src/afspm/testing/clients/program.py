@@ -1,4 +1,4 @@
-"""The conformance program of a client, as a process: steps go in by standard input, answers come by standard output."""
+"""The conformance program of a client, as a process: steps go to standard input, answers come from standard output."""
 
 from __future__ import annotations
 
@@ -20,21 +20,19 @@ from afspm.basics.plain_data import Plain
 from afspm.testing.conformance import Failed, expect
 
 ANSWER_S = 30.0
-"""Longest time for an answer, beside what the step itself may wait."""
+"""Longest time for an answer, in addition to the step's own wait."""
 _LAST_WORDS = 3
 
 
 class Pump(Protocol):
-    """Serves the judge's own sockets while it waits for the client."""
+    """Serves the judge's own sockets during a wait for the client."""
 
     def __call__(self, done: Callable[[], bool], within_s: float) -> bool:
-        """Wait until `done()`; False if that takes longer."""
+        """Wait until `done()`; return False on a timeout."""
         ...
 
 
 class Answer(Plain):
-    """The answer to one step."""
-
     @property
     def ok(self) -> bool:
         return self.get("ok") is True
@@ -52,8 +50,8 @@ class ClientProgram:
         command: the program and its arguments.
         launch: its launch line.
         pump: waits for its answers.
-        wake: called from other threads when the program has said something, or ended.
-        log: where its standard error goes.
+        wake: called from other threads after output of the program, and after its end.
+        log: the file for its standard error.
 
     Raises:
         ConfigError: it can't be started.
@@ -64,7 +62,7 @@ class ClientProgram:
         self._pump, self._wake = pump, wake
         self._answers: dict[int, Answer] = {}
         self._garbage: deque[str] = deque(maxlen=_LAST_WORDS)
-        self._said: deque[str] = deque(maxlen=_LAST_WORDS)
+        self._stderr_lines: deque[str] = deque(maxlen=_LAST_WORDS)
         self._begun: dict[int, str] = {}
         self._next = 0
         self._log = log
@@ -74,6 +72,7 @@ class ClientProgram:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
+                # its own process group, so that `kill` reaches its children
                 start_new_session=sys.platform != "win32",
             )
         except (OSError, ValueError) as error:
@@ -92,7 +91,7 @@ class ClientProgram:
     # --- steps ---
 
     def begin(self, do: str, **arguments: object) -> int:
-        """Give it a step, and return the step's id."""
+        """Send a step, and return its id."""
         self._next += 1
         self._begun[self._next] = do
         self._write(json.dumps({"id": self._next, "do": do, **arguments}))
@@ -102,7 +101,7 @@ class ClientProgram:
         """Return the answer to a step.
 
         Raises:
-            Failed: none comes, or it is none.
+            Failed: no answer arrives, or it is not one.
         """
         self._pump(lambda: step in self._answers or not self.is_running, within_s)
         self._finish_reading()
@@ -115,21 +114,21 @@ class ClientProgram:
         return step in self._answers
 
     def do(self, do: str, **arguments: object) -> Answer:
-        """Give it a step, and return the answer.
+        """Send a step, and return the answer.
 
         Raises:
-            Failed: none comes, or it could not do it at all.
+            Failed: no answer arrives, or the program could not do the step.
         """
         answer = self.do_quietly(do, **arguments)
         expect("error" not in answer, f"the step {do} to be done", str(answer))
         return answer
 
     def do_quietly(self, do: str, **arguments: Any) -> Answer:
-        """Give it a step, and return the answer, be it an error. Raises Failed: none comes."""
+        """Send a step, and return the answer, even an error. Raises Failed: no answer arrives."""
         return self.answer(self.begin(do, **arguments), ANSWER_S + float(arguments.get("timeout_s", 0.0)))
 
     def succeed(self, do: str, **arguments: object) -> Answer:
-        """Give it a step, which must succeed. Raises Failed."""
+        """Send a step that must succeed. Raises Failed."""
         answer = self.do(do, **arguments)
         expect(answer.ok, f"the step {do} to succeed", str(answer))
         return answer
@@ -142,7 +141,7 @@ class ClientProgram:
 
     @property
     def ending(self) -> str:
-        """Return how it has ended, for a person."""
+        """Describe how the program ended."""
         code = self._popen.poll()
         return "still running" if code is None else f"exit code {code}" if code >= 0 else f"signal {-code}"
 
@@ -152,22 +151,22 @@ class ClientProgram:
 
     @property
     def last_words(self) -> str:
-        """Return its last lines on standard error, and on standard output beside answers; empty if there are none."""
-        said = [*self._garbage, *self._said]
-        return f"; it said: {' / '.join(said)}" if said else ""
+        """The last lines on standard error, and on standard output beside answers; empty if there are none."""
+        lines = [*self._garbage, *self._stderr_lines]
+        return f"; its last lines: {' / '.join(lines)}" if lines else ""
 
     def close_stdin(self) -> None:
-        """End its standard input, by which it is asked to end."""
+        """Close its standard input, which requests its end."""
         assert self._popen.stdin is not None
         with contextlib.suppress(OSError):
             self._popen.stdin.close()
 
     def wait_ended(self, within_s: float) -> bool:
-        """Wait until it has ended; False if it takes longer."""
+        """Wait until it has ended; return False on a timeout."""
         return self._pump(lambda: not self.is_running, within_s)
 
     def kill(self) -> None:
-        """End it and what it has started, now."""
+        """Kill the program with its child processes."""
         if sys.platform == "win32":
             self._popen.kill()
         else:
@@ -178,14 +177,14 @@ class ClientProgram:
         self._finish_reading()
 
     def require_clean_output(self) -> None:
-        """Raise Failed if anything but answers came on standard output."""
+        """Raise Failed if standard output contained anything but answers."""
         expect(not self._garbage, "only answers on standard output", " / ".join(self._garbage))
 
     # --- lines ---
 
     def _write(self, line: str) -> None:
         assert self._popen.stdin is not None
-        with contextlib.suppress(OSError):  # it has ended: waiting for the answer tells
+        with contextlib.suppress(OSError):  # it has ended, which the wait for the answer reports
             self._popen.stdin.write(line.encode() + b"\n")
             self._popen.stdin.flush()
 
@@ -202,10 +201,11 @@ class ClientProgram:
             answer = Answer(json.loads(line))
             self._answers[int(answer["id"])] = answer
         except (ValueError, TypeError, KeyError):
+            # kept as evidence for `require_clean_output`
             self._garbage.append(line[:200])
 
     def _note(self, line: str) -> None:
-        self._said.append(line[:300])
+        self._stderr_lines.append(line[:300])
         with self._log.open("a", encoding="utf-8") as file:
             file.write(f"{self.pid} {line}\n")
 

@@ -1,7 +1,7 @@
-"""A TCP proxy that cuts connections after a request has gone through, before its reply is delivered.
+"""A TCP proxy that cuts connections after a request has passed, before its reply is delivered.
 
-It knows of ZMTP only where frames begin, which encryption (CURVE) does not hide: after the greeting and the handshake's
-commands, each frame that the scheduler sends belongs to a reply.
+It parses only the frame boundaries of ZMTP, which encryption (CURVE) does not hide: after the greeting and the
+handshake's commands, each frame from the scheduler belongs to a reply.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _LONG, _COMMAND = 0x02, 0x04
 
 @dataclass
 class FrameCounter:
-    """Counts the frames in a stream of ZMTP that are no commands."""
+    """Counts the frames in a stream of ZMTP, except commands."""
 
     messages: int = 0
     _skip: int = _GREETING
     _head: bytearray = field(default_factory=bytearray)
 
     def feed(self, chunk: bytes) -> None:
-        """Take in what was received."""
+        """Count the frames that begin in received bytes."""
         at = 0
         while at < len(chunk):
             if self._skip:
@@ -44,15 +44,15 @@ class FrameCounter:
 
 
 class CuttingProxy:
-    """Passes on what client and scheduler send each other.
+    """Forwards data between client and scheduler.
 
     Args:
         target: the scheduler's address, "tcp://host:port".
         longest: one connection is cut at its first chunk with replies, the next at its second and so on, up to this.
-            Those cut at the first have lost the answer to the greeting; the others replies to what was asked.
+            A cut at the first chunk loses the answer to the greeting; later cuts lose replies to requests.
 
     Attributes:
-        cuts: how many connections were cut.
+        cuts: the number of cut connections.
     """
 
     def __init__(self, target: str, longest: int) -> None:
@@ -67,7 +67,7 @@ class CuttingProxy:
         threading.Thread(target=self._accept, name="proxy", daemon=True).start()
 
     def close(self) -> None:
-        """Cut everything, and listen no more."""
+        """Cut all connections and close the listening socket."""
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
@@ -83,6 +83,7 @@ class CuttingProxy:
                 except OSError:
                     client.close()
                     continue
+                # the timeout is for connecting only
                 server.settimeout(None)
                 with self._lock:
                     self._open |= {client, server}
@@ -90,7 +91,7 @@ class CuttingProxy:
                     threading.Thread(target=self._pass_on, args=pair, daemon=True).start()
 
     def _pass_on(self, source: socket.socket, sink: socket.socket, chunks: float) -> None:
-        """Pass on until so many chunks with frames have come; the last of them is lost."""
+        # the chunk with number `chunks` is lost together with the connection
         counter = FrameCounter()
         with contextlib.suppress(OSError):
             for chunk in iter(lambda: source.recv(_CHUNK), b""):
@@ -107,6 +108,7 @@ class CuttingProxy:
     def _end(self, *sockets: socket.socket) -> None:
         for one in sockets:
             with contextlib.suppress(OSError):
+                # wakes the thread that reads from this socket; close alone does not
                 one.shutdown(socket.SHUT_RDWR)
             one.close()
         self._open -= set(sockets)

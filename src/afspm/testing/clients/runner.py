@@ -1,4 +1,4 @@
-"""The run of all checks of a client, one after the other, and its report."""
+"""Runs all checks of a client in order, and writes the report."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def judge(
     only: Collection[str] = (),
     done: Callable[[CheckResult], None] = lambda result: None,
 ) -> ClientReport:
-    """Do all checks that are chosen, and write `report.json` into a new folder in `runs`.
+    """Run the selected checks, and write `report.json` into a new folder in `runs`.
 
     Args:
         command: the client's conformance program, and its arguments.
-        only: parts of the names of the checks to do; empty: all.
-        done: gets each result.
+        only: parts of the names of the checks; empty: all.
+        done: called with each result.
 
     Raises:
         ConfigError: the program can't be started, or there are no such checks.
@@ -55,6 +55,6 @@ def judge(
 
 
 def show_client_end(report: ClientReport, console: Console) -> None:
-    """Print what came of it all."""
+    """Print the verdict."""
     does = "does" if report.passed else "does not do"
     show_verdict(report, f": the client {does} what it should", console)

@@ -1,4 +1,4 @@
-"""A scripted scheduler: every byte that the client sends is seen, and every byte that it gets is chosen."""
+"""A scripted scheduler: every byte from the client is recorded, and every byte to it is scripted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from afspm.transport.polling import Poller, WakeUp, milliseconds
 
 @dataclass(frozen=True)
 class ScriptedRequest:
-    """A request of the client, as it came; greetings are answered by themselves, and are not among them."""
+    """A received request; greetings are answered automatically and not recorded as requests."""
 
     peer: bytes
     frames: tuple[bytes, ...]
@@ -32,7 +32,7 @@ class ScriptedRequest:
     def answered(
         self, code: int = ControlResponse.SUCCESS, payload: bytes = b"", reason: str = "", detail: int = 0
     ) -> list[bytes]:
-        """Return the frames of a response to it."""
+        """Return the frames of a response to the request."""
         frames = [bytes([code]), payload, reason.encode(), self.id]
         return [*frames, bytes([detail])] if detail else frames
 
@@ -41,7 +41,7 @@ Reply = Callable[[ScriptedRequest], Sequence[Sequence[bytes]]]
 
 
 def success(request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
-    """Answer that all is well."""
+    """Answer with success."""
     return [request.answered()]
 
 
@@ -49,17 +49,17 @@ class ScriptedScheduler:
     """The sockets of a scheduler.
 
     Args:
-        control, publish: where to bind.
+        control, publish: addresses to bind.
         keys: its own; None: without encryption.
 
     Attributes:
-        requests: as they came.
-        greetings: the requests 101 that came.
-        connections: the number of connections to `control`, also of those that are refused for their keys.
-        prefixes, markers: what was subscribed to.
-        cached: packets, as frames, for who asks by a marker.
-        reply: what to answer a request.
-        greeting: what to answer the request 101.
+        requests: received requests, in order.
+        greetings: received requests 101.
+        connections: the number of connections to `control`, including those refused for their keys.
+        prefixes, markers: received subscriptions.
+        cached: packets, as frames, for clients that request them by a marker.
+        reply: returns the answer to a request.
+        greeting: returns the answer to request 101.
     """
 
     def __init__(self, clock: Clock, control: str, publish: str, keys: Keys | None) -> None:
@@ -72,7 +72,7 @@ class ScriptedScheduler:
         self.markers: list[Marker] = []
         self.cached: list[list[bytes]] = []
         self.reply: Reply = success
-        self.greeting: Reply = self._what_time_it_is
+        self.greeting: Reply = self._answer_clock_request
         self.open()
 
     def open(self) -> None:
@@ -80,10 +80,12 @@ class ScriptedScheduler:
         control, publish, keys = self._bound
         self._network = Network(keys)
         self._router = self._network.socket(zmq.ROUTER)
+        # a client that reconnects replaces its old connection at once
         self._router.setsockopt(zmq.ROUTER_HANDOVER, 1)
         monitor = Monitor(self._network, self._router, ACCEPTED)
         self._network.bind(self._router, control, requests=True)
         self._publisher = self._network.socket(zmq.XPUB, max_bytes=LONGEST + 1)
+        # manual: a marker subscribes to its topic, not to its own bytes; verboser: repeated subscriptions are recorded
         self._publisher.setsockopt(zmq.XPUB_MANUAL, 1)
         self._publisher.setsockopt(zmq.XPUB_VERBOSER, 1)
         self._network.bind(self._publisher, publish)
@@ -102,11 +104,11 @@ class ScriptedScheduler:
         self._woken.close()
 
     def wake(self) -> None:
-        """Have `pump` look again. May be called from any thread."""
+        """Make `pump` evaluate its condition again. Thread-safe."""
         self._woken.post()
 
     def pump(self, done: Callable[[], bool], within_s: float) -> bool:
-        """Serve until `done()`; False if that takes longer."""
+        """Serve until `done()`; return False on a timeout."""
         until_s = self._clock.monotonic_s() + within_s
         while not done():
             left_s = until_s - self._clock.monotonic_s()
@@ -120,15 +122,13 @@ class ScriptedScheduler:
         return True
 
     def serve(self, for_s: float) -> None:
-        """Serve for some time."""
         self.pump(lambda: False, for_s)
 
     def publish(self, *frames: bytes) -> None:
-        """Publish a packet, or what is none."""
+        """Publish frames, whether they are a packet or not."""
         self._publisher.send_multipart(list(frames))
 
     def send(self, peer: bytes, frames: Sequence[bytes]) -> None:
-        """Send a response to a client."""
         self._router.send_multipart([peer, b"", *frames])
 
     def _count_connections(self, monitor: Monitor) -> None:
@@ -152,10 +152,10 @@ class ScriptedScheduler:
         for frames in reply(request):
             self.send(request.peer, frames)
 
-    def _what_time_it_is(self, request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
+    def _answer_clock_request(self, request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
         now_s = self._clock.now_s()
-        told = {"now_ns": round(now_s * 1e9), "origin_s": now_s, "start_s": now_s, "speed": 1.0, "simulated": True}
-        return [request.answered(payload=json.dumps(told).encode())]
+        clock = {"now_ns": round(now_s * 1e9), "origin_s": now_s, "start_s": now_s, "speed": 1.0, "simulated": True}
+        return [request.answered(payload=json.dumps(clock).encode())]
 
     def _take_subscription(self) -> None:
         (frame,) = receive_frames(self._publisher)[:1]

@@ -1,4 +1,4 @@
-"""What a step works with: the microscope through the suite's client, and the person at the panel."""
+"""`Guide`: gives a step access to the microscope, through the suite's client, and to the person at the panel."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from afspm.testing.translators.measuring import CheckMeasurements
 
 
 class Prompts(Protocol):
-    """The person: the terminal, or the answers of a test."""
+    """The person's answers: from the terminal, or scripted in a test."""
 
-    def show(self, text: str) -> None:
-        """Show a text."""
+    def show(self, text: str) -> None: ...
 
     def confirm(self, question: str) -> bool:
-        """Ask yes or no; without an answer it is no."""
+        """Ask yes or no; no answer means no."""
 
     def text(self, question: str) -> str:
         """Ask for a line, which may be empty."""
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
-        """Ask for one of the options; an empty answer is the default, if there is one."""
+        """Ask for one of the options; an empty answer selects the default, if there is one."""
 
 
 UNSEEN = "unseen"
@@ -37,13 +36,13 @@ NO_PANEL = "a simulated microscope has no panel"
 
 @dataclass
 class Guide:
-    """One commissioning as its steps see it.
+    """The fixture of the steps of one commissioning.
 
     Attributes:
         folder: of the run, for pictures.
         has_panel: True of a real controller. Without a panel, each question about it is shown and skipped.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
-        in_contact: the person has approached; the tip is withdrawn when the steps at the sample are over.
+        in_contact: the person has approached the tip; it is withdrawn after the steps at the sample.
     """
 
     kit: CheckMeasurements
@@ -58,7 +57,7 @@ class Guide:
         return self.kit.clock
 
     def perform(self, step: CommissioningStep) -> str:
-        """Explain a step, have it confirmed if it moves anything, and do it. Raises a CheckEnded."""
+        """Explain a step, ask for confirmation if it moves anything, and run it. Raises a CheckEnded."""
         if missing := self.kit.support.missing(step.needs):
             raise Unsupported(", ".join(missing))
         self.prompts.show(f"\n{step.title}\n{step.explained}")
@@ -69,7 +68,7 @@ class Guide:
         return step.do(self) or ""
 
     def explain(self, step: CommissioningStep, failure: Failed) -> tuple[str, ...]:
-        """Stop what runs. Raises Lost: it does not stop."""
+        """Stop the microscope's activity. Raises Lost: it does not stop."""
         try:
             self.kit.client.come_to_rest()
         except Failed as restless:
@@ -77,19 +76,19 @@ class Guide:
         return (f"What to do: {step.remedy}",)
 
     def unseen(self) -> str:
-        """Return the line of a step whose outcome could not be seen at the panel; Skipped if there is one."""
+        """Return the line of a step whose outcome was not seen at the panel. Raises Skipped if there is a panel."""
         line = "set and read back; not seen at the panel"
         if self.has_panel:
             raise Skipped(line)
         return line
 
     def require(self, question: str, expected: str) -> None:
-        """Ask the person; Failed unless it is so."""
+        """Ask the person to confirm. Raises Failed unless they do."""
         if not self.prompts.confirm(question):
             raise Failed(expected, "the person says no")
 
     def require_at_panel(self, question: str, expected: str) -> None:
-        """Ask the person about the panel, if there is one; Failed unless it is so."""
+        """Ask the person to confirm at the panel, if there is one. Raises Failed unless they do."""
         if self._can_be_seen(question):
             self.require(question, expected)
 
@@ -98,7 +97,7 @@ class Guide:
         return self.prompts.text(question) if self._can_be_seen(question) else None
 
     def require_choice(self, question: str, right: str, wrong: Sequence[str], what: str) -> bool:
-        """Ask for what the panel shows. Return False if it can't be seen; Failed if it is something else."""
+        """Ask what the panel shows; return False if it can't be seen. Raises Failed for a wrong answer."""
         if not self._can_be_seen(question):
             return False
         seen = self.prompts.choose(question, [right, *wrong, UNSEEN], UNSEEN)
@@ -107,9 +106,9 @@ class Guide:
         return seen == right
 
     def compare(self, what: str, value: float, unit: str, absolute: float = 0.0) -> bool:
-        """Ask for a value as the panel shows it. Return False if it is not shown; Failed if it is another.
+        """Ask for a value shown at the panel; return False if it is not shown. Raises Failed if it differs.
 
-        The person types it before afspm's is shown: so a wrong one is not read as the right one.
+        The person types it before afspm shows its own, so that a wrong value is not misread as the expected one.
         """
         shown = f"{value:.6g} {unit}".rstrip()
         question = f"{what}, as the panel shows it{f', e.g. in {unit}' if unit else ''}"

@@ -1,4 +1,4 @@
-"""The procedure: one step after the other, the report after each, and a safe state however it ends."""
+"""The procedure: steps in order, a report after each, and a safe state at every end."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _NOT_WITHDRAWN = "THE TIP WAS NOT WITHDRAWN ({why}): withdraw it by hand, now."
 
 @dataclass
 class CommissioningResult:
-    """What came of it.
+    """The result of a commissioning.
 
     Attributes:
         progress: the steps.
-        lost: why it ended before its end; empty if it did not.
+        lost: why it ended early; empty if it did not.
         folder: of the run, with the log and the trace.
     """
 
@@ -51,17 +51,17 @@ def commission(
     *,
     has_panel: bool | None = None,
 ) -> CommissioningResult:
-    """Take a person through all steps.
+    """Guide a person through all steps.
 
     Args:
         file: for the report, written after each step.
         tried_on: see `TRIED_ON`.
-        before: the report of an unfinished commissioning of the same controller, to go on with.
+        before: the report of an unfinished commissioning of the same controller, to continue.
         has_panel: False skips questions about the panel; None: a simulated microscope has no panel.
 
     Raises:
         ConfigError: the experiment file is wrong; nothing was started.
-        KeyboardInterrupt: after the scan was stopped, the tip withdrawn if it was in contact, and all was put back.
+        KeyboardInterrupt: the scan was stopped, the tip withdrawn if it was in contact, and all settings restored.
     """
     result = CommissioningResult(CommissioningProgress.resumed(all_steps(), before.results() if before else {}), file)
     try:
@@ -100,7 +100,7 @@ def _in_session(
 
 
 class _Walk:
-    """The way through the steps."""
+    """Runs the steps in order."""
 
     def __init__(self, guide: Guide, progress: CommissioningProgress, write: Callable[[], None]) -> None:
         self._guide = guide
@@ -108,7 +108,7 @@ class _Walk:
         self._write = write
 
     def through(self) -> None:
-        """Do what is left to do."""
+        """Run the remaining steps."""
         while (step := self._progress.next()) is not None:
             result = self._progress.results[step.name] = attempt(step, self._guide)
             symbol, _ = mark(result.outcome)
@@ -136,7 +136,6 @@ class _Walk:
 
 
 def _traced(options: CheckOptions, stack: ExitStack) -> CheckOptions:
-    """Return the options with a trace of all that is said to the controller."""
     overlay = trace_overlay(prepare(options).resolved, Path(stack.enter_context(tempfile.TemporaryDirectory())))
     return options if overlay is None else replace(options, files=[*options.files, overlay])
 
@@ -150,7 +149,7 @@ def _report(
     return InstrumentReport(
         maker=session.maker or "unknown",
         driver=session.translator,
-        release=support.controller or "not told",
+        release=support.controller or "not reported",
         tried_on=tried_on,
         evidence="afspm commission",
         began=checks.began,

@@ -1,4 +1,4 @@
-"""The progress of a commissioning: which step is next, and what follows from the outcome of each. Pure."""
+"""The progress of a commissioning: the next step, and the consequences of each outcome. Pure."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.testing.conformance import Check, CheckOutcome, CheckResult
 _MISMATCH: Final = "mismatch"
 """The word for a failed step in reports and in the public matrix."""
 _GOES_ON = (CheckOutcome.PASSED, CheckOutcome.SKIPPED, CheckOutcome.UNSUPPORTED)
-"""What is not supported, or not shown at the panel, keeps nothing else from being tried."""
+"""An unsupported step, or one not shown at the panel, does not block others."""
 
 
 _WORSE = (
@@ -25,7 +25,7 @@ _WORSE = (
 
 
 def outcome_word(outcome: CheckOutcome) -> str:
-    """Return an outcome as reports and the public matrix have it."""
+    """Return the word for an outcome in reports and in the public matrix."""
     return _MISMATCH if outcome is CheckOutcome.FAILED else outcome.value
 
 
@@ -39,13 +39,13 @@ class CommissioningStep(Check):
     """One step.
 
     Attributes:
-        explained: the text shown to the person before anything is done.
-        after: the steps that come first: none of them may have failed, or have been declined.
-        moves: it acts on the microscope, which the person has confirmed before.
-        needs_panel: the person has to do something at the panel; skipped where there is none.
-        contact: the tip is at the sample: it is withdrawn when the step is over.
-        remembered: a resumed commissioning need not do it again; what concerns the tip is asked each time.
-        operations: of the public matrix, that it tries.
+        explained: shown to the person before the step.
+        after: required earlier steps: none may have failed or been declined.
+        moves: it acts on the microscope, so the person confirms it first.
+        needs_panel: the person acts at the panel; skipped where there is none.
+        contact: the tip is at the sample; it is withdrawn after the step.
+        remembered: a resumed commissioning skips it if it has passed; steps about the tip are always repeated.
+        operations: of the public matrix, that it tests.
     """
 
     explained: str
@@ -66,7 +66,7 @@ class CommissioningProgress:
 
     @classmethod
     def resumed(cls, steps: Sequence[CommissioningStep], before: Mapping[str, CheckResult]) -> CommissioningProgress:
-        """Keep what has passed before and can be remembered; the rest is done again."""
+        """Keep earlier passes of remembered steps; all other steps are repeated."""
         kept = {
             step.name: before[step.name]
             for step in steps
@@ -75,9 +75,9 @@ class CommissioningProgress:
         return cls(steps, kept)
 
     def next(self) -> CommissioningStep | None:
-        """Return the next step; those that can't be done any more are noted as blocked.
+        """Return the next step; record steps that have become impossible as blocked.
 
-        A gate, which is not remembered, is passed over if nothing that needs it is left to do.
+        A gate, which is not remembered, is skipped if no remaining step needs it.
         """
         for step in self.steps:
             if step.name in self.results or not self._is_wanted(step):
@@ -92,12 +92,12 @@ class CommissioningProgress:
 
     @property
     def passed(self) -> bool:
-        """True if nothing was found to be wrong, and nothing was left out that could be done."""
+        """True if no step found an error, and every possible step was done."""
         found = [result.outcome for result in self.results.values()]
         return bool(found) and all(one in _GOES_ON for one in found)
 
     def operations(self) -> dict[str, str]:
-        """Return the outcome of each operation of the matrix: the worst of the steps that tried it."""
+        """Return the outcome of each operation of the matrix: the worst of its steps."""
         found: dict[str, CheckOutcome] = {}
         for step in self.steps:
             outcome = self._outcome(step.name)
@@ -112,7 +112,7 @@ class CommissioningProgress:
         return not gate or any(user.name not in self.results for user in users)
 
     def _before(self, step: CommissioningStep) -> list[str]:
-        """Return all steps that come before a step, also those before these: a gate is asked again when resumed."""
+        # all ancestors: a gate is asked again after a resume
         known = {one.name: one for one in self.steps}
         found = dict.fromkeys(step.after)
         for name in step.after:

@@ -1,4 +1,4 @@
-"""The report of a commissioning: one TOML file for people and programs, from which the public matrix is made."""
+"""The report of a commissioning: one TOML file for people and programs, the source of the public matrix."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ _HEAD = """# A commissioning report of afspm. Send it to have it in the public m
 
 @dataclass(frozen=True)
 class InstrumentReport:
-    """Tries of the operations of one controller.
+    """Test results of the operations of one controller.
 
     Attributes:
-        release: of the controller's program, as it tells, or as the person knows.
+        release: of the controller's program, as reported by it or by the person.
         tried_on: one of `TRIED_ON`.
-        evidence: what was done: a command, or tests of the repository.
+        evidence: a command, or tests of the repository.
         operations: the outcome of each.
         steps: of `afspm commission`: outcome and line of each.
         unsupported: actions and parameters that the controller does not have.
-        unrestored: settings that could not be put back.
+        unrestored: settings that could not be restored.
     """
 
     maker: str
@@ -55,17 +55,17 @@ class InstrumentReport:
     @property
     def row(self) -> str:
         """The row of the matrix, in Markdown."""
-        told = [f"{name}: {outcome}" for name, outcome in self.operations.items()]
-        return f"| {self.maker} | {self.release} | {self.tried_on} | {', '.join(told)} |"
+        outcomes = [f"{name}: {outcome}" for name, outcome in self.operations.items()]
+        return f"| {self.maker} | {self.release} | {self.tried_on} | {', '.join(outcomes)} |"
 
     def write(self, file: Path) -> None:
-        """Write it. Raises FileError."""
+        """Write the report as TOML. Raises FileError."""
         text = _HEAD.format(row=self.row) + dumps(asdict(self))
         write_atomic(file, [text.encode()])
 
     @classmethod
     def read(cls, file: Path) -> InstrumentReport:
-        """Read one. Raises FileError: it is none."""
+        """Read a report. Raises FileError: the file is not one."""
         try:
             facts: Plain = tomllib.loads(file.read_text(encoding="utf-8"))
             found = cls(**facts)
@@ -76,12 +76,11 @@ class InstrumentReport:
             raise FileError(f"is not a commissioning report: {error}", where=str(file)) from error
 
     def results(self) -> dict[str, CheckResult]:
-        """Return the results of the steps."""
         return {
             name: CheckResult(name, "", outcome_of(one["outcome"]), one["line"]) for name, one in self.steps.items()
         }
 
 
 def steps_of(progress: CommissioningProgress) -> dict[str, dict[str, str]]:
-    """Return the results as they are written."""
+    """Return the results in the form of the file."""
     return {name: {"outcome": outcome_word(one.outcome), "line": one.line} for name, one in progress.results.items()}

@@ -1,6 +1,6 @@
-"""The steps of a commissioning, in their order.
+"""The steps of a commissioning, in order.
 
-Each returns a line that says what was seen, or raises Failed, Skipped or Declined.
+Each returns a line with its observation, or raises Failed, Skipped or Declined.
 """
 
 from __future__ import annotations
@@ -25,14 +25,13 @@ READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES = (
 )  # fmt: skip
 OPERATIONS: Final = (READ, FRAME, ANGLE, SCAN, END, FILES, STOP, LOSS, AXES)
 _NOTICED_S: Final = 5.0
-"""Seconds between the end of a scan at the panel and the one that afspm publishes: reaction, saving, polling."""
+"""Seconds between the end of a scan at the panel and its publication: reaction, saving, polling."""
 _LOST_S: Final = 60.0
 _STEPS: list[CommissioningStep] = []
 _FRAME = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
 def all_steps() -> tuple[CommissioningStep, ...]:
-    """Return all steps, in their order."""
     return tuple(_STEPS)
 
 
@@ -89,7 +88,6 @@ def _panel(guide: Guide) -> str:
 
 
 def _compare_frame(guide: Guide, frame: FrameSetting) -> int:
-    """Compare a frame with the panel. Return how many of its values are shown there."""
     region, (rows, columns) = frame.region, frame.shape
     slack_nm = 0.01 * max(region.size_m) * 1e9
     x_nm, y_nm = (value * 1e9 for value in region.center_m)
@@ -122,7 +120,7 @@ def _compare_values(guide: Guide) -> int:
 
 @_step(
     "The tip is withdrawn",
-    "All that follows until you are told moves the scanner sideways and takes scans. It never approaches.",
+    "The next steps, up to the next notice, move the scanner sideways and take scans. They never approach.",
     "Withdraw the tip with the coarse motor, so far that the scanner can't reach the sample, and begin again.",
     after=("controller",),
     moves=False,
@@ -189,7 +187,7 @@ def _angle(guide: Guide) -> str:
 )
 def _scan(guide: Guide) -> str:
     taken, panel_s = _watched(guide)
-    scans.require_order(taken.heard, ScopeState.SCANNING, Scan)
+    scans.require_order(taken.observed, ScopeState.SCANNING, Scan)
     scans.require_frame(taken)
     begin_s, free_s = taken.time_s(ScopeState.SCANNING), taken.time_s(ScopeState.FREE)
     for one in taken.scans:
@@ -201,7 +199,7 @@ def _scan(guide: Guide) -> str:
         expect(abs(late_s) <= _NOTICED_S, wanted, f"{abs(late_s):.0f} s {'later' if late_s > 0 else 'earlier'}")
     elif taken.expected_s is not None:
         wanted = f"a scan of about {taken.expected_s:.3g} s, by its speed"
-        # the program's own time is real time, of which more passes in an experiment that goes faster
+        # the program's own delay is real time; in experiment time it is longer if the clock runs faster
         own_s = max(2.0 * _NOTICED_S, guide.program_s / guide.kit.client.clock.real_s(1.0))
         most_s = 1.5 * taken.expected_s + own_s
         expect(free_s - begin_s <= most_s, wanted, f"{_lasted(guide, free_s - begin_s)} until its end was noticed")
@@ -210,13 +208,12 @@ def _scan(guide: Guide) -> str:
 
 
 def _lasted(guide: Guide, lasted_s: float) -> str:
-    """Return a duration in words; with the real one, where the experiment's time goes faster."""
+    # the real duration is added where experiment time runs faster
     real_s = guide.kit.client.clock.real_s(lasted_s)
     return f"{lasted_s:.3g} s" if real_s == lasted_s else f"{lasted_s:.3g} s ({real_s:.2g} s of real time)"
 
 
 def _watched(guide: Guide) -> tuple[Taken, float | None]:
-    """Take the scan; and the experiment time at which the person saw it end."""
     kit, client = guide.kit, guide.kit.client
     frame = kit.frames.plain
     expected_s = kit.prepare(frame, SCAN_S)
@@ -227,8 +224,8 @@ def _watched(guide: Guide) -> tuple[Taken, float | None]:
     panel_s = None if answer is None or answer.strip() else client.clock.now_s()
     limit_s = 1200.0 if expected_s is None else 5.0 * expected_s + 60.0
     client.wait_state(ScopeState.FREE, mark, client.real_s(limit_s))
-    heard = client.settled(mark)
-    taken = Taken(frame, heard, expected_s)
+    observed = client.settled(mark)
+    taken = Taken(frame, observed, expected_s)
     expect(taken.scans, "a Scan2d of the scan", "none: see the files of the controller")
     guide.kit.keep("scan of the plain frame", taken)
     return taken, panel_s
@@ -344,7 +341,7 @@ def _contact(guide: Guide) -> str:
     needs=(names.START_SCAN,),
 )
 def _axes(guide: Guide) -> str:
-    guide.kit.forget()  # what was taken with the tip withdrawn
+    guide.kit.forget()  # those measurements were taken with the tip withdrawn
     picture.picture(guide.kit)
     taken = guide.kit.scan("wide").scans
     scan = next((one for one in taken if one.unit == "m"), taken[0])
@@ -353,4 +350,4 @@ def _axes(guide: Guide) -> str:
     file.write_bytes(raster.png(levels))
     guide.prompts.show(f"  {scan.channel}, y upwards: {file}")
     guide.require_at_panel("Does the panel show the same picture, not mirrored and not turned?", "the panel's picture")
-    return "details fit into the larger scan as told"
+    return "details fit into the larger scan as reported"

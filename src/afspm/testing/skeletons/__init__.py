@@ -1,4 +1,4 @@
-"""Packages to begin with: real ones, checked and tested as they are. `afspm new` writes them by another name."""
+"""Template packages, which are checked and tested as they are; `afspm new` copies them under another name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _NAMES = {
     "component": ("my_component", "MyComponent"),
     "experiment": ("my_experiment", "MyExperiment"),
 }
-"""Of each kind, the module and the class that are called otherwise."""
+"""Module and class of each kind, which are renamed in the copy."""
 _SKIPPED = {"__pycache__", "__init__.pyc"}
 
 
@@ -27,8 +27,8 @@ def write(kind: str, name: str, into: Path) -> Path:
         its folder, new in `into`.
 
     Raises:
-        ConfigError: it can't be called that.
-        FileError: there is such a folder, or it can't be written.
+        ConfigError: the name is invalid.
+        FileError: the folder exists, or can't be written.
     """
     module = re.sub(r"[\s-]+", "_", name.strip()).lower()
     if not module.isidentifier() or module in ("afspm", "tests"):

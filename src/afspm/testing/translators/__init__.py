@@ -1,8 +1,8 @@
 """Conformance suite for translators: each operation of the wire format, checked from outside.
 
 `afspm test-translator experiment.toml` starts translator and scheduler as real processes, or joins running ones, and
-asks for everything that a component could ask for. The same as pytest items, one for each check:
-`pytest -p afspm.testing.translators.plugin experiment.toml` (that plugin is loaded only where it is asked for).
+sends every request that a component could send. The same as pytest items, one for each check:
+`pytest -p afspm.testing.translators.plugin experiment.toml` (the plugin is loaded only on request).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The client that asks what a component could ask, through the scheduler, and observes what is published."""
+"""`CheckClient`: sends requests like a component, through the scheduler, and records publications."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Observation:
 
     Attributes:
         message: its name.
-        thing: what is in it; an error that says why it can't be read.
-        time_ns: when it was published.
+        thing: its content, or the error that prevents decoding.
+        time_ns: the time of its publication.
     """
 
     message: str
@@ -46,7 +46,7 @@ class Observation:
 
     @property
     def state(self) -> ScopeState | None:
-        """The state, where it tells one."""
+        """The state in a status message, else None."""
         return self.thing.state if isinstance(self.thing, ScopeStatus) else None
 
     def __str__(self) -> str:
@@ -60,41 +60,41 @@ class Observation:
 
 
 class Observations:
-    """All that is heard of the microscope, oldest first."""
+    """All packets about the microscope, oldest first."""
 
     def __init__(self) -> None:
         self.all: list[Observation] = []
 
     def take(self, packet: Packet, ours: bool) -> None:
-        """A listener of a `ExperimentLink`."""
+        """Record a packet; a listener of an `ExperimentLink`."""
         message = packet.envelope
         try:
             message = wire.message_of(packet.envelope)
             thing = wire.decode(message, bytes(packet.payload))
         except WireError as error:
             thing = error
-        # the rest comes from the scheduler, or only where a client asks for it
+        # other packets come from the scheduler, or only on request of a client
         if isinstance(thing, WireError) or _is_always_published(wire.declaration(message)):
             self.all.append(Observation(message, thing, packet.time_ns))
 
     def mark(self) -> int:
-        """Here: what comes later is news."""
+        """Return the present position, for `since`."""
         return len(self.all)
 
     def since(self, mark: int) -> list[Observation]:
-        """Return what came after `mark`."""
+        """Return the observations after `mark`."""
         return self.all[mark:]
 
     def newest(self, kind: type[T]) -> T | None:
-        """The last that was published of a kind."""
+        """Return the newest content of a kind."""
         return next((one.thing for one in reversed(self.all) if isinstance(one.thing, kind)), None)
 
     def has_state(self, state: ScopeState, mark: int) -> bool:
-        """True if it was published after `mark`."""
+        """Return whether a state was published after `mark`."""
         return any(one.state is state for one in self.all[mark:])
 
     def at_s(self, state: ScopeState, mark: int) -> float | None:
-        """When it was first said after `mark`, experiment time; None: not yet."""
+        """Return the first time of a state after `mark`, experiment time; None if there is none yet."""
         times = (one.time_ns for one in self.all[mark:] if one.state is state and one.time_ns is not None)
         return next((time_ns / 1e9 for time_ns in times), None)
 
@@ -103,40 +103,37 @@ def _is_always_published(message: wire.MessageDeclaration) -> bool:
     return message.source is Role.TRANSLATOR and message.always
 
 
-def told(heard: Iterable[Observation]) -> str:
-    """Return the observations as text."""
-    return ", ".join(map(str, heard)) or "nothing"
+def describe_all(observed: Iterable[Observation]) -> str:
+    return ", ".join(map(str, observed)) or "nothing"
 
 
-def scans(heard: Iterable[Observation]) -> list[Scan]:
-    """The scans among it."""
-    return [one.thing for one in heard if isinstance(one.thing, Scan)]
+def scans(observed: Iterable[Observation]) -> list[Scan]:
+    return [one.thing for one in observed if isinstance(one.thing, Scan)]
 
 
-def spectra(heard: Iterable[Observation]) -> list[Spectrum]:
-    """The spectra among it."""
-    return [one.thing for one in heard if isinstance(one.thing, Spectrum)]
+def spectra(observed: Iterable[Observation]) -> list[Spectrum]:
+    return [one.thing for one in observed if isinstance(one.thing, Spectrum)]
 
 
-def states(heard: list[Observation]) -> list[str]:
-    """The states among what was heard, in words, each once where it is repeated."""
+def states(observed: list[Observation]) -> list[str]:
+    """Return the names of the states, without immediate repetitions."""
     found: list[str] = []
-    for one in heard:
+    for one in observed:
         if one.state is not None and str(one) not in found[-1:]:
             found.append(str(one))
     return found
 
 
 STARTED_S = 30.0
-"""Real seconds until translator and scheduler are up and the microscope has said that it is free."""
+"""Real seconds until translator and scheduler are up and the microscope has reported that it is free."""
 ANSWERED_S = 15.0
 """Real seconds until an answer: longer than a scheduler waits for the translator's."""
 NOTICED_S = 10.0
-"""Real seconds until what was asked for is published."""
+"""Real seconds until the effect of a request is published."""
 QUIET_S = 0.2
-"""Real seconds without anything after which nothing more is said to come."""
+"""Real seconds without a packet that count as a pause."""
 MOVED_S = 60.0
-"""Experiment seconds that a move may take."""
+"""Longest experiment seconds of a move."""
 
 _STOPS = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}
 
@@ -145,16 +142,16 @@ _ANSWERS = "a scheduler that answers (of a running experiment: one with `[securi
 
 
 class CheckClient:
-    """A component of a kind of its own: it is told everything, and hides nothing.
+    """A component that records every publication.
 
     Args:
         link: to the scheduler, connected or about to be.
-        direct: to the translator, past the scheduler, which would refuse some things by itself; None: there is none.
-        lost: says why the links were told that the parent is gone: which process has ended.
+        direct: to the translator, bypassing the scheduler's own refusals; None if there is none.
+        lost: returns which process has ended, after a link reports that the parent is gone.
 
     Attributes:
-        observations: what is published.
-        at_start: what of it was there before anything was asked.
+        observations: all publications.
+        at_start: the publications before the first request.
     """
 
     def __init__(self, link: ExperimentLink, direct: ExperimentLink | None, lost: Callable[[], str]) -> None:
@@ -174,7 +171,7 @@ class CheckClient:
         """Wait until the microscope is there, and take control.
 
         Raises:
-            Lost: that could not be.
+            Lost: that was impossible.
         """
         try:
             self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)
@@ -186,7 +183,7 @@ class CheckClient:
             self.wait(lambda: self.state is not ScopeState.UNDEFINED, STARTED_S, "a connection to the controller")
         except Failed as failure:
             raise Lost(str(failure)) from failure
-        response = self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)
+        response = self._request_over(self._link, ControlRequest.REQUEST_CTRL, 0)
         if not response.ok:
             raise Lost(f"control was refused: {answer_in_words(response)}")
         self.quiet()
@@ -196,21 +193,23 @@ class CheckClient:
         """Ask for control again, after it was taken away while the controller was lost.
 
         Raises:
-            Lost: it is not granted within so many real seconds.
+            Lost: it is not granted within `within_s` real seconds.
         """
         until_s = self.clock.monotonic_s() + within_s
-        while not (response := self._asked_by(self._link, ControlRequest.REQUEST_CTRL, 0)).ok:
+        while not (response := self._request_over(self._link, ControlRequest.REQUEST_CTRL, 0)).ok:
             if self.clock.monotonic_s() >= until_s:
                 raise Lost(f"control was refused: {answer_in_words(response)}")
             self.quiet()
 
     def end(self) -> None:
-        """Give control back."""
+        """Release control."""
         self._link.send_only(ControlRequest.RELEASE_CTRL)
 
     def interrupt(self) -> None:
-        """Ctrl-C: KeyboardInterrupt where the checks next wait or ask. Raised anywhere, it could leave a request half
-        sent, and what is then put back would be taken for the rest of it."""
+        """Raise KeyboardInterrupt (after Ctrl-C) where the checks next wait or send.
+
+        Raised elsewhere, it could leave a half-sent request; requests that restore settings would be read as its rest.
+        """
         self._interrupted = True
         self._link.port.wake_up()
 
@@ -222,22 +221,22 @@ class CheckClient:
     # --- asking ---
 
     def ask(self, kind: ControlRequest, subject: object = None) -> Response:
-        """The answer, whatever it is.
+        """Send a request, and return the answer, also a refusal.
 
         Raises:
-            Failed: there is none.
+            Failed: there is no answer.
             Lost: a process has ended, or control was taken away.
         """
-        response = self._asked_by(self._link, kind, subject)
+        response = self._request_over(self._link, kind, subject)
         if response.code == ControlResponse.NOT_IN_CONTROL:
             raise Lost(f"control was lost: {response.reason}")
         return response
 
     def ask_directly(self, kind: ControlRequest, subject: object) -> Response:
-        """As `ask`, past the scheduler: for what the translator has to refuse by itself."""
-        return self._asked_by(self._direct, kind, subject)
+        """Send a request to the translator, bypassing the scheduler: for the translator's own refusals."""
+        return self._request_over(self._direct, kind, subject)
 
-    def _asked_by(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
+    def _request_over(self, link: ExperimentLink, kind: ControlRequest, subject: object) -> Response:
         self._heed()
         try:
             with self._alive():
@@ -248,43 +247,42 @@ class CheckClient:
         return response
 
     def asked(self, kind: ControlRequest, subject: object, what: str) -> Response:
-        """As `ask`, where it has to be a success."""
+        """Send a request that must succeed. Raises as `ask`."""
         response = self.ask(kind, subject)
         expect(response.ok, f"REP_SUCCESS to {what}", answer_in_words(response))
         return response
 
     def get(self, name: str, unit: str | None = None) -> Parameter:
-        """A parameter's value, as it is told."""
+        """Return a parameter's value as reported."""
         return value_in(self.asked(ControlRequest.PARAM, Parameter(name, None, unit), f"getting {name}"), name)
 
     def set(self, name: str, value: str, unit: str | None = None) -> Response:
-        """Ask for a value; the answer, whatever it is."""
+        """Request a value; return the answer, also a refusal."""
         return self.ask(ControlRequest.PARAM, Parameter(name, value, unit))
 
     # --- hearing ---
 
     @property
     def state(self) -> ScopeState:
-        """The microscope's newest state."""
         newest = self.observations.newest(ScopeStatus)
         return ScopeState.UNDEFINED if newest is None else newest.state
 
     def wait(self, done: Callable[[], bool], within_s: float, expected: str) -> None:
-        """Wait for something to be heard, real seconds.
+        """Wait for a condition on the observations, real seconds.
 
         Raises:
-            Failed: it did not come.
+            Failed: a timeout.
         """
         mark = self.observations.mark()
         self._wait(done, within_s, expected, mark)
 
     def wait_state(self, state: ScopeState, mark: int, within_s: float = NOTICED_S) -> None:
-        """Wait until a state is heard after `mark`."""
+        """Wait until a state is published after `mark`."""
         self._wait(lambda: self.observations.has_state(state, mark), within_s, f"SS_{state.name}", mark)
 
     def _wait(self, done: Callable[[], bool], within_s: float, expected: str, mark: int) -> None:
         came = self._awaited(done, within_s)
-        expect(came, f"{expected} within {within_s:.3g} s", told(self.observations.since(mark)))
+        expect(came, f"{expected} within {within_s:.3g} s", describe_all(self.observations.since(mark)))
 
     def _awaited(self, done: Callable[[], bool], within_s: float) -> bool:
         def done_or_interrupted() -> bool:
@@ -295,7 +293,7 @@ class CheckClient:
             return self._link.wait(done_or_interrupted, self._link.until(within_s))
 
     def settled(self, mark: int, experiment_s: float = MOVED_S) -> list[Observation]:
-        """All that is published after `mark` until the microscope is free and quiet."""
+        """Wait until the microscope is free and quiet; return all publications after `mark`."""
 
         self.quiet()
         if self.state is not ScopeState.FREE:
@@ -304,7 +302,7 @@ class CheckClient:
         return self.observations.since(mark)
 
     def quiet(self) -> None:
-        """Until nothing has come for a while."""
+        """Wait for a pause in the publications."""
         self._stirred = False
         until_s = self.clock.monotonic_s() + NOTICED_S
         while self.clock.monotonic_s() < until_s:
@@ -313,11 +311,11 @@ class CheckClient:
                 return
 
     def real_s(self, experiment_s: float) -> float:
-        """Return the longest real time for that: never less than it takes to be noticed."""
+        """Return the longest real time for an experiment time, with an allowance for the notification."""
         return self.clock.real_s(experiment_s) + NOTICED_S
 
     def come_to_rest(self) -> None:
-        """Stop whatever runs; free, or Lost."""
+        """Stop any activity, and wait until the microscope is free. Raises Lost."""
         if self.state is not ScopeState.FREE:
             mark = self.observations.mark()
             if self.state in _STOPS:
@@ -326,7 +324,7 @@ class CheckClient:
                 self.wait(lambda: self.state is ScopeState.FREE, self.real_s(MOVED_S), "SS_FREE")
             except Failed as failure:
                 raise Lost(
-                    f"the microscope does not become free: {failure} ({told(self.observations.since(mark))})"
+                    f"the microscope does not become free: {failure} ({describe_all(self.observations.since(mark))})"
                 ) from failure
         if self._stirred:
             self.quiet()
@@ -346,14 +344,14 @@ def _only_asks(kind: ControlRequest, subject: object) -> bool:
 
 
 def answer_in_words(response: Response) -> str:
-    """An answer, and why."""
+    """Describe an answer with its reason."""
     known = response.code in ControlResponse._value2member_map_
     code = f"REP_{ControlResponse(response.code).name}" if known else f"response {response.code}"
     return f"{code} ({response.reason})" if response.reason else code
 
 
 def value_in(response: Response, name: str) -> Parameter:
-    """The parameter that comes with a success.
+    """Return the parameter in a successful answer.
 
     Raises:
         Failed: none, or another.
@@ -362,6 +360,6 @@ def value_in(response: Response, name: str) -> Parameter:
         found = wire.decode_parameter(response.payload)
     except WireError as error:
         raise Failed(f"REP_SUCCESS with a ParameterMsg of {name}", f"one that can't be read: {error}") from error
-    expect(found.name == name, f"the value of {name}", f"that of {found.name!r}")
+    expect(found.name == name, f"the value of {name}", f"the value of {found.name!r}")
     expect(found.value is not None, f"REP_SUCCESS with the value of {name} in force", "no value")
     return found

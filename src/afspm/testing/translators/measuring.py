@@ -1,4 +1,4 @@
-"""Setting frames, and taking scans and spectra, with everything that is published meanwhile."""
+"""`CheckMeasurements`: sets frames, takes scans and spectra, and records all publications meanwhile."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from afspm.model import (
     names,
 )
 from afspm.testing.conformance import Check, Failed, Skipped, expect
-from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, scans, spectra, told
+from afspm.testing.translators.client import CheckClient, Observation, answer_in_words, describe_all, scans, spectra
 from afspm.testing.translators.support import Support
 
 NEAR = 1e-3
-"""Of a frame's size: closer than that is the same. Half a pixel of the largest frame here is more."""
+"""Tolerance in units of the frame's size: less than half a pixel of the largest frame here."""
 TURN_RAD = math.radians(20.0)
 
 
@@ -40,7 +40,7 @@ class FrameSetting:
     shape: tuple[int, int]
 
     def request(self, support: Support) -> ScanParameters:
-        """Return the request for it; without the angle, where the microscope has none."""
+        """Return the request that sets it; without the angle, where the microscope has none."""
         (left, low), (width, height) = self.region.top_left_m, self.region.size_m
         angle = self.region.angle_rad if support.has(names.SCAN_ANGLE) else None
         return ScanParameters(RegionChange(left, low, width, height, angle), self.shape)
@@ -48,38 +48,38 @@ class FrameSetting:
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """The frames of one pass. Columns are multiples of 16: some controllers take no others.
+    """The frames of one pass. Columns are multiples of 16: some controllers accept no others.
 
     Attributes:
-        whole: as it was set at the beginning.
+        whole: the frame at the beginning.
     """
 
     whole: Region
 
     @property
     def plain(self) -> FrameSetting:
-        """Square, beside the middle in both directions."""
+        """A square, off the centre in both directions."""
         return self._part((0.1, -0.15), (0.5, 0.5), (32, 32))
 
     @property
     def other(self) -> FrameSetting:
-        """Square as well, elsewhere and smaller."""
+        """A smaller square, elsewhere."""
         return self._part((-0.2, 0.2), (0.3, 0.3), (32, 32))
 
     @property
     def wide(self) -> FrameSetting:
-        """Twice as wide as high, and of other pixels."""
+        """A frame twice as wide as high, with other pixels."""
         return self._part((-0.1, 0.15), (0.6, 0.3), (16, 64))
 
     @property
     def turned(self) -> FrameSetting:
-        """Turned counter-clockwise."""
+        """A frame turned counter-clockwise."""
         return self._part((0.1, 0.05), (0.5, 0.4), (32, 48), TURN_RAD)
 
     def _part(
         self, offset: tuple[float, float], size: tuple[float, float], shape: tuple[int, int], turn_rad: float = 0.0
     ) -> FrameSetting:
-        """`offset` of the middle and `size` in units of the whole, in its own directions."""
+        # `offset` of the centre and `size` are fractions of the whole frame, along its own axes
         width, height = self.whole.size_m
         side = min(width, height)
         cos, sin = math.cos(self.whole.angle_rad), math.sin(self.whole.angle_rad)
@@ -90,7 +90,7 @@ class FrameSettings:
 
 
 def difference(expected: Region, came: Region) -> str:
-    """In which respect two regions differ; empty where they are the same to a controller's precision."""
+    """Describe the difference of two regions; empty if they agree to a controller's precision."""
     size = math.hypot(*expected.size_m)
     if math.dist(expected.size_m, came.size_m) > NEAR * size:
         return f"a size of {in_words(came.size_m)} instead of {in_words(expected.size_m)}"
@@ -107,63 +107,63 @@ def difference(expected: Region, came: Region) -> str:
 
 
 def in_words(xy_m: tuple[float, float]) -> str:
-    """Two lengths, in nm."""
+    """Return a position as text, in nm."""
     return "({:.6g}, {:.6g}) nm".format(*(value * 1e9 for value in xy_m))
 
 
 SCAN_S = 8.0
-"""Experiment seconds that a scan is to last, where its speed can be set: long enough to tell its start from its end."""
+"""Experiment seconds of a scan, where its speed can be set: long enough to distinguish its start from its end."""
 LINE_S = 0.25
-"""Experiment seconds that a line, there and back, is to last at least: no scanner is driven to its limits."""
+"""Least experiment seconds of a line, trace and retrace, far from the limits of any scanner."""
 LONG_REAL_S = 3.0
-"""Real seconds that a scan has to last at least in the middle of which something is asked."""
+"""Least real seconds of a scan during which requests are sent."""
 UNKNOWN_S = 1200.0
-"""Experiment seconds after which a scan or spectrum of unknown duration is said not to end."""
+"""Experiment seconds after which a scan or spectrum of unknown duration counts as endless."""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Taken:
-    """A measurement that was taken.
+    """A finished measurement.
 
     Attributes:
-        frame: that was set; of a spectrum: None.
-        heard: from its beginning on until all was quiet.
-        expected_s: how long, by its speed, it should have lasted, experiment time; None if that is not known.
+        frame: the set frame; None for a spectrum.
+        observed: publications from its start until a pause.
+        expected_s: its expected duration, experiment time; None if unknown.
     """
 
     frame: FrameSetting | None
-    heard: list[Observation]
+    observed: list[Observation]
     expected_s: float | None
 
     @property
     def scans(self) -> list[Scan]:
-        return scans(self.heard)
+        return scans(self.observed)
 
     @property
     def spectra(self) -> list[Spectrum]:
-        return spectra(self.heard)
+        return spectra(self.observed)
 
     def time_s(self, state: ScopeState) -> float:
-        """When it was first in a state, experiment time.
+        """Return the first time of a state, experiment time.
 
         Raises:
-            Failed: never.
+            Failed: it was never published.
         """
-        times = [one.time_ns for one in self.heard if one.state is state and one.time_ns is not None]
-        expect(times, f"SS_{state.name} with a time", told(self.heard))
+        times = [one.time_ns for one in self.observed if one.state is state and one.time_ns is not None]
+        expect(times, f"SS_{state.name} with a time", describe_all(self.observed))
         return times[0] / 1e9
 
 
 class CheckMeasurements:
-    """Takes measurements for checks. What failed once is not tried again: who needs it is skipped.
+    """Takes measurements for checks. A failed measurement is not repeated: checks that need it are skipped.
 
     Attributes:
         excused: checks that this controller can't pass, with the reason.
-        complaints: what is logged as wrong; it grows.
-        frames: to take scans of; Skipped where the microscope has not said what is set.
-            `frame_m` is the side of what they are parts of, instead of the frame that is set.
+        complaints: logged warnings and errors; it grows.
+        frames: the frames to scan; Skipped where the microscope has not published its frame.
+            `frame_m` is the side of the square that contains them, instead of the set frame.
     """
 
     def __init__(
@@ -191,14 +191,14 @@ class CheckMeasurements:
         return self.client.clock
 
     def perform(self, check: Check) -> None:
-        """Do a check. Raises a CheckEnded: Skipped if the microscope does not have what it needs."""
+        """Run a check. Raises a CheckEnded: Skipped if the microscope does not have what it needs."""
         self._heeded = len(self._complaints)
         if missing := self.support.missing(check.needs):
             raise Skipped(f"not supported: {', '.join(missing)}")
         check.do(self)
 
     def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
-        """Return the complaints since the check began. Raises Skipped: this controller can't pass the check."""
+        """Return the complaints since the check began. Raises Skipped: the controller can't pass it."""
         if check.name in self._excused:
             raise Skipped(f"{self._excused[check.name]}: {failure}")
         return tuple(self._complaints[self._heeded :])
@@ -210,34 +210,34 @@ class CheckMeasurements:
         return FrameSettings(self._whole)
 
     def keep(self, what: str, taken: Taken) -> None:
-        """Keep a measurement that was taken otherwise."""
+        """Keep a measurement that was taken in another way."""
         self._kept[what] = taken
 
     def forget(self) -> None:
-        """Take all measurements anew when they are asked for."""
+        """Discard all kept measurements, so that they are taken again on request."""
         self._kept.clear()
 
     # --- scans ---
 
     def scan(self, name: str) -> Taken:
-        """The scan of the frame of this name, taken now unless it was before."""
+        """Return the scan of the frame of this name, taken now or earlier."""
         return self._once(f"scan of the {name} frame", lambda: self.take_scan(getattr(self.frames, name)))
 
     def take_scan(self, frame: FrameSetting) -> Taken:
-        """Take a scan, to its end."""
+        """Take a complete scan."""
         expected_s = self.prepare(frame, max(SCAN_S, LINE_S * frame.shape[0]))
-        heard = self._measure(names.START_SCAN, ScopeState.SCANNING, expected_s)
-        if not scans(heard):
-            raise Failed("a Scan2d between SS_SCANNING and SS_FREE", told(heard))
-        return Taken(frame, heard, expected_s)
+        observed = self._measure(names.START_SCAN, ScopeState.SCANNING, expected_s)
+        if not scans(observed):
+            raise Failed("a Scan2d between SS_SCANNING and SS_FREE", describe_all(observed))
+        return Taken(frame, observed, expected_s)
 
     def begin_long_scan(self, frame: FrameSetting) -> int:
-        """Begin a scan that lasts long enough to ask something meanwhile; where the observations was before it."""
+        """Start a scan long enough for other requests; return the mark before it."""
         self.prepare(frame, max(SCAN_S, LONG_REAL_S / self.client.clock.real_s(1.0)))
         return self._begin(names.START_SCAN, ScopeState.SCANNING)
 
     def prepare(self, frame: FrameSetting, lasts_s: float) -> float | None:
-        """Set frame and speed; how long, by that, the scan lasts."""
+        """Set frame and speed; return the expected duration of the scan."""
         client = self.client
         client.come_to_rest()
         mark = client.observations.mark()
@@ -246,7 +246,8 @@ class CheckMeasurements:
         if self.support.parameters.get(names.SCAN_SPEED) is None:
             return None
         speed_m_s = 2.0 * frame.region.size_m[0] * frame.shape[0] / lasts_s
-        client.set(names.SCAN_SPEED, f"{speed_m_s:.4g}", "m/s")  # if that is refused, it lasts as long as it does
+        # may be refused: the scan then takes the controller's time
+        client.set(names.SCAN_SPEED, f"{speed_m_s:.4g}", "m/s")
         in_force_m_s = number(client.get(names.SCAN_SPEED), "m/s")
         expect(in_force_m_s > 0.0, "a scan-speed above zero", f"{in_force_m_s:g} m/s")
         return 2.0 * frame.region.size_m[0] * frame.shape[0] / in_force_m_s
@@ -254,11 +255,11 @@ class CheckMeasurements:
     # --- spectra ---
 
     def spectrum(self) -> Taken:
-        """A spectrum somewhere in the frame, taken now unless one was before."""
+        """Return a spectrum somewhere in the frame, taken now or earlier."""
         return self._once("spectrum", self._take_spectrum)
 
     def begin_spectrum(self) -> int:
-        """Begin one; where the observations was before it."""
+        """Start a spectrum; return the mark before it."""
         self.client.come_to_rest()
         return self._begin(names.START_SPEC, ScopeState.SPEC)
 
@@ -266,13 +267,13 @@ class CheckMeasurements:
         self.client.come_to_rest()
         if self.support.has(names.PROBE_POS_X, names.PROBE_POS_Y):
             self.move_probe(self.frames.other.region.center_m)
-        heard = self._measure(names.START_SPEC, ScopeState.SPEC, None)
-        if not spectra(heard):
-            raise Failed("a Spec1d between SS_SPEC and SS_FREE", told(heard))
-        return Taken(None, heard, None)
+        observed = self._measure(names.START_SPEC, ScopeState.SPEC, None)
+        if not spectra(observed):
+            raise Failed("a Spec1d between SS_SPEC and SS_FREE", describe_all(observed))
+        return Taken(None, observed, None)
 
     def move_probe(self, xy_m: tuple[float, float]) -> list[Observation]:
-        """Move the probe; what is published of it."""
+        """Move the probe; return the resulting publications."""
         self.client.come_to_rest()
         self._set_whole()
         mark = self.client.observations.mark()
@@ -280,10 +281,7 @@ class CheckMeasurements:
         return self.client.settled(mark)
 
     def _set_whole(self) -> None:
-        """Set the first frame, unless it is in force: a scan that failed leaves its own.
-
-        Some controllers move the probe within the scan frame only.
-        """
+        # a failed scan may have left another frame; some controllers move the probe within the scan frame only
         newest, whole = self.client.observations.newest(ScanParameters), self.frames.whole
         if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
             return
@@ -296,7 +294,7 @@ class CheckMeasurements:
     # --- both ---
 
     def act(self, action: str) -> None:
-        """Have it done. Some microscopes can't be asked what they support: this tells."""
+        """Run an action. Raises Skipped if it is unsupported, which some microscopes only report now."""
         response = self.client.ask(ControlRequest.ACTION, action)
         if response.code == ControlResponse.ACTION_NOT_SUPPORTED and self.support.actions.get(action) is None:
             self.support.actions[action] = False
@@ -329,13 +327,13 @@ class CheckMeasurements:
 
 
 def number(parameter: Parameter, unit: str = "") -> float:
-    """The value of a parameter in a unit, "" for its own.
+    """Return the value of a parameter in a unit, "" for its own.
 
     Raises:
-        Failed: it is none.
+        Failed: it is not a number.
     """
     try:
         found = float(str(parameter.value))
         return convert(found, parameter.unit or unit, unit) if unit else found
-    except ValueError as error:  # an AfspmError of units is one
+    except ValueError as error:  # an AfspmError of units is a ValueError
         raise Failed(f"a number in {unit or 'its unit'} as the value of {parameter.name}", str(error)) from error

@@ -1,10 +1,10 @@
-"""A pytest plugin: an experiment file that is given to pytest by name becomes a test for each check.
+"""A pytest plugin: an experiment file named on pytest's command line becomes a test for each check.
 
     pytest -p afspm.testing.translators.plugin experiment.toml [--overlay FILE] [--without-process NAME]
 
-Nothing loads it by itself: who has afspm installed and runs tests of their own is not disturbed by it. In the tests of
-a translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
-"experiment.toml"]`. The tip is taken to be withdrawn.
+It is not loaded automatically, so it does not disturb other tests in an environment with afspm. In the tests of a
+translator's package: `addopts = ["-p", "afspm.testing.translators.plugin"]` and `testpaths = ["tests",
+"experiment.toml"]`. The tip is assumed to be withdrawn.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collect_file(file_path: Path, parent: pytest.Collector) -> pytest.Collector | None:
-    """An experiment file that was named, and not any that lies about."""
+    """Collect an experiment file named on the command line, and no other TOML file."""
     if file_path.suffix == ".toml" and parent.session.isinitpath(file_path):
         return ExperimentFile.from_parent(parent, path=file_path)
     return None
@@ -100,7 +100,7 @@ class CheckItem(pytest.Item):
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Print what is supported and what is not."""
+    """Print the supported and unsupported operations."""
     from rich.console import Console
 
     from afspm.testing.translators.report import show_end

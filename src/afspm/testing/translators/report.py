@@ -21,7 +21,7 @@ class CheckReport(SuiteReport):
 
     Attributes:
         translator: its class or command.
-        unrestored: what could not be put back, a line each.
+        unrestored: settings that could not be restored, a line each.
     """
 
     translator: str = ""
@@ -30,7 +30,7 @@ class CheckReport(SuiteReport):
     unrestored: list[str] = field(default_factory=list)
 
     def describe(self, session: CheckSession) -> None:
-        """Note down the translator under test."""
+        """Record the facts about the translator under test."""
         self.translator, self.simulated = session.translator, session.simulated
         self.support, self.folder = session.support, str(session.folder)
 
@@ -50,25 +50,27 @@ class CheckReport(SuiteReport):
         }
 
     def _parameter(self, name: str) -> dict[str, object]:
-        told = self.support.parameters[name]
+        parameter = self.support.parameters[name]
         return {
             "name": name,
-            "supported": told is not None,
-            "value": None if told is None else told.value,
-            "unit": None if told is None else told.unit,
+            "supported": parameter is not None,
+            "value": None if parameter is None else parameter.value,
+            "unit": None if parameter is None else parameter.unit,
             "settable": self.support.settable.get(name),
         }
 
 
 def show_beginning(report: CheckReport, console: Console) -> None:
-    """Print what will be checked."""
-    told = report.support.controller or "its controller does not report its version"
+    """Print the translator under test."""
+    controller = report.support.controller or "its controller does not report its version"
     simulated = " SIMULATED" if report.simulated else ""
-    console.print(Text.assemble((report.translator, "bold"), f": {told}", (simulated, "bold yellow")), soft_wrap=True)
+    console.print(
+        Text.assemble((report.translator, "bold"), f": {controller}", (simulated, "bold yellow")), soft_wrap=True
+    )
 
 
 def show_end(report: CheckReport, console: Console) -> None:
-    """The tables, and what came of it all."""
+    """Print the tables and the verdict."""
     console.print(_actions(report))
     console.print(_parameters(report))
     for failure in report.failed:
@@ -88,8 +90,8 @@ def _actions(report: CheckReport) -> Table:
         table.add_column(column)
     for name, has in report.support.actions.items():
         of_base = "base" if name in names.BASE_ACTIONS else ""
-        said = {True: Text("yes", "green"), False: Text("no", "yellow"), None: Text("not reported", "yellow")}[has]
-        table.add_row(name, of_base, said)
+        supported = {True: Text("yes", "green"), False: Text("no", "yellow"), None: Text("not reported", "yellow")}[has]
+        table.add_row(name, of_base, supported)
     return table
 
 
@@ -97,11 +99,11 @@ def _parameters(report: CheckReport) -> Table:
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("parameter", "", "supported", "at the beginning"):
         table.add_column(column)
-    for name, told in report.support.parameters.items():
+    for name, parameter in report.support.parameters.items():
         of_base = "base" if name in names.BASE_PARAMETERS else ""
-        if told is None:
+        if parameter is None:
             table.add_row(name, of_base, Text("no", "yellow"), "")
             continue
         settable = {True: "yes, set", False: "yes, read-only", None: "yes"}[report.support.settable.get(name)]
-        table.add_row(name, of_base, Text(settable, "green"), f"{told.value} {told.unit or ''}".rstrip())
+        table.add_row(name, of_base, Text(settable, "green"), f"{parameter.value} {parameter.unit or ''}".rstrip())
     return table

@@ -1,4 +1,4 @@
-"""The run of all checks: one after the other, and then every setting is put back."""
+"""Runs all checks in order, then restores every setting."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from afspm.testing.translators.support import Support
 from afspm.testing.translators.translator_suite import TRANSLATOR_SUITE
 
 _LAST = (names.SCAN_SPEED, names.MOVE_SPEED)
-"""A frame may change them."""
+"""Restored last, since a change of the frame may change them."""
 
 
 @dataclass(frozen=True)
 class SettingsBefore:
-    """The settings that were in force before the checks."""
+    """The settings in force before the checks."""
 
     frame: ScanParameters | None
     feedback: Feedback | None
@@ -31,7 +31,7 @@ class SettingsBefore:
 
     @classmethod
     def of(cls, client: CheckClient, support: Support) -> SettingsBefore:
-        """As it was told when the checks began."""
+        """Return the settings published when the checks began."""
         return cls(
             client.observations.newest(ScanParameters),
             client.observations.newest(Feedback),
@@ -41,10 +41,10 @@ class SettingsBefore:
         )
 
     def restore(self, client: CheckClient) -> list[str]:
-        """Stop what runs, and put everything back.
+        """Stop any activity, and restore all settings.
 
         Returns:
-            what could not be, a line each.
+            the failures, a line each.
         """
         wrong: list[str] = []
         try:
@@ -54,12 +54,13 @@ class SettingsBefore:
             ordered = sorted(self.parameters, key=lambda name: name in _LAST)
             for name in ordered:
                 self._put_back(client, name, wrong)
+        # listed in the report instead of raised: the results of the checks must not get lost
         except (Lost, Failed) as error:
             wrong.append(str(error))
         return wrong
 
     def _put_back_together(self, client: CheckClient, wrong: list[str]) -> None:
-        """Set together what is published together, or it would pass through states that can't be."""
+        # settings of one packet are restored in one request: one by one, they would pass through invalid combinations
         observations = client.observations
         settings = (
             (ControlRequest.SET_SCAN_PARAMS, observations.newest(ScanParameters), self.frame, self._frame()),
@@ -80,7 +81,6 @@ class SettingsBefore:
                 client.settled(mark)
 
     def _frame(self) -> ScanParameters | None:
-        """Return the request for the first frame, without the angle where there is none."""
         before = self.frame
         if before is not None and isinstance(before.region, Region) and isinstance(before.shape, tuple):
             return FrameSetting(before.region, before.shape).request(self.support)
@@ -99,7 +99,7 @@ class SettingsBefore:
 
 
 def _changed(before: Feedback | None, now: Feedback | None) -> Feedback:
-    """Return the fields to put back: some may only be read."""
+    # only changed fields: some are read-only
     fields = {} if before is None else vars(before)
     return Feedback(**{name: value for name, value in fields.items() if now is None or value != getattr(now, name)})
 
@@ -115,7 +115,7 @@ def _same(before: Parameter, now: Parameter) -> bool:
 
 @contextmanager
 def restored(session: CheckSession, report: CheckReport) -> Iterator[CheckMeasurements]:
-    """Put back at the end of the block, however it ends, the settings of its beginning."""
+    """Restore the settings at the end of the block, however it ends."""
     kit = CheckMeasurements(
         session.client, session.support, session.options.frame_m, excused=session.excused, complaints=session.complaints
     )
@@ -131,14 +131,14 @@ def run(
     begun: Callable[[CheckReport], None] = lambda report: None,
     done: Callable[[CheckResult], None] = lambda result: None,
 ) -> CheckReport:
-    """Do all checks that are chosen, restore, and write `report.json` into the run's folder.
+    """Run the selected checks, restore the settings, and write `report.json` into the run's folder.
 
     Args:
-        begun: gets the report before the first check, `done` each result.
+        begun: called with the report before the first check, `done` with each result.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
-        KeyboardInterrupt: after everything was put back, and the report of what was done was written.
+        KeyboardInterrupt: after all settings were restored and the report of finished checks was written.
     """
     checks = TRANSLATOR_SUITE.checks(options.only)
     report = CheckReport()
@@ -147,5 +147,6 @@ def run(
         begun(report)
         with restored(session, report) as kit:
             report.run(checks, kit, done)
+            # after the scans, since some controllers report their version in their files only
             session.support.ask_again(session.client)
     return report

@@ -38,7 +38,7 @@ from afspm.transport.zmq_port import open_port
 
 NAME = "translator_test"
 SPEED = 20.0
-"""Experiment seconds in a real second where the microscope is simulated: quick, and slow enough to stop a scan."""
+"""Experiment seconds in a real second of a simulated microscope: quick, but slow enough to stop a scan."""
 _OVERLAY = f"""
 [{NAME}]
 component = true
@@ -52,7 +52,7 @@ class = "Scheduler"
 
 
 class Tester(Component):
-    """Whom the checks are in the experiment. It is wired like any other component, and not started as one."""
+    """The component of the checks in the experiment: wired like any other, but not started as a process."""
 
 
 @dataclass(frozen=True)
@@ -60,13 +60,12 @@ class CheckOptions:
     """The options of a pass.
 
     Attributes:
-        files: the experiment file, and those laid over it.
-        without: processes that run already, at the addresses that the file gives, and are joined.
+        files: the experiment file, and its overlays.
+        without: processes that run already, at the addresses in the file, and are joined.
         runs: the folder of run folders.
         speed: of the clock of a simulated microscope; experiment seconds in a real second.
-        only: parts of the names of the checks to do; empty: all.
-        frame_m: the side of the square, about the centre of the frame that is set, that nothing is done outside of;
-            None: the frame that is set.
+        only: parts of the names of the checks; empty: all.
+        frame_m: the side of a square about the centre of the set frame, never left by checks; None: the set frame.
     """
 
     files: Sequence[Path]
@@ -79,14 +78,14 @@ class CheckOptions:
 
 @dataclass
 class CheckSession:
-    """The translator to check, and the connection to it.
+    """The translator under test, and the connection to it.
 
     Attributes:
-        support: what the microscope has.
-        translator: its class or command; maker: of its controller, if the driver says.
+        support: the supported actions and parameters.
+        translator: its class or command; maker: of its controller, if the driver names it.
         folder: of this run.
         excused: checks that this controller can't pass, with the reason.
-        complaints: the warnings and errors that were logged; it grows.
+        complaints: the logged warnings and errors; it grows.
         program_s: real seconds that the controller's program may need beside measuring; see `Driver.program_s`.
     """
 
@@ -103,7 +102,7 @@ class CheckSession:
 
 
 def prepare(options: CheckOptions) -> Experiment:
-    """The experiment with the tester in it, and a scheduler if it had none.
+    """Return the experiment with the tester in it, and with a scheduler if it had none.
 
     Raises:
         ConfigError: it can't be run, or is in sample coordinates.
@@ -127,7 +126,7 @@ def prepare(options: CheckOptions) -> Experiment:
 
 @contextmanager
 def opened(options: CheckOptions) -> Iterator[CheckSession]:
-    """Start, or join, what is to be checked; in control of the microscope while in the block.
+    """Start, or join, the program under test; hold control of the microscope in the block.
 
     Raises:
         ConfigError: the experiment file or the options are wrong; nothing was started.
@@ -155,7 +154,7 @@ def opened(options: CheckOptions) -> Iterator[CheckSession]:
 
 @contextmanager
 def _interrupting(client: CheckClient) -> Iterator[None]:
-    """Ctrl-C interrupts the client, where signals come to this thread at all."""
+    # only the main thread receives signals
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -169,11 +168,10 @@ def _interrupting(client: CheckClient) -> Iterator[None]:
 def _client(
     experiment: Experiment, options: CheckOptions, stack: ExitStack, complaints: list[str]
 ) -> tuple[CheckClient, Path, bool]:
-    """Start what is to be started; in control, the run's folder, and whether it is simulated. `stack` ends it all."""
-    common = _common(experiment, options)
+    common = _run_identity(experiment, options)
     clock = common.clock
     folder = run_folder.create(options.runs, f"test-{experiment.name}", _now())
-    own, starts = _starts(experiment, options, common, folder)
+    own, starts = _planned_starts(experiment, options, common, folder)
     require_free(addresses_of(starts))
     log = RunLog(folder / run_folder.LOG_FILE, clock, level=_NOTHING, names=[start.launch.name for start in starts])
     stack.callback(log.close)
@@ -205,10 +203,9 @@ def _client(
 _NOTHING = logging.CRITICAL + 1
 
 
-def _starts(
+def _planned_starts(
     experiment: Experiment, options: CheckOptions, common: RunIdentity, folder: Path
 ) -> tuple[Launch, list[ProcessStart]]:
-    """The tester's own launch line, and what is to be started."""
     starts = experiment.launches(
         take_address=FreePorts().address,
         without=_left_out(experiment, options),
@@ -220,11 +217,11 @@ def _starts(
         log_level="DEBUG",
     )
     own = next(start.launch for start in starts if start.launch.name == NAME)
+    # the tester runs in this process
     return own, [start for start in starts if start.launch.name != NAME]
 
 
 def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
-    """Return the parts not to start: all but translator, scheduler and emulated controller, and what runs already."""
     resolved = experiment.resolved
     wanted = {part.name for role in (Role.TRANSLATOR, Role.SCHEDULER) for part in resolved.with_role(role)}
     wanted |= {*resolved.emulators, NAME}
@@ -232,7 +229,6 @@ def _left_out(experiment: Experiment, options: CheckOptions) -> list[str]:
 
 
 def _translator_address(experiment: Experiment, starts: Sequence[ProcessStart]) -> str | None:
-    """Where the scheduler asks the translator; None: nobody says."""
     for start in starts:
         if start.role is Role.SCHEDULER:
             return start.launch.sockets.control
@@ -260,12 +256,12 @@ def _link(port: Port, own: Launch, log: logging.Logger) -> ExperimentLink:
 
 
 def is_simulated(experiment: Experiment, options: CheckOptions) -> bool:
-    """True if what is started here is simulated for certain."""
+    """Return whether the started microscope is certainly simulated."""
     return experiment.simulated(without=_left_out(experiment, options))
 
 
-def _common(experiment: Experiment, options: CheckOptions) -> RunIdentity:
-    """The scheduler's, where that runs already; else our own."""
+def _run_identity(experiment: Experiment, options: CheckOptions) -> RunIdentity:
+    # a scheduler that runs already determines clock and run
     simulated = is_simulated(experiment, options)
     schedulers = {part.name for part in experiment.resolved.with_role(Role.SCHEDULER)}
     launch = experiment.asking([NAME]) if schedulers <= set(options.without) else None
@@ -281,7 +277,6 @@ def _now() -> datetime:
 
 
 def _logger(log: RunLog) -> logging.Logger:
-    """Return a logger that writes what the connection says into the run's log."""
     logger = logging.Logger("afspm.translator_test")
 
     class Writing(logging.Handler):

@@ -1,4 +1,4 @@
-"""The generic actions and parameters that a microscope supports, asked over the wire."""
+"""The generic actions and parameters that a microscope supports, requested over the wire."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class Support:
     """The supported actions and parameters, by generic name.
 
     Attributes:
-        actions: whether it is supported; None if the microscope does not say.
-        parameters: the value in force at the beginning; None if it is not supported.
-        errors: what was wrong with the answers.
-        settable: what the checks have found out; None: not tried.
+        actions: whether each is supported; None if the microscope does not report it.
+        parameters: the value at the beginning; None if it is not supported.
+        errors: errors in the answers.
+        settable: results of the checks; None if not tried.
     """
 
     actions: dict[str, bool | None] = field(default_factory=dict)
@@ -30,28 +30,28 @@ class Support:
     settable: dict[str, bool | None] = field(default_factory=dict)
 
     def ask_again(self, client: CheckClient) -> None:
-        """For the controller's version: some tell it by their files alone."""
+        """Read the controller's version again: some controllers report it in their files only."""
         if self.parameters.get(names.CONTROLLER) is not None:
             self.parameters[names.CONTROLLER] = _value(client, names.CONTROLLER, self.errors)
 
     def missing(self, needs: Iterable[str]) -> list[str]:
-        """Those of `needs` that the microscope does not have."""
+        """Return the names in `needs` that the microscope does not support."""
         known = {**self.parameters, **{name: has or has is None for name, has in self.actions.items()}}
         return [name for name in needs if not known.get(name)]
 
     def has(self, *wanted: str) -> bool:
-        """True if the microscope has all of these."""
+        """Return whether the microscope supports all of these."""
         return not self.missing(wanted)
 
     @property
     def controller(self) -> str:
-        """The controller's name and version, as it says."""
-        told = self.parameters.get(names.CONTROLLER)
-        return "" if told is None else str(told.value)
+        """The controller's name and version, as reported."""
+        reported = self.parameters.get(names.CONTROLLER)
+        return "" if reported is None else str(reported.value)
 
 
 def find_out(client: CheckClient, actions: Iterable[str] = (), parameters: Iterable[str] = ()) -> Support:
-    """Ask for all generic names, and those of the microscope's own."""
+    """Query all generic names, and the microscope's own."""
     found = Support()
     for name in dict.fromkeys((*ACTIONS, *actions)):
         found.actions[name] = _has_action(client, name, found.errors)

@@ -19,7 +19,7 @@ class Acme(Driver):
 
     Args:
         address: of the controller.
-        settings: as of every microscope.
+        settings: common to all drivers.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")

@@ -41,7 +41,7 @@ def read_acme(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
-    """Return the version in a NetCDF file of the maker's older program, which other makers' files may be, too."""
+    """Return the version in a NetCDF file of the maker's older program; other makers use this format, too."""
     about = netcdf.read(path).attributes
     if about.get("program") != "Acme":
         raise OtherFormat("Acme did not write it")

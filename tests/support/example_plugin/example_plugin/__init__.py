@@ -1,1 +1,1 @@
-"""A laboratory's own package, which joins afspm by being installed."""
+"""A laboratory's own package, which extends afspm once it is installed."""

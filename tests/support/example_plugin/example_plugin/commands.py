@@ -6,5 +6,5 @@ import typer
 
 
 def hello(name: str = "everybody") -> None:
-    """Greet somebody."""
+    """Print a greeting."""
     typer.echo(f"hello {name}")

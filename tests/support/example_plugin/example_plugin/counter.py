@@ -1,4 +1,4 @@
-"""A component that counts scans, and ends the experiment after some."""
+"""A component that counts scans, and ends the experiment after a number of them."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from afspm import Component, Scan
 
 
 class ExampleCounter(Component):
-    """Ends the experiment after some scans.
+    """Ends the experiment after a number of scans.
 
     Args:
-        scans: how many channels it waits for.
+        scans: the number of channels to wait for.
     """
 
     listens: ClassVar = ("Scan2d",)

@@ -8,7 +8,7 @@ from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 
 
 class Standstill:
-    """Finds that nothing moved, to within a nanometre."""
+    """Reports no movement, to within a nanometre."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """Return a displacement of zero at the middle of the reference."""

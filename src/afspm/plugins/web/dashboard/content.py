@@ -126,7 +126,7 @@ class Contents:
             )
 
     def _draw(self, overview: Overview, silent: Mapping[str, int]) -> SlowContent:
-        parameters = overview.scan_parameters
+        parameters = overview.readings.scan_parameters
         newest = overview.scans[-1] if overview.scans else None
         content = MapContent(
             overview.scans,
@@ -134,7 +134,7 @@ class Contents:
             parameters.region if parameters and isinstance(parameters.region, Region) else None,
             self._limits,
             self._watch.tip_to_sample,
-            overview.probe_position.xy_m if overview.probe_position else None,
+            overview.readings.probe_position.xy_m if overview.readings.probe_position else None,
             newest.time_ns if newest else None,
             overview.targets,
             self._pictures,
@@ -174,7 +174,7 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
     running = [state.name for state in overview.processes.values() if state.condition not in OVER]
-    return {name: ns for name in running if (ns := overview.unheard_ns(name, speed)) is not None}
+    return {name: ns for name in running if (ns := overview.silent_ns(name, speed)) is not None}
 
 
 def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
@@ -206,19 +206,21 @@ def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = T
     Args:
         unfolded: a row for each process; else one for all that have not failed.
     """
-    yield TimelineRow("control", overview.controls.spans, tint_class)
+    yield TimelineRow("control", overview.timelines.control.spans, tint_class)
     if overview.notes:
         yield TimelineRow("notes", overview.note_spans, lambda _: "marked")
-    yield TimelineRow("mode", overview.modes.spans, lambda label: f"mode-{label}")
-    yield TimelineRow("microscope", overview.states.spans, lambda label: f"state-{label.replace('_', '-')}")
-    for number, lane in sorted(overview.problem_timelines.items()):
+    yield TimelineRow("mode", overview.timelines.mode.spans, lambda label: f"mode-{label}")
+    yield TimelineRow(
+        "microscope", overview.timelines.scope_state.spans, lambda label: f"state-{label.replace('_', '-')}"
+    )
+    for number, lane in sorted(overview.timelines.problems.items()):
         if lane.spans:
             is_routine = all(map(overview.is_routine, lane.spans))
             style = (lambda _: "marked") if is_routine else (lambda _: "problem")
             yield TimelineRow(overview.problems.name(number), lane.spans, style)
     rows = {
-        name: tuple(_until_told(lane, overview.processes_told_ns[name]) if name in silent else lane.spans)
-        for name, lane in overview.process_timelines.items()
+        name: tuple(_until_told(lane, overview.process_history.reported_ns[name]) if name in silent else lane.spans)
+        for name, lane in overview.process_history.timelines.items()
     }
     fine = [] if unfolded else [name for name, spans in rows.items() if not _has_failed(spans)]
     for name, spans in rows.items():
@@ -276,7 +278,7 @@ def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     done = overview.scan_progress(now_ns)
     far = "" if done is None else f" {100 * done[0]:.0f} %<small>ends {time_of_day(now_ns + done[1])}</small>"
     yield _chip(f"microscope {state}{paused}{far}", "state", f"state-{state.replace(' ', '-')}")
-    if overview.feedback is not None and overview.feedback.on is False:
+    if overview.readings.feedback is not None and overview.readings.feedback.on is False:
         yield _chip("FEEDBACK OFF", "feedback", "problem")
 
 

@@ -32,7 +32,7 @@ def flags(overview: Overview) -> Iterator[Flag]:
     """Yield the problems that are flagged now."""
     control = overview.control
     for number in control.problems if control else ():
-        now = overview.problem_timelines[number].now if number in overview.problem_timelines else None
+        now = overview.timelines.problems[number].now if number in overview.timelines.problems else None
         name, by, since_ns = overview.problems.name(number), now.by if now else "", now.start_ns if now else None
         advice = f"{ROUTINE}." if overview.is_routine(now) else advice_for(number, control) if control else ""
         yield Flag(number, name, by, since_ns, advice)

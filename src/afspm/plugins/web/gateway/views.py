@@ -41,7 +41,8 @@ def region_model(region: Region) -> RegionModel:
 
 def microscope(overview: Overview) -> MicroscopeModel:
     """Return what the microscope does."""
-    parameters, probe, feedback = overview.scan_parameters, overview.probe_position, overview.feedback
+    readings = overview.readings
+    parameters, probe, feedback = readings.scan_parameters, readings.probe_position, readings.feedback
     region = None if parameters is None or not isinstance(parameters.region, Region) else parameters.region
     shape = None if parameters is None or not isinstance(parameters.shape, tuple) else parameters.shape
     return MicroscopeModel.model_construct(

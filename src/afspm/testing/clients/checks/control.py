@@ -1,4 +1,4 @@
-"""Losing control, to a person and to a problem, and processes that are killed on the way."""
+"""Loss of control to a person or a problem, and processes killed meanwhile."""
 
 from __future__ import annotations
 
@@ -19,19 +19,18 @@ _LONG = (256, 64)
 
 
 def _require_state(experiment: JudgedExperiment, program: ClientProgram, **right: object) -> None:
-    """Raise Failed unless the client soon holds this to be true."""
-    told: Answer = Answer()
+    state: Answer = Answer()
 
     def is_known() -> bool:
-        nonlocal told
-        told = program.succeed("state")
-        return all(told.get(name) == value for name, value in right.items())
+        nonlocal state
+        state = program.succeed("state")
+        return all(state.get(name) == value for name, value in right.items())
 
     until_s = experiment.clock.monotonic_s() + KNOWN_S
     while not is_known() and experiment.clock.monotonic_s() < until_s:
         experiment.pump(lambda: False, 0.05)
     words = ", ".join(f"{name} = {value!r}" for name, value in right.items())
-    expect(is_known(), f"the client to know that {words}", str(told))
+    expect(is_known(), f"the client to know that {words}", str(state))
 
 
 @client_check(
@@ -90,7 +89,6 @@ def problem(bench: ClientBench) -> None:
 
 
 def _interrupted(bench: ClientBench, disturb: Callable[[JudgedExperiment, ClientProgram], None]) -> Answer:
-    """Have the client take a scan that is disturbed in the middle; return the answer."""
     experiment = bench.experiment
     asked = scan_step(_LONG)
     with bench.client(experiment) as client:
@@ -108,7 +106,7 @@ def _interrupted(bench: ClientBench, disturb: Callable[[JudgedExperiment, Client
 @client_check(
     "control/repair",
     "A scan that loses control to a tip repair is taken again when that is done.",
-    "Wait until no problem is set and nobody is in control, ask for control, set the frame again, start again.",
+    "Wait until no problem is set and the microscope is free, ask for control, set the frame again, start again.",
 )
 def repair(bench: ClientBench) -> None:
     def mend(experiment: JudgedExperiment, program: ClientProgram) -> None:
@@ -140,7 +138,7 @@ def scheduler_killed(bench: ClientBench) -> None:
 @client_check(
     "faults/translator",
     "The same with the translator.",
-    "`REP_FAILURE` or `REP_NO_RESPONSE` with the detail 1 or 2 while it is away: wait for `SS_FREE`, and begin anew.",
+    "`REP_FAILURE` or `REP_NO_RESPONSE` with the detail 1 or 2 while it is away: wait for `SS_FREE`, and start again.",
 )
 def translator_killed(bench: ClientBench) -> None:
     _interrupted(bench, lambda experiment, program: experiment.restart(TRANSLATOR))

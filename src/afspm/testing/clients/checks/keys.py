@@ -1,4 +1,4 @@
-"""Encryption: what has not the right key is not spoken to, and does not get in."""
+"""Encryption: a peer without the right key gets no answer and no access."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def wrong_key(bench: ClientBench) -> None:
 
 @client_check(
     "keys/impostor",
-    "Whoever else listens at the scheduler's address, without its key, is sent nothing.",
+    "Another program that listens at the scheduler's address, without its key, receives nothing.",
     "Set the server key of the address's owner before you connect.",
 )
 def impostor(bench: ClientBench) -> None:
@@ -47,12 +47,12 @@ def impostor(bench: ClientBench) -> None:
 
 def _require_silence(run: ScriptedRun, which: str) -> None:
     run.client.begin("request", number=7)
-    # a busy computer may take longer to start a program than silence is listened to
+    # on a busy computer the start of a program may take longer than the wait for silence
     has_come = run.scheduler.pump(lambda: run.scheduler.connections > 0, ANSWER_S)
     expect(has_come, "a connection to the scheduler's address", f"none in {ANSWER_S:g} s{run.client.last_words}")
     run.scheduler.serve(_LISTENED_S)
-    heard = [*run.scheduler.requests, *run.scheduler.greetings, *run.scheduler.prefixes, *run.scheduler.markers]
-    expect(not heard, f"silence towards a scheduler with {which}", f"{len(heard)} messages")
+    received = [*run.scheduler.requests, *run.scheduler.greetings, *run.scheduler.prefixes, *run.scheduler.markers]
+    expect(not received, f"silence towards a scheduler with {which}", f"{len(received)} messages")
 
 
 @client_check(

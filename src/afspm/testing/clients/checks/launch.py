@@ -1,4 +1,4 @@
-"""Checks of how the program begins, shows that it is alive, and ends."""
+"""Checks of the program's start, heartbeats and end."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from afspm.testing.conformance import expect
 from afspm.wire import BEAT, KILL
 
 ENDED_S = 4.0
-"""Twice what the page gives a program: the computer may be busy."""
+"""Twice the documented limit, for a busy computer."""
 _WATCHED_S = 5.0
 _MOST_BEATS_APART = 4.0
-"""Periods: three missed ones count as dead, and the computer may be busy."""
+"""In periods: three missed beats count as dead; one more for a busy computer."""
 
 
 def await_beat(beats: BeatRecorder, pump: Pump) -> None:
-    """Wait for the first beat: only then it is sure that the last one would be heard, too."""
+    """Wait for the first beat; from then on the last one can't be missed."""
     pump(lambda: bool(beats.beats), _MOST_BEATS_APART * BEAT_S)
 
 
 def require_beats(beats: BeatRecorder, since_s: float) -> None:
-    """Raise Failed if the heartbeats have not been regular since then."""
+    """Raise Failed if heartbeats have been irregular since `since_s`."""
     pause_s = beats.longest_pause_s(since_s)
     expect(pause_s <= _MOST_BEATS_APART * BEAT_S, f"a beat every {BEAT_S} s", f"a pause of {pause_s:.1f} s")
 
 
 def require_exit(program: ClientProgram, codes: tuple[int, ...]) -> None:
-    """Raise Failed unless the program ends in time, with one of these exit codes."""
     ended = program.wait_ended(ENDED_S)
     wanted = " or ".join(str(int(code)) for code in codes)
     expect(ended, f"the end of the program within {ENDED_S:.0f} s", f"a program that goes on{program.last_words}")
@@ -78,7 +77,7 @@ def stdin(bench: ClientBench) -> None:
         await_beat(run.beats, run.scheduler.pump)
         run.client.close_stdin()
         require_end(run.client, run.beats, run.scheduler.pump, (ExitCode.DONE, ExitCode.ORPHAN))
-    with bench.scripted(ready=False) as run:  # without a scheduler, too
+    with bench.scripted(ready=False) as run:  # it must also end before it is connected
         run.scheduler.shut()
         run.scheduler.open()
         run.client.close_stdin()

@@ -16,7 +16,7 @@ from afspm.testing.conformance import Failed, expect, near
 
 SCAN_S = 120.0
 CHANNELS = 2
-"""The least that the simulated microscope records."""
+"""The smallest number of channels of the simulated microscope."""
 
 
 def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s: float = SCAN_S) -> Plain:
@@ -31,7 +31,7 @@ def scan_step(shape: Sequence[int] = (16, 32), angle_deg: float = 0.0, timeout_s
 
 
 def require_scans(experiment: JudgedExperiment, answer: Answer, asked: Plain) -> None:
-    """Raise Failed unless an answer has what was published of the scan that was asked for."""
+    """Raise Failed unless an answer contains the published channels of the requested scan."""
     expect(answer.ok, "the scan to be taken", str(answer))
     scans = answer.get("scans")
     if not isinstance(scans, list):
@@ -47,19 +47,19 @@ def require_scans(experiment: JudgedExperiment, answer: Answer, asked: Plain) ->
         expect(near(scan["angle_deg"], asked["angle_deg"], 1e-3, 1e-3), f"{asked['angle_deg']}°", scan["angle_deg"])
 
 
-def _require_published(experiment: JudgedExperiment, message: str, told: dict[str, object]) -> None:
-    """Raise Failed unless exactly this was published. A client need not tell which packet its own measurement was."""
-    told = {"message": message, **told}
+def _require_published(experiment: JudgedExperiment, message: str, reported: dict[str, object]) -> None:
+    # a client need not report which packet was its own measurement, so the fields are compared
+    reported = {"message": message, **reported}
     wrong: list[Failed] = []
 
     def is_there() -> bool:
         wrong.clear()
         for packet in experiment.packets(message):
             of_packet = {"envelope": packet.envelope, "timestamp_ns": packet.time_ns}
-            if any(told.get(name, value) not in (value, None) for name, value in of_packet.items()):
+            if any(reported.get(name, value) not in (value, None) for name, value in of_packet.items()):
                 continue
             try:
-                compare({**told, **of_packet}, packet)
+                compare({**reported, **of_packet}, packet)
             except Failed as failure:
                 wrong.append(failure)
             else:
@@ -67,7 +67,7 @@ def _require_published(experiment: JudgedExperiment, message: str, told: dict[st
         return False
 
     if not experiment.pump(is_there, 5.0):
-        raise wrong[-1] if wrong else Failed(f"a {message} that was published", str(told))
+        raise wrong[-1] if wrong else Failed(f"a {message} that was published", str(reported))
 
 
 @client_check(
@@ -95,7 +95,7 @@ def _require_value(answer: Answer, name: str, right: str) -> None:
     dimension = right.split()[1].removeprefix("m") if "/" not in right else "m/s"
     try:
         came = si(text, dimension)
-    except Exception as error:
+    except Exception as error:  # the answer is a client's and may be anything: any error means a wrong answer
         raise Failed(f"{name} = {right}", f"{answer} ({error})") from error
     expect(near(came, si(right, dimension)), f"{name} = {right}", str(answer))
 
@@ -132,11 +132,13 @@ def spectrum(bench: ClientBench) -> None:
         for position in ([0.1e-6, 0.2e-6], [-0.3e-6, 0.0]):
             answer = client.program.do("spectrum", position_m=position, kind="IV", timeout_s=SCAN_S)
             expect(answer.ok and answer.get("spectra"), "a spectrum", str(answer))
-            for told in answer["spectra"]:
-                _require_published(experiment, "Spec1d", told)
-                came = told["position_m"]
+            for reported in answer["spectra"]:
+                _require_published(experiment, "Spec1d", reported)
+                came = reported["position_m"]
                 right = all(near(a, b, 1e-3, 1e-10) for a, b in zip(came, position, strict=True))
-                expect(right and told["kind"] == "IV", f"an IV curve at {position}", f"{told['kind']} at {came}")
+                expect(
+                    right and reported["kind"] == "IV", f"an IV curve at {position}", f"{reported['kind']} at {came}"
+                )
 
 
 @client_check(

@@ -1,4 +1,4 @@
-"""Late joining: what was published before is asked for and arrives once."""
+"""Late joining: earlier packets are requested and arrive once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def _notes(*numbers: int) -> list[list[bytes]]:
 
 
 def _times(run: ScriptedRun, count: int) -> list[int]:
-    """Return the number, of `_notes`, of each note that the client has."""
     answers = [run.client.succeed("wait", prefix="Note", timeout_s=_PACKET_S) for _ in range(count)]
     return [(int(answer.get("timestamp_ns") or 0) - _FIRST_NS) // 1_000_000 for answer in answers]
 
@@ -59,8 +58,8 @@ def marker(bench: ClientBench) -> None:
 @client_check(
     "replay/late-joiner",
     "What was published before the client came arrives once, oldest first, only what it asked for, "
-    "and nobody else gets it again.",
-    "Deliver the packets under your marker's topic before those that follow; compare envelopes with your prefixes.",
+    "and no other subscriber gets it again.",
+    "Deliver the packets under your marker's topic before the following ones; compare envelopes with your prefixes.",
 )
 def late_joiner(bench: ClientBench) -> None:
     with bench.scripted(ready=False, envelopes=("Note",)) as run:
@@ -75,7 +74,6 @@ def late_joiner(bench: ClientBench) -> None:
 
 
 def _in_an_experiment(bench: ClientBench, experiment: JudgedExperiment) -> None:
-    """A real scheduler replays its notes, and a plain subscriber hears none of it again."""
     for number in range(3):
         experiment.scope.note(f"late joining {number}")
     network = Network.from_launch("judge", dict(experiment.launch.keys or {}) or None)
@@ -121,9 +119,8 @@ def second_publisher(bench: ClientBench) -> None:
 
 @client_check(
     "replay/reconnect",
-    "After a connection is lost the client asks for what is newer than the newest that it has, "
-    "and delivers nothing twice.",
-    "Send a new marker after each connect, with the newest time in it; drop what is not newer than the last of its "
+    "After a lost connection the client requests packets newer than its newest one, and delivers none twice.",
+    "Send a new marker after each connect, with the newest time in it; drop packets not newer than the last of their "
     "envelope.",
 )
 def reconnect(bench: ClientBench) -> None:
@@ -139,7 +136,7 @@ def reconnect(bench: ClientBench) -> None:
         again = scheduler.pump(lambda: len(scheduler.markers) > 1, 10.0)
         expect(again, "a new marker after the connection was lost", "none in 10 s")
         since_ns, newest_ns = scheduler.markers[-1].since_ns, _FIRST_NS + 2_000_000
-        expect(since_ns == newest_ns, f"a marker that asks for what is newer than {newest_ns}", f"since {since_ns}")
+        expect(since_ns == newest_ns, f"a marker that requests packets newer than {newest_ns}", f"since {since_ns}")
         scheduler.publish(*_notes(4)[0])
         came = _times(run, 2)
         expect(came == [3, 4], "the packets 3, which was missed, and 4", str(came))

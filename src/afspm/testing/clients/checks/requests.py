@@ -1,4 +1,4 @@
-"""Requests: ids, repetition, answers that get lost, and refusals."""
+"""Requests: ids, repetition, lost answers, and refusals."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from afspm.wire import decode, encode, encode_subject
 REQUESTS = 1000
 _AT_A_TIME = 16
 _LONGEST = 12
-"""Chunks with replies: so many a connection delivers at most, before it is cut."""
+"""The most chunks with replies that a connection delivers before it is cut."""
 _TRY_S, _RETRIES = 0.3, 3
 _CUT_RETRIES = 100
-"""For 30 s: a scheduler that a busy computer gives no processor for 6 s is not the client's fault."""
+"""Retries for 30 s: on a busy computer the scheduler may get no processor for 6 s."""
 _ALL_S = 300.0
 _SEEN_S = 10.0
 _LOGGED_S = 60.0
-"""Of thousands of entries on a busy computer; a count of a part of them would be the client's fault."""
+"""Longest wait for thousands of log entries on a busy computer; an incomplete count would blame the client."""
 _PARAMETER = "scan-speed"
 
 
@@ -39,8 +39,8 @@ def repeat(bench: ClientBench) -> None:
     with bench.scripted(request_timeout_s=_TRY_S, request_retries=_RETRIES) as run:
         run.scheduler.reply = lambda request: []
         answer = ask(run, ControlRequest.RELEASE_CTRL)
-        told = (answer.get("response"), answer.get("detail"))
-        expect(told == ("REP_NO_RESPONSE", 2), "REP_NO_RESPONSE with the detail 2", str(answer))
+        reply = (answer.get("response"), answer.get("detail"))
+        expect(reply == ("REP_NO_RESPONSE", 2), "REP_NO_RESPONSE with the detail 2", str(answer))
         ids = [request.id for request in run.scheduler.requests]
         expect(len(set(ids)) == 1, "repetitions with the id of the first", f"the ids {sorted(set(ids))}")
         right = f"the request and {_RETRIES} repetitions, and perhaps some after a new connection"
@@ -71,38 +71,35 @@ def other_answers(bench: ClientBench) -> None:
 
 
 def _note(experiment: JudgedExperiment, text: str) -> str:
-    """Return the object of the request that publishes a note, which shows that it was executed."""
     now_ns = experiment.clock.now_ns()
     note = Note(now_ns, "client", text, None, now_ns)
     return in_base64(encode_subject(RelayedMessage(*encode(note))))
 
 
 def begin_read(client: ClientProgram) -> int:
-    """Have the client ask for a parameter; return the step's id."""
+    """Start the client's request for a parameter; return the step's id."""
     asked = encode_subject(Parameter(_PARAMETER))
     return client.begin("request", number=ControlRequest.PARAM, object=in_base64(asked))
 
 
 def begin_note(experiment: JudgedExperiment, client: ClientProgram, text: str) -> int:
-    """Have the client publish a note; return the step's id."""
+    """Start the client's publication of a note; return the step's id."""
     return client.begin("request", number=RELAY_REQUEST, object=_note(experiment, text))
 
 
 def published(experiment: JudgedExperiment) -> Counter[str]:
-    """Return how often each note has been published."""
+    """Count the publications of each note."""
     notes = [decode("Note", packet.payload) for packet in experiment.packets("Note")]
     return Counter(note.text for note in notes)
 
 
 def _executed(experiment: JudgedExperiment) -> int:
-    """Return how many reads of a parameter the scheduler has executed for the client, by its log of requests."""
-
     def logged(who: str) -> int:
         logs = [decode("JournalEntries", packet.payload) for packet in experiment.packets("JournalEntries")]
         return sum((entry.who, entry.request) == (who, ControlRequest.PARAM) for log in logs for entry in log.entries)
 
     known = logged(JUDGE)
-    experiment.scope.get(_PARAMETER)  # the log is in order: once this is in it, all before it is
+    experiment.scope.get(_PARAMETER)  # the log is in order: with this entry, all earlier ones are in it
     if not experiment.pump(lambda: logged(JUDGE) > known, _LOGGED_S):
         raise Lost(f"the scheduler's log of requests did not come within {_LOGGED_S:g} s")
     return logged(CLIENT)
@@ -183,7 +180,7 @@ def refusals(bench: ClientBench) -> None:
             ),
         ]
         for answer, response in refused:
-            told = answer.get("response")
-            expect(not answer.ok and told == response, f"the refusal {response}", str(answer))
+            reply = answer.get("response")
+            expect(not answer.ok and reply == response, f"the refusal {response}", str(answer))
             expect(answer.get("reason"), f"the reason of {response}", str(answer))
         program.succeed("release_control")

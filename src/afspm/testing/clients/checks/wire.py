@@ -23,7 +23,6 @@ _FIRST_NS = 1_767_225_600_123_456_000
 
 
 def in_base64(data: bytes) -> str:
-    """Return bytes as a step has them."""
     return base64.b64encode(data).decode()
 
 
@@ -37,35 +36,35 @@ def bytes_in(answer: Answer, name: str) -> bytes:
 
 @client_check(
     "wire/decode",
-    "Every message of `proto/golden.json` is decoded, and says what it should.",
-    "Compile `proto/` anew. Keep presence: a zero that is set is not one that is missing.",
+    "Every message of `proto/golden.json` is decoded to the right fields.",
+    "Compile `proto/` again. Keep presence: a zero that is set is not one that is missing.",
 )
 def decode(bench: ClientBench) -> None:
     with bench.scripted() as run:
         for entry in golden()["messages"]:
             payload = bytes.fromhex(entry["hex"])
             answer = run.client.succeed("decode", message=entry["type"], bytes=in_base64(payload))
-            _says(entry, answer)
+            _require_fields(entry, answer)
             again = bytes_in(answer, "bytes")
             expect(again == payload, f"{entry['name']} encoded again as {payload.hex()}", again.hex())
 
 
-def _says(entry: Plain, answer: Answer) -> None:
+def _require_fields(entry: Plain, answer: Answer) -> None:
     kind = message_type(entry["type"])
     right = kind.FromString(bytes.fromhex(entry["hex"]))
     try:
-        told = json_format.ParseDict(answer["fields"], kind())
+        decoded = json_format.ParseDict(answer["fields"], kind())
     except (json_format.ParseError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise Failed(f"the fields of {entry['name']} ({entry['type']})", f"{answer} ({error})") from None
-    # as dictionaries: JSON as some languages write it has no negative zero, which the bytes then tell
-    same = json_format.MessageToDict(told) == json_format.MessageToDict(right)
+    # as dictionaries: the JSON of some languages has no negative zero; the comparison of bytes finds that
+    same = json_format.MessageToDict(decoded) == json_format.MessageToDict(right)
     expect(same, f"{entry['name']} with the fields {entry['fields']}", str(answer.get("fields")))
 
 
 @client_check(
     "wire/encode",
     "Every message is encoded to the reference bytes.",
-    "Write fields in the order of their numbers, repeated numbers packed, and only what is present.",
+    "Write fields in the order of their numbers, repeated numbers packed, and only present fields.",
 )
 def encode(bench: ClientBench) -> None:
     with bench.scripted() as run:
@@ -96,7 +95,7 @@ def requests(bench: ClientBench) -> None:
 
 
 def ask(run: ScriptedRun, number: int, payload: bytes = b"") -> Answer:
-    """Have the client send a request, and return its answer."""
+    """Make the client send a request, and return its answer."""
     given = {"object": in_base64(payload)} if payload else {}
     return run.client.do("request", number=number, **given)
 
@@ -138,12 +137,12 @@ def _answered(run: ScriptedRun, code: int, payload: bytes, reason: str, detail: 
     expect(answer.ok == (code == 0), f"ok = {str(code == 0).lower()} with {name}", str(answer))
     expect(bytes_in(answer, "object") == payload, f"the object {in_base64(payload)!r} with {name}", str(answer))
     if code:
-        told = (answer.get("reason"), answer.get("detail"))
-        expect(told == (reason, detail), f"the reason {reason!r} and the detail {detail} with {name}", str(answer))
+        reply = (answer.get("reason"), answer.get("detail"))
+        expect(reply == (reason, detail), f"the reason {reason!r} and the detail {detail} with {name}", str(answer))
 
 
 def response_name(code: int) -> str | int:
-    """Return a response as an answer has it."""
+    """Return the name of a response code as in the client's answers, or an unknown code itself."""
     known = code in ControlResponse._value2member_map_
     return f"REP_{ControlResponse(code).name}" if known else code
 
@@ -165,7 +164,7 @@ def packets(bench: ClientBench) -> None:
             run.scheduler.publish(*frames)
         for envelope, frames in reversed(sent.items()):
             answer = run.client.succeed("wait", prefix=envelope, timeout_s=_PACKET_S)
-            if answer.get("envelope") != envelope:  # of a longer one that begins the same
+            if answer.get("envelope") != envelope:  # ZeroMQ's prefix match also delivers longer envelopes
                 answer = run.client.succeed("wait", prefix=envelope, timeout_s=_PACKET_S)
             compare(answer, decode_packet(frames))
 
@@ -201,5 +200,5 @@ def bad_packets(bench: ClientBench) -> None:
         compare(run.client.succeed("wait", prefix="Scan2d_good", timeout_s=_PACKET_S), Packet(
             "Scan2d_good", payload, _FIRST_NS + 2_000_000
         ))  # fmt: skip
-        told = run.client.succeed("state").get("scope_state")
-        expect(told == "SS_SPEC", "the scope state SS_SPEC, which came after bad ones", str(told))
+        scope_state = run.client.succeed("state").get("scope_state")
+        expect(scope_state == "SS_SPEC", "the scope state SS_SPEC, which came after bad ones", str(scope_state))

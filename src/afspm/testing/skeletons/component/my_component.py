@@ -1,4 +1,4 @@
-"""MyComponent: say in a sentence what it decides."""
+"""MyComponent: describe its decision in one sentence."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from afspm import Component, Scan
 
 
 class MyComponent(Component):
-    """Tells how rough each scan is, and at the end which was the roughest.
+    """Logs the roughness of each scan, and at the end the roughest scan.
 
     Args:
-        channel: that it looks at.
+        channel: the evaluated channel.
     """
 
     listens = ("Scan2d",)
@@ -32,5 +32,5 @@ class MyComponent(Component):
 
 
 def roughness(heights_m: np.ndarray) -> float:
-    """Return the root mean square of the heights, in metres, once the median of each line is taken away."""
+    """Return the RMS roughness in metres, with the median of each line subtracted."""
     return float(np.nanstd(heights_m - np.nanmedian(heights_m, axis=1, keepdims=True)))

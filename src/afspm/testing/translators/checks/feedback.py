@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from afspm.model import ControlRequest, ControlResponse, Feedback, names
 from afspm.testing.conformance import Failed, Skipped, expect, near
-from afspm.testing.translators.client import answer_in_words, told
+from afspm.testing.translators.client import answer_in_words, describe_all
 from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.translator_suite import check
 
@@ -17,7 +17,7 @@ _NUMBERS = {
     "setpoint": names.ZCTRL_SETPOINT,
 }
 _STEP = 1.02
-"""A tip that is not engaged does not mind, and neither would one that is."""
+"""A relative change that is harmless even for an engaged tip."""
 
 
 def in_force(kit: CheckMeasurements) -> Feedback:
@@ -26,29 +26,29 @@ def in_force(kit: CheckMeasurements) -> Feedback:
     if feedback is None and not any(map(kit.support.has, _NUMBERS.values())):
         raise Skipped("the microscope reports no feedback")
     if feedback is None:
-        raise Failed("ZCtrlParameters at the start", told(kit.client.observations.all[:10]))
+        raise Failed("ZCtrlParameters at the start", describe_all(kit.client.observations.all[:10]))
     return feedback
 
 
 def set_and_require(kit: CheckMeasurements, wanted: Feedback) -> None:
-    """Set what is given of it; the rest must stay as it is."""
+    """Set the given fields; all others must keep their values."""
     kit.client.come_to_rest()
     before, mark = in_force(kit), kit.client.observations.mark()
     given = {name: value for name, value in vars(wanted).items() if value is not None}
     response = kit.client.ask(ControlRequest.SET_ZCTRL_PARAMS, wanted)
-    heard = kit.client.settled(mark)
+    observed = kit.client.settled(mark)
     if response.code in (ControlResponse.PARAM_ERROR, ControlResponse.PARAM_NOT_SUPPORTED):
         require_same(before, in_force(kit))
         raise Skipped(f"it can't be set here: {answer_in_words(response)}")
     expect(response.ok, f"REP_SUCCESS to setting {', '.join(given)} of the feedback", answer_in_words(response))
     after = in_force(kit)
-    count = sum(isinstance(one.thing, Feedback) for one in heard)
-    expect(count == 1, "the new ZCtrlParameters once", told(heard))
+    count = sum(isinstance(one.thing, Feedback) for one in observed)
+    expect(count == 1, "the new ZCtrlParameters once", describe_all(observed))
     require_same(replace(before, **given), after)
 
 
 def require_same(wanted: Feedback, came: Feedback) -> None:
-    """That both are the same, to a float32."""
+    """Raise Failed unless both agree to the precision of a float32."""
     for name, value in vars(wanted).items():
         other = getattr(came, name)
         if value is None or other is None or isinstance(value, bool):

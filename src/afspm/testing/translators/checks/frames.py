@@ -1,4 +1,4 @@
-"""Where the microscope scans: what is published at the start, setting the frame, and moving the probe."""
+"""The scan frame: its publication at the start, changes of it, and moves of the probe."""
 
 from __future__ import annotations
 
@@ -16,32 +16,32 @@ from afspm.model import (
     names,
 )
 from afspm.testing.conformance import Failed, Skipped, expect, near
-from afspm.testing.translators.client import Observation, states, told
+from afspm.testing.translators.client import Observation, describe_all, states
 from afspm.testing.translators.measuring import CheckMeasurements, FrameSetting, difference, number
 from afspm.testing.translators.translator_suite import check
 
 
 @check("published/in-force", "the settings in force are published at the start, the state last")
 def published_in_force(kit: CheckMeasurements) -> None:
-    heard = kit.client.at_start
+    observed = kit.client.at_start
     wanted: list[tuple[type, tuple[str, ...]]] = [
         (ScanParameters, (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)),
         (Feedback, (names.ZCTRL_SETPOINT,)),
         (ProbePosition, (names.PROBE_POS_X, names.PROBE_POS_Y)),
     ]
-    state_at = max(i for i, one in enumerate(heard) if one.state is not None)
+    state_at = max(i for i, one in enumerate(observed) if one.state is not None)
     for kind, needs in wanted:
-        at = max((i for i, one in enumerate(heard) if isinstance(one.thing, kind)), default=None)
+        at = max((i for i, one in enumerate(observed) if isinstance(one.thing, kind)), default=None)
         if kit.support.has(*needs):
-            expect(at is not None, f"a {kind.__name__} at the start", told(heard))
+            expect(at is not None, f"a {kind.__name__} at the start", describe_all(observed))
         if at is not None:
-            expect(at < state_at, f"ScopeStateMsg after {kind.__name__}", told(heard))
+            expect(at < state_at, f"ScopeStateMsg after {kind.__name__}", describe_all(observed))
 
 
 @check("published/free", "the microscope is free before anything is asked of it")
 def free(kit: CheckMeasurements) -> None:
     states = [one.state for one in kit.client.at_start if one.state is not None]
-    expect(states[-1] is ScopeState.FREE, "SS_FREE", told(kit.client.at_start))
+    expect(states[-1] is ScopeState.FREE, "SS_FREE", describe_all(kit.client.at_start))
 
 
 @check("published/frame", "the ScanParameters2d agree with the parameters", needs=(names.SCAN_SIZE_X,))
@@ -50,7 +50,7 @@ def frame(kit: CheckMeasurements) -> None:
         (one.thing for one in reversed(kit.client.at_start) if isinstance(one.thing, ScanParameters)), None
     )
     if parameters is None or not isinstance(parameters.region, Region):
-        raise Failed("ScanParameters2d with a region", told(kit.client.at_start))
+        raise Failed("ScanParameters2d with a region", describe_all(kit.client.at_start))
     (left, low), (width, height) = parameters.region.top_left_m, parameters.region.size_m
     told_m = {
         names.SCAN_TOP_LEFT_X: left,
@@ -69,7 +69,7 @@ _SIZES = (names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
 def ask_for(kit: CheckMeasurements, wanted: ScanParameters) -> list[Observation]:
-    """Set what is wanted; what is published of it."""
+    """Set scan parameters; return the resulting publications."""
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
     kit.client.asked(ControlRequest.SET_SCAN_PARAMS, wanted, "setting a frame")
@@ -77,7 +77,7 @@ def ask_for(kit: CheckMeasurements, wanted: ScanParameters) -> list[Observation]
 
 
 def current_frame(kit: CheckMeasurements) -> FrameSetting:
-    """The frame that was published last."""
+    """Return the last published frame."""
     newest = kit.client.observations.newest(ScanParameters)
     if newest is None or not isinstance(newest.region, Region) or not isinstance(newest.shape, tuple):
         raise Failed("ScanParameters2d with region and shape", str(newest))
@@ -85,7 +85,7 @@ def current_frame(kit: CheckMeasurements) -> FrameSetting:
 
 
 def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
-    """The frame that was published last is this."""
+    """Raise Failed unless this is the last published frame."""
     published = current_frame(kit)
     wrong = difference(frame.region, published.region)
     if wrong:
@@ -93,20 +93,20 @@ def require_in_force(kit: CheckMeasurements, frame: FrameSetting) -> None:
     expect(published.shape == frame.shape, f"ScanParameters2d of {frame.shape} pixels", f"{published.shape}")
 
 
-def require_told_once(heard: list[Observation], kind: type, named: str) -> None:
-    """SS_MOVING, the new setting once, SS_FREE."""
+def require_published_once(observed: list[Observation], kind: type, named: str) -> None:
+    """Raise Failed unless the order is SS_MOVING, the new setting once, SS_FREE."""
     right = f"SS_MOVING, {named} once, SS_FREE"
-    expect(states(heard) == ["SS_MOVING", "SS_FREE"], right, told(heard))
-    at = [i for i, one in enumerate(heard) if isinstance(one.thing, kind)]
-    free_at = max(i for i, one in enumerate(heard) if one.state is ScopeState.FREE)
-    expect(len(at) == 1 and at[0] < free_at, right, told(heard))
+    expect(states(observed) == ["SS_MOVING", "SS_FREE"], right, describe_all(observed))
+    at = [i for i, one in enumerate(observed) if isinstance(one.thing, kind)]
+    free_at = max(i for i, one in enumerate(observed) if one.state is ScopeState.FREE)
+    expect(len(at) == 1 and at[0] < free_at, right, describe_all(observed))
 
 
 @check("frame/set", "a frame that is set: SS_MOVING, ScanParameters2d as set, once, SS_FREE", needs=_SIZES)
 def set_whole(kit: CheckMeasurements) -> None:
     ask_for(kit, kit.frames.plain.request(kit.support))
-    heard = ask_for(kit, kit.frames.wide.request(kit.support))
-    require_told_once(heard, ScanParameters, "ScanParameters2d")
+    observed = ask_for(kit, kit.frames.wide.request(kit.support))
+    require_published_once(observed, ScanParameters, "ScanParameters2d")
     require_in_force(kit, kit.frames.wide)
 
 

@@ -1,4 +1,4 @@
-"""Each base parameter by itself: got, set, set in another unit, and refused what can't be."""
+"""Each base parameter: read, set, set in another unit; and refusals of impossible values."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from afspm.testing.translators.measuring import CheckMeasurements, number
 from afspm.testing.translators.translator_suite import check
 
 _SMALLER = {"m": "nm", "m/s": "nm/s", "V": "mV", "deg": "rad", "A": "pA"}
-"""A peer may give and ask for a value in any unit of its kind."""
+"""Peers may set and read a value in any unit of its kind."""
 _NO_VALUES = ("nan", "inf", "-inf", "abc", "")
 _BAD_UNIT = "kg"
 
 
 @dataclass(frozen=True)
 class ParameterStep:
-    """By how much a parameter is changed for a check: by a factor, by an amount where it is 0, or by an amount."""
+    """The change of a parameter in a check: a factor, an amount where the value is 0, or always an amount."""
 
     factor: float = 1.02
     from_zero: float = 0.0
     by: float = 0.0
 
     def from_(self, value: float, sign: int) -> float:
-        """Another value near by."""
+        """Return a changed value."""
         if self.by:
             return value + sign * self.by
         return value * self.factor**sign if value else sign * self.from_zero
@@ -47,8 +47,7 @@ _STEPS = {
 _PLACES = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
-def _of(name: str) -> None:
-    """Marks the checks of one parameter."""
+def _declare_checks(name: str) -> None:
     what = name.replace("-", " ")
 
     @check(f"parameter/{name}", f"{what}: set, and reported as it was set, also in another unit", needs=(name,))
@@ -61,7 +60,7 @@ def _of(name: str) -> None:
 
 
 for _name in names.BASE_PARAMETERS:
-    _of(_name)
+    _declare_checks(_name)
 
 
 def _require_set(kit: CheckMeasurements, name: str) -> None:
@@ -76,19 +75,14 @@ def _require_set(kit: CheckMeasurements, name: str) -> None:
         step = _STEPS.get(name, ParameterStep())
     wanted, response = _set_near(kit, name, now, step, unit)
     kit.support.settable[name] = True
-    _require_told(name, value_in(response, name), wanted, unit, "the answer")
+    _require_reported(name, value_in(response, name), wanted, unit, "the answer")
     client.settled(client.observations.mark())
-    _require_told(name, client.get(name), wanted, unit, "the value read back")
+    _require_reported(name, client.get(name), wanted, unit, "the value read back")
     if unit in _SMALLER:
         _require_other_unit(kit, name, now, unit)
 
 
 def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep, unit: str) -> tuple[float, Response]:
-    """A value near the one in force, and the success of setting it.
-
-    Raises:
-        Skipped: the microscope lets none be set.
-    """
     if step.from_(now, 1) == now:
         raise Skipped(f"{name} is {now:g} and can't be changed by a fraction")
     response = Response(ControlResponse.FAILURE)
@@ -105,24 +99,27 @@ def _set_near(kit: CheckMeasurements, name: str, now: float, step: ParameterStep
 
 
 def _require_other_unit(kit: CheckMeasurements, name: str, value: float, unit: str) -> None:
-    """Back to the first value, given in another unit."""
     other = _SMALLER[unit]
     text = f"{convert(value, unit, other):.12g}"
     response = kit.client.set(name, text, other)
     expect(response.ok, f"REP_SUCCESS to {name} = {text} {other}", answer_in_words(response))
     kit.client.settled(kit.client.observations.mark())
-    _require_told(name, kit.client.get(name), value, unit, f"the value read back after setting {text} {other}")
-    _require_told(name, kit.client.get(name, other), value, unit, f"the value read back in {other}")
+    _require_reported(name, kit.client.get(name), value, unit, f"the value read back after setting {text} {other}")
+    _require_reported(name, kit.client.get(name, other), value, unit, f"the value read back in {other}")
 
 
-def _require_told(name: str, told: Parameter, wanted: float, unit: str, where: str) -> None:
-    came = number(told, unit) if unit else number(told)
+def _require_reported(name: str, reported: Parameter, wanted: float, unit: str, where: str) -> None:
+    came = number(reported, unit) if unit else number(reported)
     alike = near(came, wanted, absolute=1e-12 if unit == "m" else 1e-6 if unit == "deg" else 0.0)
-    expect(alike, f"{name} = {wanted:.6g} {unit}".rstrip() + f" as {where}", f"{told.value} {told.unit or ''}".rstrip())
+    expect(
+        alike,
+        f"{name} = {wanted:.6g} {unit}".rstrip() + f" as {where}",
+        f"{reported.value} {reported.unit or ''}".rstrip(),
+    )
 
 
 def _written(value: float, name: str) -> str:
-    """As a person would write it; pixels are whole numbers."""
+    # as a person would write it; pixels are whole numbers
     return str(round(value)) if name in (names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y) else f"{value:.6g}"
 
 
@@ -136,7 +133,7 @@ def _require_refused(kit: CheckMeasurements, name: str) -> None:
 
 
 def require_param_error(kit: CheckMeasurements, name: str, value: str, unit: str | None, before: Parameter) -> None:
-    """Setting that is refused with REP_PARAM_ERROR, and changes nothing."""
+    """Raise Failed unless setting is refused with REP_PARAM_ERROR and changes nothing."""
     asked = f"{name} = {value!r} {unit or ''}".rstrip()
     response = kit.client.ask_directly(ControlRequest.PARAM, Parameter(name, value, unit))
     expect(response.code == ControlResponse.PARAM_ERROR, f"REP_PARAM_ERROR to {asked}", answer_in_words(response))

@@ -1,7 +1,7 @@
-"""Where scans say they were taken is where they were: details fit into a larger scan, if there is a sample to see.
+"""Geometry of scans: details must fit into a larger scan at their reported regions, if the sample shows structure.
 
-A larger scan is compared with details of it. Both are made from the same wrong idea of the axes, if there is one: so
-each idea is tried on both.
+A larger scan is compared with details of it. A wrong idea of the axes affects both alike, so each idea is tried on
+both.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from afspm.testing.translators.translator_suite import check
 
 Array = NDArray[np.float64]
 LIKE = 0.6
-"""Correlation from which on two pictures show the same."""
+"""The least correlation of two pictures of the same structure."""
 CLEARLY = 0.1
 _EQUAL = 0.01
 _SHIFTS = (-0.04, -0.02, 0.0, 0.02, 0.04)
-"""Of the larger scan: drift between two scans, and an imperfect scanner."""
+"""In units of the larger scan: drift between two scans, and an imperfect scanner."""
 _INSIDE = 0.6
 
 
@@ -39,13 +39,13 @@ Idea = Callable[[ScanPicture], ScanPicture]
 
 
 def ideas(angle_rad: float) -> dict[str, Idea]:
-    """Return what may be wrong with the axes of a translator, in words; `angle_rad` is that of the larger scan."""
+    """Return possible errors in the axes of a translator, by description; `angle_rad` is the larger scan's."""
 
     def turned_back(picture: ScanPicture) -> ScanPicture:
         return replace(picture, region=replace(picture.region, angle_rad=2 * angle_rad - picture.region.angle_rad))
 
     found: dict[str, Idea] = {
-        "as told": lambda picture: picture,
+        "as reported": lambda picture: picture,
         "with x mirrored": lambda picture: replace(picture, values=picture.values[:, ::-1]),
         "with y mirrored": lambda picture: replace(picture, values=picture.values[::-1]),
         "with x and y mirrored": lambda picture: replace(picture, values=picture.values[::-1, ::-1]),
@@ -72,7 +72,7 @@ def _moved(across: float, up: float) -> Idea:
 
 
 def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str, float]:
-    """For each idea, how well the details fit into the larger scan: the mean correlation, -1 to 1."""
+    """Return for each idea the mean correlation (-1 to 1) of the details with the larger scan."""
     return {
         name: float(np.mean([_best(idea(larger), idea(detail)) for detail in details]))
         for name, idea in ideas(larger.region.angle_rad).items()
@@ -80,9 +80,9 @@ def likenesses(larger: ScanPicture, details: Sequence[ScanPicture]) -> dict[str,
 
 
 def best_of(found: dict[str, float]) -> tuple[str, float]:
-    """The idea of `likenesses` that explains the scans, and how well: of those that do as well, the first and simplest.
+    """Return the idea that explains the scans best, with its likeness; of equal ones the first and simplest.
 
-    With few details two may be the same: one that is square fits swapped as well as half a frame away.
+    With few details two may be equal: a square detail fits swapped as well as shifted by half a frame.
     """
     most = max(found.values())
     return next((name, likeness) for name, likeness in found.items() if likeness >= most - _EQUAL)
@@ -108,7 +108,7 @@ def _correlation(larger: ScanPicture, detail: Array, x_m: Array, y_m: Array) -> 
 
 
 def _at(picture: ScanPicture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """The picture at these places, bilinear, and where they lie inside of it."""
+    # bilinear; the mask marks positions inside the picture
     region, (rows, columns) = picture.region, picture.values.shape
     cos, sin = np.cos(region.angle_rad), np.sin(region.angle_rad)
     right, up = x_m - region.center_m[0], y_m - region.center_m[1]
@@ -126,7 +126,7 @@ def _at(picture: ScanPicture, x_m: Array, y_m: Array) -> tuple[Array, NDArray[np
 
 
 def _level(inside: NDArray[np.bool_], *pictures: Array) -> Array:
-    """Return what of them is inside, each without its plane: no sample lies quite flat."""
+    # without its plane: no sample is level
     rows, columns = np.nonzero(inside)
     plane = np.stack([rows, columns, np.ones(len(rows))], axis=1).astype(float)
     found = np.stack([values[inside] for values in pictures], axis=1)
@@ -150,16 +150,16 @@ def picture(kit: CheckMeasurements) -> None:
         raise Failed("the same channels in all scans", "no channel that all have")
     best = max(found, key=lambda likeness: max(likeness.values()))
     name, likeness = best_of(best)
-    as_told = best["as told"]
+    as_reported = best["as reported"]
     if likeness < LIKE:
         raise Skipped(f"no structure is seen in all scans (correlation {likeness:.2f}): noise shows no coordinates")
-    if as_told < likeness - CLEARLY:
+    if as_reported < likeness - CLEARLY:
         raise Failed(
             "details that fit into a larger scan at their position and angle",
-            f"a correlation of {as_told:.2f}, and of {likeness:.2f} {name}",
+            f"a correlation of {as_reported:.2f}, and of {likeness:.2f} {name}",
         )
-    if as_told < LIKE:
-        raise Skipped(f"no structure is seen clearly in all scans (correlation {as_told:.2f})")
+    if as_reported < LIKE:
+        raise Skipped(f"no structure is seen clearly in all scans (correlation {as_reported:.2f})")
 
 
 def _common(larger: Taken, details: list[Taken]) -> list[str]:

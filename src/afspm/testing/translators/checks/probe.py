@@ -1,4 +1,4 @@
-"""Moving the probe, after all scans: some controllers move it within the scan frame alone."""
+"""Moves of the probe, after all scans: some controllers move it within the scan frame only."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 from afspm.model import ControlRequest, ProbePosition, names
 from afspm.testing.conformance import Failed, expect
-from afspm.testing.translators.checks.frames import require_told_once
+from afspm.testing.translators.checks.frames import require_published_once
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words, number
 from afspm.testing.translators.translator_suite import check
 from afspm.wire import messages
@@ -15,7 +15,7 @@ _NEEDS = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
 def require_place(kit: CheckMeasurements, xy_m: tuple[float, float]) -> None:
-    """The probe is said to be there: as published, and by its parameters."""
+    """Raise Failed unless the probe's position is reported there, as published and by its parameters."""
     newest = kit.client.observations.newest(ProbePosition)
     if newest is None:
         raise Failed("a ProbePosition", "none")
@@ -28,8 +28,8 @@ def require_place(kit: CheckMeasurements, xy_m: tuple[float, float]) -> None:
 @check("probe/move", "the probe is moved: SS_MOVING, ProbePosition as set, once, SS_FREE", needs=_NEEDS)
 def move(kit: CheckMeasurements) -> None:
     kit.move_probe(kit.frames.plain.region.center_m)
-    heard = kit.move_probe(kit.frames.other.region.center_m)
-    require_told_once(heard, ProbePosition, "ProbePosition")
+    observed = kit.move_probe(kit.frames.other.region.center_m)
+    require_published_once(observed, ProbePosition, "ProbePosition")
     require_place(kit, kit.frames.other.region.center_m)
 
 

@@ -1,4 +1,4 @@
-"""Refusals: unknown names, impossible values, places out of reach, and all that would disturb a scan."""
+"""Refusals: unknown names, impossible values, positions out of reach, and requests that would disturb a scan."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from afspm.model import (
 )
 from afspm.testing.conformance import expect
 from afspm.testing.translators.checks.parameters import require_param_error
-from afspm.testing.translators.client import answer_in_words, told
+from afspm.testing.translators.client import answer_in_words, describe_all
 from afspm.testing.translators.measuring import CheckMeasurements
 from afspm.testing.translators.translator_suite import check
 from afspm.wire import messages
@@ -107,8 +107,8 @@ def _require_unchanged(
     before, mark = client.observations.newest(published), client.observations.mark()
     response = client.ask_directly(kind, subject)
     expect(response.code == ControlResponse.PARAM_ERROR, f"REP_PARAM_ERROR to {what}", answer_in_words(response))
-    heard = client.settled(mark)
-    expect(client.observations.newest(published) == before, f"nothing changed by {what}", told(heard))
+    observed = client.settled(mark)
+    expect(client.observations.newest(published) == before, f"nothing changed by {what}", describe_all(observed))
 
 
 _NEEDS = (names.START_SCAN, names.STOP_SCAN)
@@ -137,8 +137,8 @@ def refused(kit: CheckMeasurements) -> None:
                 answer_in_words(response),
             )  # fmt: skip
     _require_running(kit, mark)
-    heard = [one for one in kit.client.observations.since(mark) if one.state is None]
-    expect(not heard, "nothing but SS_SCANNING while requests were refused", told(heard))
+    observed = [one for one in kit.client.observations.since(mark) if one.state is None]
+    expect(not observed, "nothing but SS_SCANNING while requests were refused", describe_all(observed))
 
 
 @check("busy/answered", "during a scan, questions for parameters and supported actions are answered", needs=_NEEDS)
@@ -158,4 +158,4 @@ def answered(kit: CheckMeasurements) -> None:
 
 def _require_running(kit: CheckMeasurements, mark: int) -> None:
     state = kit.client.state
-    expect(state is ScopeState.SCANNING, "a scan that goes on", told(kit.client.observations.since(mark)))
+    expect(state is ScopeState.SCANNING, "a scan that goes on", describe_all(kit.client.observations.since(mark)))

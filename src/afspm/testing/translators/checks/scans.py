@@ -1,4 +1,4 @@
-"""Scans: broken off, and taken to their end."""
+"""Scans: interrupted, and complete."""
 
 from __future__ import annotations
 
@@ -6,37 +6,37 @@ import numpy as np
 
 from afspm.model import Scan, ScanParameters, ScopeState, ScopeStatus, names
 from afspm.testing.conformance import Failed, Skipped, expect
-from afspm.testing.translators.client import Observation, scans, states, told
+from afspm.testing.translators.client import Observation, describe_all, scans, states
 from afspm.testing.translators.measuring import SCAN_S, CheckMeasurements, Taken, difference
 from afspm.testing.translators.translator_suite import check
 
 
 def broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
-    """Stop what runs; what is published from its beginning on, once its states have been found right."""
-    asked_to_stop(kit, mark, stop, begun)
+    """Stop the activity; return its publications, after a check of its states."""
+    stop_by_request(kit, mark, stop, begun)
     return require_broken_off(kit, mark, stop, begun)
 
 
-def asked_to_stop(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
-    """Stop what runs; when that was answered, experiment time in s."""
+def stop_by_request(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> float:
+    """Stop the activity; return the time of the answer, experiment time in s."""
     client = kit.client
-    expect(client.state is begun, f"SS_{begun.name} until it is stopped", told(client.observations.since(mark)))
+    expect(client.state is begun, f"SS_{begun.name} until it is stopped", describe_all(client.observations.since(mark)))
     kit.act(stop)
     return client.clock.now_s()
 
 
 def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: ScopeState) -> list[Observation]:
-    """Return all that was published of what was stopped, once its states have been found right."""
+    """Return all publications of the stopped activity, after a check of its states."""
     client = kit.client
     client.wait_state(ScopeState.INTERRUPTED, mark)
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))
-    heard = client.settled(mark)
+    observed = client.settled(mark)
     expect(
-        states(heard) == [f"SS_{begun.name}", "SS_INTERRUPTED", "SS_FREE"],
+        states(observed) == [f"SS_{begun.name}", "SS_INTERRUPTED", "SS_FREE"],
         f"SS_{begun.name}, SS_INTERRUPTED, SS_FREE after {stop}",
-        told(heard),
+        describe_all(observed),
     )
-    return heard
+    return observed
 
 
 @check(
@@ -45,8 +45,8 @@ def require_broken_off(kit: CheckMeasurements, mark: int, stop: str, begun: Scop
     needs=(names.START_SCAN, names.STOP_SCAN),
 )
 def cancel(kit: CheckMeasurements) -> None:
-    heard = broken_off(kit, kit.begin_long_scan(kit.frames.other), names.STOP_SCAN, ScopeState.SCANNING)
-    expect(not scans(heard), "no Scan2d of a scan that was stopped", told(heard))
+    observed = broken_off(kit, kit.begin_long_scan(kit.frames.other), names.STOP_SCAN, ScopeState.SCANNING)
+    expect(not scans(observed), "no Scan2d of a scan that was stopped", describe_all(observed))
 
 
 @check("scan/stop-nothing", "stop-scan while nothing runs succeeds, and changes nothing", needs=(names.STOP_SCAN,))
@@ -54,33 +54,33 @@ def stop_nothing(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
     kit.act(names.STOP_SCAN)
-    heard = kit.client.settled(mark)
-    expect(not states(heard), "no state after stopping nothing", told(heard))
+    observed = kit.client.settled(mark)
+    expect(not states(observed), "no state after stopping nothing", describe_all(observed))
 
 
 _NEEDS = (names.START_SCAN,)
 CLOCK_S = 2.0
-"""Files have their times in whole seconds, and who wrote them may have done it a moment after the end."""
+"""Files have times in whole seconds, and may be written a moment after the end."""
 _FASTER, _SLOWER, _EDGES_S = 2.5, 5.0, 30.0
-"""A fast way back; turning at the edges; and what a controller does before and after."""
+"""Bounds for a fast retrace, turns at the edges, and work of the controller before and after."""
 
 
 @check("scan/order", "start-scan: SS_SCANNING, the Scan2d of every channel once, and only then SS_FREE", needs=_NEEDS)
 def order(kit: CheckMeasurements) -> None:
-    require_order(kit.scan("plain").heard, ScopeState.SCANNING, Scan)
+    require_order(kit.scan("plain").observed, ScopeState.SCANNING, Scan)
 
 
-def require_order(heard: list, begun: ScopeState, kind: type) -> None:  # type: ignore[type-arg]
-    """SS_<begun>, then results of a kind, then SS_FREE, and nothing else."""
-    results = [i for i, one in enumerate(heard) if isinstance(one.thing, kind)]
+def require_order(observed: list, begun: ScopeState, kind: type) -> None:  # type: ignore[type-arg]
+    """Raise Failed unless the order is SS_<begun>, results of a kind, SS_FREE, and nothing else."""
+    results = [i for i, one in enumerate(observed) if isinstance(one.thing, kind)]
     named = "Scan2d" if kind is Scan else "Spec1d"
     right = f"SS_{begun.name}, {named} …, SS_FREE"
-    expect(states(heard) == [f"SS_{begun.name}", "SS_FREE"], right, told(heard))
-    first = next(i for i, one in enumerate(heard) if one.state is begun)
-    last = next(i for i, one in enumerate(heard) if one.state is ScopeState.FREE)
-    expect(all(first < i < last for i in results), right, told(heard))
-    again = [i for i, one in enumerate(heard) if isinstance(one.thing, ScopeStatus)]
-    expect(len(again) == 2, f"each state once: {right}", told(heard))
+    expect(states(observed) == [f"SS_{begun.name}", "SS_FREE"], right, describe_all(observed))
+    first = next(i for i, one in enumerate(observed) if one.state is begun)
+    last = next(i for i, one in enumerate(observed) if one.state is ScopeState.FREE)
+    expect(all(first < i < last for i in results), right, describe_all(observed))
+    again = [i for i, one in enumerate(observed) if isinstance(one.thing, ScopeStatus)]
+    expect(len(again) == 2, f"each state once: {right}", describe_all(observed))
 
 
 @check("scan/channels", "every channel has a name of its own, and values everywhere", needs=_NEEDS)
@@ -100,7 +100,7 @@ def frame(kit: CheckMeasurements) -> None:
 
 
 def require_frame(taken: Taken) -> None:
-    """The scans are of the frame that was set."""
+    """Raise Failed unless the scans are of the set frame."""
     assert taken.frame is not None
     for scan in taken.scans:
         wrong = difference(taken.frame.region, scan.region)
@@ -131,12 +131,12 @@ def time(kit: CheckMeasurements) -> None:
 
 
 def require_time(time_ns: int | None, taken: Taken, begun: ScopeState, what: str) -> None:
-    """That it is of its end: not of its start, of a scan before, or on another clock."""
+    """Raise Failed unless the time is the scan's end: not its start, an earlier scan, or another clock."""
     if time_ns is None:
         raise Skipped(f"the {what} has no time")
     begin_s, free_s = taken.time_s(begun), taken.time_s(ScopeState.FREE)
     lasted_s, at_s = free_s - begin_s, time_ns / 1e9 - begin_s
-    # a controller may take its time to save it: what is free late did not end late
+    # a controller may take long to save a scan, so SS_FREE does not give the time of its end
     least_s = 0.5 * min(lasted_s, taken.expected_s or lasted_s) - CLOCK_S
     if least_s <= at_s <= lasted_s + CLOCK_S:
         return
@@ -168,7 +168,7 @@ def duration(kit: CheckMeasurements) -> None:
 def again(kit: CheckMeasurements) -> None:
     first = kit.scan("plain")
     second = kit.take_scan(kit.frames.plain)
-    require_order(second.heard, ScopeState.SCANNING, Scan)
+    require_order(second.observed, ScopeState.SCANNING, Scan)
     before, after = ({scan.channel for scan in taken.scans} for taken in (first, second))
     expect(before == after, f"the channels {sorted(before)} again", f"{sorted(after)}")
     for scan in second.scans:
@@ -177,7 +177,7 @@ def again(kit: CheckMeasurements) -> None:
         old = next(one for one in first.scans if one.channel == scan.channel)
         if scan.filename:
             expect(scan.filename != old.filename, f"a new file for {scan.channel!r}", f"{old.filename} again")
-        # a detector that is off gives the same zeros for ever
+        # a detector that is switched off gives constant zeros
         if np.ptp(old.values) > 0:
             alike = old.values.shape == scan.values.shape and np.array_equal(old.values, scan.values)
             same = alike and old.time_ns == scan.time_ns

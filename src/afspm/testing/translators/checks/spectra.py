@@ -1,4 +1,4 @@
-"""A spectrum: broken off, and taken to its end."""
+"""Spectra: interrupted, and complete."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 from afspm.model import ProbePosition, ScopeState, Spectrum, names
 from afspm.testing.conformance import Failed, Skipped, expect
-from afspm.testing.translators.checks.scans import CLOCK_S, asked_to_stop, require_broken_off, require_order
-from afspm.testing.translators.client import spectra, states, told
+from afspm.testing.translators.checks.scans import CLOCK_S, require_broken_off, require_order, stop_by_request
+from afspm.testing.translators.client import describe_all, spectra, states
 from afspm.testing.translators.measuring import NEAR, CheckMeasurements, in_words
 from afspm.testing.translators.translator_suite import check
 
@@ -24,23 +24,23 @@ _NEEDS = (names.START_SPEC,)
 def cancel(kit: CheckMeasurements) -> None:
     mark, answered_s = kit.begin_spectrum(), math.inf
     try:
-        answered_s = asked_to_stop(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
-        heard = require_broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
+        answered_s = stop_by_request(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
+        observed = require_broken_off(kit, mark, names.STOP_SPEC, ScopeState.SPEC)
     except Failed:
         if _was_over(kit, mark, answered_s):
             raise Skipped("a spectrum ends before it can be stopped") from None
         raise
-    expect(not spectra(heard), "no Spec1d of a spectrum that was stopped", told(heard))
+    expect(not spectra(observed), "no Spec1d of a spectrum that was stopped", describe_all(observed))
 
 
 def _was_over(kit: CheckMeasurements, mark: int, answered_s: float) -> bool:
-    """True if a spectrum came to its end by itself, all in order, before anybody had stopped it."""
+    # a spectrum that ended by itself before the stop was answered could not be stopped
     client = kit.client
-    heard = client.settled(mark)
+    observed = client.settled(mark)
     ended_s = client.observations.at_s(ScopeState.FREE, mark)
     if ended_s is None or ended_s > answered_s:
         return False
-    first, *between, last = [str(one) for one in heard if one.state is not None or isinstance(one.thing, Spectrum)]
+    first, *between, last = [str(one) for one in observed if one.state is not None or isinstance(one.thing, Spectrum)]
     return (first, {*between}, last) == ("SS_SPEC", {"Spec1d"}, "SS_FREE")
 
 
@@ -49,14 +49,14 @@ def stop_nothing(kit: CheckMeasurements) -> None:
     kit.client.come_to_rest()
     mark = kit.client.observations.mark()
     kit.act(names.STOP_SPEC)
-    heard = kit.client.settled(mark)
-    expect(not states(heard), "no state after stopping nothing", told(heard))
+    observed = kit.client.settled(mark)
+    expect(not states(observed), "no state after stopping nothing", describe_all(observed))
 
 
 @check("spectrum/order", "start-spec: SS_SPEC, the Spec1d, and only then SS_FREE", needs=_NEEDS)
 def order(kit: CheckMeasurements) -> None:
     taken = kit.spectrum()
-    require_order(taken.heard, ScopeState.SPEC, Spectrum)
+    require_order(taken.observed, ScopeState.SPEC, Spectrum)
 
 
 @check("spectrum/values", "a spectrum has a kind, variables of different names, and values", needs=_NEEDS)

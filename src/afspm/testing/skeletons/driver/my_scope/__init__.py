@@ -1,6 +1,6 @@
-"""MyScope: what afspm asks of a microscope, in the words of its controller.
+"""MyScope: translates afspm's requests to a microscope into commands of its controller.
 
-Everything here that says `PretendController` is to be replaced, method by method, by talking to the real one.
+Replace each use of `PretendController`, method by method, by commands to the real controller.
 """
 
 from __future__ import annotations
@@ -18,42 +18,42 @@ from afspm.translator import Driver, Value, action
 
 
 class MyScope(Driver):
-    """The microscope behind the controller.
+    """The driver of the microscope.
 
     Args:
         address: of the controller.
-        settings: as of every microscope.
+        settings: common to all drivers.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    simulated = True  # take this out for a real microscope: its time is real, and its tip can break
+    simulated = True  # remove this line for a real microscope: its time is real, and its tip can break
 
     def __init__(self, *, address: str = "127.0.0.1:5000", **settings: Any) -> None:
         super().__init__(**settings)
         self.address = address
 
     def connect(self) -> None:
-        """Reach the controller; called again whenever it was lost (a ConnectionError of any method)."""
+        """Connect to the controller; called again after each loss (a ConnectionError of any method)."""
         self.controller = PretendController(self.clock, self.run_dir / "scans")
 
     def status(self) -> ScopeStatus:
-        """Return what the controller is doing now."""
+        """Return the present activity of the controller."""
         return ScopeStatus(ScopeState.SCANNING if self.controller.is_scanning() else ScopeState.FREE)
 
     def get(self, vendor: str) -> Value:
-        """A value by the vendor's name, in the vendor's unit, as parameters.toml has them."""
+        """Return a value by the vendor's name, in the vendor's unit, as in parameters.toml."""
         return self.controller.values[vendor]
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set values. afspm has checked them, and looks afterwards whether they are in force."""
+        """Set values. afspm has checked them, and reads them back afterwards."""
         self.controller.values.update(values)
 
     def results(self) -> Sequence[str]:
-        """The finished files that there are, oldest first."""
+        """Return all finished files, oldest first."""
         return sorted(str(file) for file in self.controller.folder.glob("*.npz"))
 
     def load(self, result: str) -> Sequence[Scan | Spectrum]:
-        """All channels of a file; a FileError while it is incomplete. Rows and columns ascend with y and x."""
+        """Return all channels of a file, rows ascending with y, columns with x. Raises FileError: incomplete."""
         try:
             with np.load(result) as file:
                 x_m, y_m, width_m, height_m = file["frame_m"]
@@ -64,17 +64,17 @@ class MyScope(Driver):
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Begin; `status` then says how it goes on."""
+        """Start a scan; `status` reports its progress."""
         self.controller.start()
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        """Break the scan off: no file may come of it."""
+        """Interrupt the scan; it must not produce a file."""
         self.controller.stop()
 
 
 class PretendController:
-    """Stands for yours until you talk to it: it has values, scans as long as its speed says, and saves a file."""
+    """Stands for your controller: it stores values, scans at its speed, and saves a file."""
 
     def __init__(self, clock: Clock, folder: Path) -> None:
         self.folder = folder
