@@ -20,9 +20,7 @@ _QUESTIONS: Final = {
 
 def ask(experiment: Experiment) -> dict[str, str]:
     """Ask what [metadata] of the file, and the class of the microscope, leave open or may have changed."""
-    from afspm.experiment import run_metadata
-
-    known = run_metadata.of_run(experiment.resolved)
+    known = experiment.resolved.metadata()
     return {name: answer for name, text in _QUESTIONS.items() if (answer := _answer(name, text, known.get(name, "")))}
 
 

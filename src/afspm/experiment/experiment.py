@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,42 +12,17 @@ from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch
 from afspm.experiment import document as documents
-from afspm.experiment import forms
+from afspm.experiment import forms, process_starts
 from afspm.experiment import parts as sorting
 from afspm.experiment.findings import Finding, Findings
 from afspm.experiment.implied_parts import RECORDS
+from afspm.experiment.process_starts import ProcessStart
 from afspm.experiment.toml_lines import Table
+from afspm.experiment.toml_writer import to_toml
 from afspm.model import Role
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedExperiment
-
-
-@dataclass(frozen=True)
-class ProcessStart:
-    """One process to start.
-
-    Attributes:
-        launch: the line for its standard input; heartbeat, log, clock and folders are for the supervisor to add
-            where it has not given them to `Experiment.launches`.
-        command: program and arguments; empty: the Python host runs `launch.class_`.
-        folder: to start commands in: that of the experiment file.
-        beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
-        python_path: to be put before PYTHONPATH, so that modules beside the file are found.
-        leaves_last: whether it stays until the other components have ended, to record what they say at the end.
-        acts: whether it follows a plan of its own, as a series does, or that is not known; the others react.
-        hidden: environment variables that hold secrets of others.
-    """
-
-    launch: Launch
-    role: Role
-    command: tuple[str, ...]
-    folder: Path
-    python_path: tuple[str, ...]
-    beats: bool = True
-    leaves_last: bool = False
-    acts: bool = False
-    hidden: tuple[str, ...] = ()
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
 
 
 class Experiment:
@@ -111,8 +86,6 @@ class Experiment:
         Raises:
             ConfigError: `only` or `without` names no component.
         """
-        from afspm.experiment import process_starts
-
         chosen = process_starts.chosen_names(self.resolved, only, without)
         missing = process_starts.not_installed(self.resolved, chosen)
         return Findings([*self._document.findings.found, *missing]).ordered()
@@ -159,8 +132,6 @@ class Experiment:
         Raises:
             ConfigError: the file has errors, a name is unknown, or an address is missing for a piecemeal start.
         """
-        from afspm.experiment import process_starts
-
         self.require_valid(only, without)
         starts = process_starts.starts(self.resolved, take_address, only, without)
         knowing = process_starts.knowing_the_run(self.resolved)
@@ -182,20 +153,14 @@ class Experiment:
 
     def simulated(self, only: Collection[str] = (), without: Collection[str] = ()) -> bool:
         """Return whether the microscope is simulated for certain, where these parts are started here."""
-        from afspm.experiment import process_starts
-
         return self.resolved.simulated_with(process_starts.chosen_names(self.resolved, only, without))
 
     def ends_idle(self, names: Collection[str]) -> bool:
         """Return whether a run of these processes ends when nothing that acts is left."""
-        from afspm.experiment import process_starts
-
         return process_starts.ends_idle(self.resolved, names)
 
     def asking(self, names: Collection[str]) -> Launch | None:
         """Return a launch line by which `names` ask a scheduler that is started elsewhere; None: nobody can."""
-        from afspm.experiment import process_starts
-
         return process_starts.asking(self.resolved, names)
 
     def clock(self) -> ExperimentClock:
@@ -205,9 +170,7 @@ class Experiment:
 
     def expanded(self, *, secrets: bool = True) -> str:
         """Return the whole experiment as one TOML text: references replaced, defaults filled in."""
-        from afspm.experiment.toml_writer import to_toml
-
-        return to_toml(self, secrets=secrets)
+        return to_toml(self.parts, secrets=secrets)
 
 
 def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experiment:

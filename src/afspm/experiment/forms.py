@@ -10,7 +10,7 @@ from afspm.experiment.parts import Converter
 
 if TYPE_CHECKING:
     from afspm.experiment.findings import SourceLocation
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
 
 
 class FileForm(Converter, Protocol):

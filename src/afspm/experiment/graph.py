@@ -17,7 +17,7 @@ from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
 
 ENVELOPES, CONTROL, VENDOR = "#1f6fb2", "#c2570c", "#777777"
 GREY, RED, GREEN = "#666666", "#a3241c", "#1d7a3e"

@@ -14,7 +14,7 @@ from afspm.experiment.toml_lines import Settings
 from afspm.model import Role
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
     from afspm.experiment.sections import NotifySection
 
 RECORDER, NOTIFIER = "recorder", "notifier"

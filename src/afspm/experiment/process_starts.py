@@ -4,31 +4,58 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.basics.addresses import connectable, reaches
 from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.requirements import require
-from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
-from afspm.experiment.wiring import ProcessSockets
+from afspm.experiment.wiring_classes import ProcessSockets
 from afspm.model import Frame, Role
 from afspm.model.microscope_status import FEEDBACK_OFF
 from afspm.model.snapshot import to_plain
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
+    from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 
 DASHBOARD = "dashboard"
 """The name under which `afspm dashboard` joins a run."""
 DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
 """The environment variable that only dashboards get."""
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
+
+
+@dataclass(frozen=True)
+class ProcessStart:
+    """One process to start.
+
+    Attributes:
+        launch: the line for its standard input; heartbeat, log, clock and folders are for the supervisor to add
+            where it has not given them to `Experiment.launches`.
+        command: program and arguments; empty: the Python host runs `launch.class_`.
+        folder: to start commands in: that of the experiment file.
+        beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
+        python_path: to be put before PYTHONPATH, so that modules beside the file are found.
+        leaves_last: whether it stays until the other components have ended, to record what they say at the end.
+        acts: whether it follows a plan of its own, as a series does, or that is not known; the others react.
+        hidden: environment variables that hold secrets of others.
+    """
+
+    launch: Launch
+    role: Role
+    command: tuple[str, ...]
+    folder: Path
+    python_path: tuple[str, ...]
+    beats: bool = True
+    leaves_last: bool = False
+    acts: bool = False
+    hidden: tuple[str, ...] = ()
 
 
 def starts(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from datetime import datetime
 from functools import partial
-from typing import Annotated, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, ClassVar, Final, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import pydantic
 from pydantic import Field, StrictBool
@@ -14,10 +15,28 @@ from pydantic import Field, StrictBool
 from afspm.basics.plain_data import file_key
 from afspm.basics.units import Duration, PositiveDuration
 from afspm.experiment.document import Document
-from afspm.experiment.run_metadata import Orcid
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.validation_messages import report
 from afspm.scheduler.settings import ControlSettings
+
+_ORCID: Final = re.compile(r"(?:https://orcid\.org/)?(\d{4}-\d{4}-\d{4}-\d{3}[\dX])")
+
+
+def _checked_orcid(text: str) -> str:
+    """Return an ORCID iD as a URI. The last digit is checked after ISO 7064 (MOD 11-2)."""
+    found = _ORCID.fullmatch(text)
+    if found is None:
+        raise ValueError("an ORCID iD looks like 0000-0002-1825-0097")
+    digits = found[1].replace("-", "")
+    total = 0
+    for digit in digits[:-1]:
+        total = (total + int(digit)) * 2
+    if "0123456789X"[(12 - total % 11) % 11] != digits[-1]:
+        raise ValueError("this is not an ORCID iD: its last digit does not match the others")
+    return f"https://orcid.org/{found[1]}"
+
+
+Orcid = Annotated[str, pydantic.AfterValidator(_checked_orcid)]
 
 
 class Section(pydantic.BaseModel):

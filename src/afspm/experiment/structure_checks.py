@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Final
@@ -10,12 +11,12 @@ from typing import Final
 from afspm import wire
 from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.basics.errors import InvalidValue
-from afspm.experiment import class_loader, wiring
+from afspm.client.component import Component
+from afspm.experiment import class_loader
 from afspm.experiment.findings import closest, nearest
-from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
-from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
-from afspm.experiment.wiring_classes import WIRE_SETTINGS, wire_of
+from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
+from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
@@ -26,6 +27,8 @@ OPENS_PLAIN: Final = "opens_plain"
 ADDRESS: Final = "address"
 """By convention the setting of a translator that says where its controller is."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
+_HANDLER_CUTOFF = 0.8
+_CALLED_METHODS = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 _MISSING = {
     Role.SCHEDULER: 'add [scheduler] with component = true and class = "Scheduler"',
     Role.TRANSLATOR: 'add e.g. [microscope] with component = true and class = "Simulator"',
@@ -123,7 +126,7 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
 
 def check_addresses(resolved: ResolvedExperiment) -> None:
     """Refuse addresses bound twice, open to the network without keys, or connected to and bound by nobody."""
-    bound: dict[str, wiring.BoundSocket] = {}
+    bound: dict[str, BoundSocket] = {}
     security = resolved.sections.security
     secure = security.keys is not None or security.insecure
     for slot in (*resolved.net.slots.values(), *resolved.listening):
@@ -340,6 +343,57 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                 for one in [one for one in needed if one not in offered]:
                     what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"
                     resolved.document.error(what, name, hint=nearest(one, offered))
+
+
+def check_handlers(resolved: ResolvedExperiment) -> None:
+    """Check methods that look like handlers: their names, and the arguments that they take."""
+    for process in resolved.with_role(Role.COMPONENT):
+        component = process.component
+        if component is None or not issubclass(component, Component):
+            continue
+        for name, method in _handlers_of(component):
+            shown, path = f"[{process.name}] {component.__name__}.{name}", (process.name, "class")
+            if hint := _hint_on_handler(name, resolved):
+                resolved.document.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
+            wanted = _handler_arguments(name)
+            if wrong := _wrong_signature(method, wanted):
+                hint = f"write `def {name}({', '.join(wanted)})`"
+                resolved.document.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
+
+
+def _handlers_of(component: type[Component]) -> Iterator[tuple[str, Callable[..., object]]]:
+    """Methods of the user's that are called, or look so."""
+    ours = set(Component.__mro__)
+    seen: set[str] = set()
+    for base in (base for base in component.__mro__ if base not in ours):
+        for name, method in vars(base).items():
+            if (name == "run" or name.startswith("on_")) and inspect.isfunction(method) and name not in seen:
+                seen.add(name)
+                yield name, method
+
+
+def _hint_on_handler(name: str, resolved: ResolvedExperiment) -> str:
+    """Return what to do about a handler that is never called; empty: it is."""
+    valid = {*_CALLED_METHODS, *(message.handler for message in wire.declared())}
+    near = closest(name, valid, _HANDLER_CUTOFF)
+    if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
+        return ""
+    return f"did you mean {near!r}?" if near else "on_scan, on_state, …; of a message of your own after its name"
+
+
+def _handler_arguments(name: str) -> list[str]:
+    base = getattr(Component, name, None)
+    return list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
+
+
+def _wrong_signature(method: Callable[..., object], arguments: list[str]) -> str:
+    if inspect.iscoroutinefunction(method) or inspect.isgeneratorfunction(method):
+        return "calling it does nothing yet, since it is async or has a yield"
+    try:
+        inspect.signature(method).bind(*arguments)
+    except TypeError as error:
+        return str(error)
+    return ""
 
 
 Check = Callable[[ResolvedExperiment], None]

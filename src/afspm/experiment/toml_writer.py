@@ -7,26 +7,22 @@ import math
 import re
 from collections.abc import Mapping
 from datetime import date, datetime, time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
-
-if TYPE_CHECKING:
-    from afspm.experiment.experiment import Experiment
-
 
 SECRET = "webhook"
 """The name of settings and keys whose value is a secret, where it is not the "$NAME" of an environment variable."""
 _NAMED_INSTEAD = "$AFSPM_WEBHOOK"
 
 
-def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
+def to_toml(parts: ExperimentParts, *, secrets: bool = True) -> str:
     """Return variables, sections and components as they are in force; they read back as the same experiment.
 
     Args:
         secrets: else an environment variable is named in place of each, which has to be set where it is read back.
     """
-    parts = experiment.parts
     tables: Settings = dict(parts.variables)
     tables.update(parts.sections)
     for part in parts.components:

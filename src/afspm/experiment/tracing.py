@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from afspm.experiment.resolution import ResolvedExperiment
+from afspm.experiment.resolved_experiment import ResolvedExperiment
 from afspm.experiment.settings import default_of
 from afspm.model import Role
 

@@ -7,70 +7,23 @@ listen to what it publishes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Mapping
 
 from afspm.basics.addresses import hint_on, is_address
 from afspm.experiment.document import Document
-from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.resolved_experiment import ResolvedProcess
 from afspm.experiment.toml_lines import Table
-from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
+from afspm.experiment.wiring_classes import (
+    WIRE_KEYS,
+    BoundSocket,
+    ProcessSockets,
+    Wiring,
+    WiringClass,
+    WiringKeys,
+    wire_of,
+)
 from afspm.model import Role
-
-if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedProcess
-
-
-@dataclass(frozen=True)
-class BoundSocket:
-    """One end that a process binds: the address the file gives under `key`, or None where it is left open."""
-
-    owner: str
-    use: str
-    address: str | None
-    key: str
-    place: SourceLocation
-    keyed: bool = True
-    """Whether it is open to nobody without a key, where the experiment has keys."""
-
-
-@dataclass
-class WiringKeys:
-    """The wiring keys of one component, as plain addresses."""
-
-    publish: str | None = None
-    subscribe: list[str] | None = None
-    envelopes: list[str] | None = None
-    control: str | None = None
-    serve: str | None = None
-    cache_in: str | None = None
-    cache_out: str | None = None
-    request_timeout_s: float | None = None
-    request_retries: int | None = None
-
-
-@dataclass(frozen=True)
-class ProcessSockets:
-    """Every socket of one process; an open address is a `BoundSocket`'s key "owner/use" until it is given one."""
-
-    publish: str | None = None
-    subscribe: tuple[str, ...] = ()
-    serve: str | None = None
-    control: str | None = None
-
-
-@dataclass
-class Wiring:
-    """All slots and links of an experiment."""
-
-    slots: dict[str, BoundSocket] = field(default_factory=dict)
-    links: dict[str, ProcessSockets] = field(default_factory=dict)
-
-    def addresses(self, take: Callable[[], str]) -> dict[str, str]:
-        """Return every slot's key with the address bound there, open ones filled by `take()`."""
-        return {key: slot.address or take() for key, slot in self.slots.items()}
 
 
 def read_wires(part: ExperimentPart, document: Document) -> WiringKeys:

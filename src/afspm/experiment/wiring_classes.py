@@ -1,10 +1,13 @@
-"""The intermediary classes, which say where sockets are, and the keys by which components name them."""
+"""The sockets of processes: the intermediary classes that name them in a file, and what they are once connected."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
+
+from afspm.experiment.findings import SourceLocation
 
 
 class WiringClass(Enum):
@@ -53,3 +56,53 @@ def wire_of(table: object) -> WiringClass | None:
     """Return the kind of intermediary that a value is, or None."""
     name = table.get("class") if isinstance(table, Mapping) else None
     return WIRE_CLASSES.get(name) if isinstance(name, str) else None
+
+
+@dataclass(frozen=True)
+class BoundSocket:
+    """One end that a process binds: the address the file gives under `key`, or None where it is left open."""
+
+    owner: str
+    use: str
+    address: str | None
+    key: str
+    place: SourceLocation
+    keyed: bool = True
+    """Whether it is open to nobody without a key, where the experiment has keys."""
+
+
+@dataclass
+class WiringKeys:
+    """The wiring keys of one component, as plain addresses."""
+
+    publish: str | None = None
+    subscribe: list[str] | None = None
+    envelopes: list[str] | None = None
+    control: str | None = None
+    serve: str | None = None
+    cache_in: str | None = None
+    cache_out: str | None = None
+    request_timeout_s: float | None = None
+    request_retries: int | None = None
+
+
+@dataclass(frozen=True)
+class ProcessSockets:
+    """Every socket of one process; an open address is a `BoundSocket`'s key "owner/use" until it is given one."""
+
+    publish: str | None = None
+    subscribe: tuple[str, ...] = ()
+    serve: str | None = None
+    control: str | None = None
+
+
+@dataclass
+class Wiring:
+    """All slots and links of an experiment."""
+
+    slots: dict[str, BoundSocket] = field(default_factory=dict)
+    links: dict[str, ProcessSockets] = field(default_factory=dict)
+
+    def addresses(self, take: Callable[[], str]) -> dict[str, str]:
+        """Return every slot's key with the address bound there, open ones filled by `take()`."""
+        return {key: slot.address or take() for key, slot in self.slots.items()}

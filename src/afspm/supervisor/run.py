@@ -17,7 +17,7 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.formatting import counted
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
-from afspm.experiment import Experiment, ProcessStart, Role, run_metadata
+from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
@@ -122,7 +122,7 @@ def go(
         before = run_json_or_empty(folder)  # empty unless the run is resumed
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
-        facts[METADATA] = before.get(METADATA) or run_metadata.of_run(experiment.resolved) | dict(options.metadata)
+        facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
         if before.get(ENDED) and REAL_S in before:
             facts[REAL_S] = before[REAL_S]
         run_folder.write_run(folder, facts)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.experiment import load, run_metadata
+from afspm.experiment import load
 
 SIMULATOR = (
     '[microscope]\ncomponent = true\nclass = "Simulator"\n\n[scheduler]\ncomponent = true\nclass = "Scheduler"\n'
@@ -18,7 +18,7 @@ NANONIS = SIMULATOR.replace("Simulator", "Nanonis")
 def metadata(folder: Path, text: str) -> dict[str, str]:
     file = folder / "e.toml"
     file.write_text(text, encoding="utf-8")
-    return run_metadata.of_run(load(file).resolved)
+    return load(file).resolved.metadata()
 
 
 @pytest.mark.parametrize(("text", "technique"), [(SIMULATOR, "AFM"), (ASYLUM, "AFM"), (NANONIS, None)])
