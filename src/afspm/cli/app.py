@@ -11,20 +11,15 @@ from typer.core import TyperCommand, TyperGroup
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
 from afspm.cli import (
-    clients,
     commission,
-    demo,
+    developing,
     doctor,
-    drivers,
     experiment_file,
     new,
-    notify,
-    recorded,
     run,
     runs,
     status,
     steer,
-    trace,
 )
 from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS
 
@@ -71,14 +66,14 @@ def _afspm(
     """Automate scanning probe microscopes: run experiments of several components that share one microscope."""
 
 
-app.command("demo")(demo.demo)
+app.command("demo")(run.demo)
 app.command("run")(run.run)
 app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
 app.command("doctor", rich_help_panel=BEFORE)(doctor.doctor)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
-app.command("notify", rich_help_panel=BEFORE)(notify.notify)
+app.command("notify", rich_help_panel=BEFORE)(experiment_file.notify)
 app.command("status", rich_help_panel=MEANWHILE)(status.status)
 app.command("watch", rich_help_panel=MEANWHILE)(status.watch)
 app.command("pause", rich_help_panel=MEANWHILE)(steer.pause)
@@ -88,14 +83,14 @@ app.command("restart", rich_help_panel=MEANWHILE)(steer.restart)
 app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
 app.command("note", rich_help_panel=MEANWHILE)(steer.note)
 app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
-app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
-app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
-app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
-app.command("test-client", rich_help_panel=MICROSCOPES)(clients.check_client)
-app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
+app.command("report", rich_help_panel=AFTERWARDS)(runs.report)
+app.command("export", rich_help_panel=AFTERWARDS)(runs.export)
+app.command("replay", rich_help_panel=AFTERWARDS)(runs.replay)
+app.command("test-client", rich_help_panel=MICROSCOPES)(developing.check_client)
+app.command("test-translator", rich_help_panel=MICROSCOPES)(developing.check_translator)
 app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
-app.command("trace", rich_help_panel=MICROSCOPES)(trace.trace)
-app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
+app.command("trace", rich_help_panel=MICROSCOPES)(run.trace)
+app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
 
 
 def _declared(name: str) -> Command | None:

@@ -1,22 +1,32 @@
-"""`afspm run`: an experiment, from its file to the folder that it leaves behind."""
+"""`afspm run`, `demo` and `trace`: an experiment, from its file to the folder that it leaves behind."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
 import typer
 
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
-from afspm.cli.arguments import RUNS, OptionalFiles, Runs, Speed, names_in, opt
+from afspm.cli.arguments import RUNS, Files, OptionalFiles, Runs, Speed, names_in, opt
 
 if TYPE_CHECKING:
     from afspm.basics.plain_data import PlainMapping
     from afspm.experiment import Experiment, ProcessStart
     from afspm.supervisor.resume import ResumableRun
     from afspm.supervisor.run import FinishedRun
+
+_QUESTIONS: Final = {
+    "sample": "Sample",
+    "person": "Your name",
+    "orcid": "Your ORCID iD",
+    "project": "Project",
+    "technique": "Technique (STM, STS or AFM)",
+}
+_TIP_REPAIR_NIGHT = "A simulated night of eight hours: the tip changes three times, and is repaired. Two minutes."
+_DRIFT_NIGHT = "A simulated night of eighteen hours on a sample that drifts by micrometres. Three to five minutes."
 
 
 class RunPage(Protocol):
@@ -77,7 +87,6 @@ def run(
     import sys
     from dataclasses import replace
 
-    from afspm.cli import metadata_questions
     from afspm.cli.experiment_file import require_no_errors
     from afspm.experiment import load
     from afspm.supervisor import resume as resuming
@@ -112,7 +121,7 @@ def run(
             typer.echo(_told(start))
         return
     if ask:
-        options = replace(options, metadata=metadata_questions.ask(experiment))
+        options = replace(options, metadata=ask_metadata(experiment))
     ended = running.run(experiment, options, terminal=sys.stdout)
     _stay(experiment, ended, stay)
     raise typer.Exit(ended.outcome.exit_code)
@@ -146,3 +155,88 @@ def _page() -> RunPage:
 def _told(start: ProcessStart) -> str:
     what = " ".join(start.command) or start.launch.class_
     return f"{start.launch.name} ({start.role.value}): {what}"
+
+
+def ask_metadata(experiment: Experiment) -> dict[str, str]:
+    """Ask what [metadata] of the file, and the class of the microscope, leave open or may have changed."""
+    known = experiment.resolved.metadata()
+    return {name: answer for name, text in _QUESTIONS.items() if (answer := _answer(name, text, known.get(name, "")))}
+
+
+def _answer(name: str, text: str, known: str) -> str:
+    """Ask until the answer is right; empty: it is not known."""
+    import pydantic
+
+    from afspm.experiment.sections import MetadataSection
+
+    while answer := typer.prompt(text, default=known, show_default=bool(known)).strip():
+        try:
+            return str(getattr(MetadataSection.model_validate({name: answer}), name))
+        except pydantic.ValidationError as error:
+            typer.echo(f"  {error.errors()[0]['msg'].removeprefix('Value error, ')}")
+    return ""
+
+
+def demo(
+    drift: Annotated[bool, typer.Option("--drift", help="The night on a sample that drifts.")] = False,
+    runs: Runs = RUNS,
+    dashboard: Annotated[bool, typer.Option("--dashboard", help="Show it in the browser, too.")] = False,
+) -> None:
+    """Show a simulated night: the tip changes, is seen to have changed, and is repaired.
+
+    Nothing but afspm is needed. The night leaves a folder with its scans, a picture and `report.html`.
+    """
+    typer.echo(_DRIFT_NIGHT if drift else _TIP_REPAIR_NIGHT)
+    typer.echo(f"It leaves a folder in {runs}, with report.html. Ctrl-C ends it early.")
+    run([_sample("drift_night" if drift else "tip_repair") / "experiment.toml"], runs=runs, dashboard=dashboard)
+
+
+def _sample(name: str) -> Path:
+    """Return the folder of a sample: the one in the wheel, in a clone that in `experiments`."""
+    package = Path(__file__).parents[1]
+    installed = package / "samples" / name
+    return installed if installed.is_dir() else package.parents[1] / "experiments" / name
+
+
+def trace(
+    files: Files,
+    runs: Runs = RUNS,
+    speed: Speed = None,
+) -> None:
+    """Run an experiment, and record everything that is said to and by the controller.
+
+    The trace is in the run's folder: one file, with the files that the controller saved and without secrets. Send it
+    with a report of a bug: `afspm emulate --replay` plays it back. As `afspm run` with `trace = true` in the section of
+    the translator.
+    """
+    import sys
+
+    from afspm.cli.experiment_file import require_no_errors
+    from afspm.supervisor import run as running
+    from afspm.translator.trace import FILE
+
+    experiment = _with_trace(files)
+    require_no_errors(experiment, (), ())
+    ended = running.run(experiment, running.RunOptions(runs=runs, speed=speed), terminal=sys.stdout)
+    file = ended.folder / FILE
+    typer.echo(f"the trace: {file}" if file.exists() else "nothing was said to the controller: there is no trace")
+    raise typer.Exit(ended.outcome.exit_code)
+
+
+def _with_trace(files: list[Path]) -> Experiment:
+    """Return the experiment, with a trace.
+
+    Raises:
+        ConfigError: its translator has none.
+    """
+    import tempfile
+
+    from afspm.basics.errors import ConfigError
+    from afspm.experiment import load
+    from afspm.experiment.tracing import trace_overlay
+
+    with tempfile.TemporaryDirectory() as folder:
+        overlay = trace_overlay(load(*files).resolved, Path(folder))
+        if overlay is None:
+            raise ConfigError("no translator here talks to a controller: nothing to trace", where=str(files[0]))
+        return load(*files, overlay)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.interpreter import python_command, python_environment
@@ -20,11 +21,14 @@ from afspm.experiment import ProcessStart
 from afspm.model import Role
 from afspm.supervisor.child_output import ChildOutput, OutputDropped, OutputLine, Stream
 from afspm.supervisor.supervision.supervisor_events import Exited
-from afspm.supervisor.windows_job import WindowsJob
 
 LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
 LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
+
+_EXTENDED_LIMITS = 9  # JobObjectExtendedLimitInformation
+_KILL_ON_CLOSE = 0x2000  # JOB_OBJECT_LIMIT_KILL_ON_JOB_CLOSE
+_KILLED = 1
 
 ChildEvent = OutputLine | OutputDropped | Exited
 HOST = "afspm.supervisor.host"
@@ -117,7 +121,7 @@ class ChildProcess:
                 f"{task.command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
             ) from error
         self.pid = self._popen.pid
-        self._job = WindowsJob(self._popen, has_tip=has_tip)
+        self._job = _WindowsJob(self._popen, has_tip=has_tip)
         self._fed = threading.Event()
         readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
         feeding = (task.launch.to_json(), readers)
@@ -184,3 +188,55 @@ def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path 
         # on Windows what ends the console (Ctrl-Break, or closing its window) must not reach what sees to a tip
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0) | getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
+
+
+class _JobLimits(ctypes.Structure):
+    """JOBOBJECT_EXTENDED_LIMIT_INFORMATION; of it only the flags are set."""
+
+    _fields_ = (
+        ("per_process_user_time", ctypes.c_int64),
+        ("per_job_user_time", ctypes.c_int64),
+        ("flags", ctypes.c_uint32),
+        ("minimum_working_set", ctypes.c_size_t),
+        ("maximum_working_set", ctypes.c_size_t),
+        ("active_processes", ctypes.c_uint32),
+        ("affinity", ctypes.c_size_t),
+        ("priority", ctypes.c_uint32),
+        ("scheduling", ctypes.c_uint32),
+        ("counters", ctypes.c_uint64 * 6),
+        ("memory", ctypes.c_size_t * 4),
+    )
+
+
+class _WindowsJob:
+    """A child and all that it starts, ended together.
+
+    Args:
+        has_tip: it is not ended with us, since it sees to the tip first; it ends by itself.
+    """
+
+    def __init__(self, child: subprocess.Popen[bytes], *, has_tip: bool) -> None:
+        self._handle = 0
+        self._kernel: Any = None
+        if sys.platform != "win32":
+            return
+        kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+        kernel.CreateJobObjectW.restype = ctypes.c_void_p
+        self._kernel = kernel
+        self._handle = kernel.CreateJobObjectW(None, None) or 0
+        limits = _JobLimits(flags=0 if has_tip else _KILL_ON_CLOSE)
+        job = ctypes.c_void_p(self._handle)
+        kernel.SetInformationJobObject(job, _EXTENDED_LIMITS, ctypes.byref(limits), ctypes.sizeof(limits))
+        kernel.AssignProcessToJobObject(job, ctypes.c_void_p(int(child._handle)))
+
+    def kill(self) -> None:
+        """End all that is in it."""
+        if self._handle:
+            self._kernel.TerminateJobObject(ctypes.c_void_p(self._handle), _KILLED)
+
+    def close(self) -> None:
+        """Let go of it; what is left in it ends, unless it has a tip to see to."""
+        if self._handle:
+            handle, self._handle = self._handle, 0
+            with contextlib.suppress(OSError):
+                self._kernel.CloseHandle(ctypes.c_void_p(handle))
