@@ -110,7 +110,7 @@ class Terminal:
         raise KeyboardInterrupt
 
     def _line(self, question: str) -> str:
-        """Ask; Ctrl-C then interrupts, and the end of the input as well."""
+        # The end of input counts as Ctrl-C: without a terminal there is no answer to wait for.
         with _interruptible():
             try:
                 return input(question)
@@ -120,7 +120,7 @@ class Terminal:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Let Ctrl-C end a question at once: nothing is being asked of the microscope meanwhile."""
+    # During a question no request is under way, so Ctrl-C need not wait for one.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield

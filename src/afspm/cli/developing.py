@@ -235,11 +235,7 @@ def _described(name: str, class_: type[Emulator]) -> str:
 
 
 def _settings(given: list[str]) -> dict[str, object]:
-    """`a=1`, `a.b="x"`, `a=word`: as in TOML, but that a word needs no quotes.
-
-    Raises:
-        ConfigError: not of that form.
-    """
+    # `a=1`, `a.b="x"`, `a=word`: as in TOML, but a word needs no quotes.
     import tomllib
 
     from afspm.basics.errors import ConfigError

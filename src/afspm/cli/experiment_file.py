@@ -51,7 +51,6 @@ def check(
 
 
 def _explain(experiment: Experiment, console: Console) -> None:
-    """Print the short form, and to the console what has become of each line."""
     from afspm.experiment.forms import all_forms
 
     for form in all_forms():
@@ -173,7 +172,6 @@ def _message(experiment: Experiment) -> Notification:
 
 
 def _arrives(targets: Targets, message: Notification, way: Way) -> bool:
-    """Send a message once, and say whether it arrived."""
     from afspm.basics.errors import ConfigError
     from afspm.components.notifications import NotDelivered
 

@@ -107,7 +107,6 @@ def say_unreachable(folder: Path, computer: str) -> NoReturn:
 
 
 def _running(where: Path) -> Path:
-    """Return the folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
     from afspm.record.run_json import ENDED, read_run_json

@@ -128,7 +128,6 @@ def run(
 
 
 def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:
-    """Keep the page of a dashboard that was started here, unless a person has stopped the run."""
     import sys
 
     from afspm.supervisor.supervision.run_end import EndReason
@@ -164,7 +163,6 @@ def ask_metadata(experiment: Experiment) -> dict[str, str]:
 
 
 def _answer(name: str, text: str, known: str) -> str:
-    """Ask until the answer is right; empty: it is not known."""
     import pydantic
 
     from afspm.experiment.sections import MetadataSection
@@ -192,7 +190,7 @@ def demo(
 
 
 def _sample(name: str) -> Path:
-    """Return the folder of a sample: the one in the wheel, in a clone that in `experiments`."""
+    # In a wheel samples lie in the package, in a clone in `experiments`.
     package = Path(__file__).parents[1]
     installed = package / "samples" / name
     return installed if installed.is_dir() else package.parents[1] / "experiments" / name
@@ -224,11 +222,6 @@ def trace(
 
 
 def _with_trace(files: list[Path]) -> Experiment:
-    """Return the experiment, with a trace.
-
-    Raises:
-        ConfigError: its translator has none.
-    """
     import tempfile
 
     from afspm.basics.errors import ConfigError

@@ -61,7 +61,6 @@ def runs(
 
 
 def _table(found: Sequence[RunSummary]) -> Table:
-    """Return a row for each run, without columns of which nothing is known."""
     from rich import box
     from rich.table import Table
 

@@ -62,7 +62,7 @@ def _text(follower: Follower) -> StatusText:
 
 
 def _goes_on(follower: Follower) -> bool:
-    """Return whether there is more to come. The run's lock is looked at only in silence: a disk may be far away."""
+    # The run's lock is tested only after a silence: it may lie on a slow network disk.
     from afspm.record.overview import OLD_S
 
     return not (follower.ended or (follower.silent_s() > OLD_S and follower.cut_off()))

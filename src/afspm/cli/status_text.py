@@ -138,7 +138,6 @@ class StatusText:
         return line.append(self._since(now.start_ns if now else None))
 
     def _scanning(self) -> Text:
-        """Return what the microscope does, and how far it is with a scan."""
         line, seen = self._microscope(), self._seen
         if seen.status is None or seen.status.state is not ScopeState.SCANNING:
             return line
@@ -175,7 +174,6 @@ class StatusText:
             yield _label("drift").append(registered)
 
     def _processes(self) -> Iterator[Text]:
-        """Yield those that are well in one line; each of the others in its own."""
         seen, states = self._seen, self._seen.processes.values()
         running = [state.name for state in states if state.condition not in OVER]
         unheard = {name: ns for name in running if (ns := seen.unheard_ns(name, self._run.speed)) is not None}
@@ -194,13 +192,11 @@ class StatusText:
                 yield line.append(f" ({state.last_exit})" if state.last_exit else "")
 
     def _lately(self, state: ProcessState) -> str:
-        """Return since when it is so; of what is over, when that was."""
         if state.condition is ProcessCondition.ENDED:
             return f" {duration_text((self._now_ns - state.since_ns) / NS_PER_S)} ago"
         return self._since(state.since_ns)
 
     def _refusals(self, most: int = 3) -> Iterator[Text]:
-        """Yield the last; what was refused again and again in the same way, once."""
         last: dict[tuple[str, str, str], tuple[int, int]] = {}
         for entry in self._seen.refusals:
             key = (entry.who, entry.what, entry.reason)
@@ -211,7 +207,6 @@ class StatusText:
             yield line.append(f": {reason}" if reason else "", "yellow")
 
     def _notes(self, most: int = 3) -> Iterator[Text]:
-        """Yield the last notes, with the scan that each belongs to."""
         numbers = {scan.time_ns: scan.number for scan in self._seen.scans}
         for note in list(self._seen.notes)[-most:]:
             on = f" on scan {numbers[note.scan_ns]}" if note.scan_ns in numbers else ""

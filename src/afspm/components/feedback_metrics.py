@@ -129,7 +129,7 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
 
 def _smooth_variance(values: Array) -> float:
-    """Return the variance along lines, less tilt and white noise: the covariance of neighbours where significant."""
+    # White noise has no covariance between neighbours, so theirs is the variance of the smooth part.
     x = np.linspace(-1.0, 1.0, values.shape[1])
     level = values - values.mean(axis=1, keepdims=True)
     level = level - np.outer(level @ x / (x @ x), x)

@@ -64,7 +64,7 @@ class FeedbackSignal:
         return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))
 
     def _gap_m(self, signal: Scan, setpoint: float | None) -> float:
-        """Return by how much the tip is too high where the relative error is one; 0 where that is not known."""
+        # 0 where the gap per relative error is not known.
         if same_kind(signal.unit, "A"):
             return -(self._sensitivity or _CURRENT_DECAY_M)
         unit, metres = ("m", 1.0) if same_kind(signal.unit, "m") else ("V", self._sensitivity or _M_PER_V)

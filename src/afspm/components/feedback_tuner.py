@@ -75,7 +75,7 @@ class FeedbackTuner(FeedbackObserver):
         self._finish("" if found is not None else "no gain is good")
 
     def _search(self, start: float) -> float | None:
-        """Return the gain to keep, if there is one. One that is good is noted, whatever happens afterwards."""
+        # A good gain is saved at once: a kill afterwards must not lose it.
         search = gain_search(start, self.factor, self.lowest, self.highest, self.most_tries)
         gain = next(search)
         try:
@@ -89,11 +89,6 @@ class FeedbackTuner(FeedbackObserver):
         return found
 
     def _try(self, gain: float) -> FeedbackQuality | None:
-        """Return how the feedback follows with a gain; None if that was refused.
-
-        Raises:
-            InvalidValue: the scan says nothing.
-        """
         try:
             self.scope.set_feedback(integral_gain=gain)
         except Refused as refused:
@@ -110,19 +105,17 @@ class FeedbackTuner(FeedbackObserver):
         return following
 
     def _keep(self, gain: float) -> None:
-        """Note the gain to leave behind, also for one that is started after a kill."""
         self.memory["gain"] = gain
         self.memory.save()
 
     def _finish(self, why: str) -> None:
-        """Set the gain that is to be left behind, and let the experiment go on."""
         self._set_back()
         if why:
             self.log.error("the feedback can't be improved: %s. Its setting is as before; please check it", why)
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
     def _leave_behind(self) -> None:
-        """The same where control was lost before that, or this process killed."""
+        # Control was lost before `_finish`, or this process was killed.
         if "gain" in self.memory:
             with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S):
                 self._set_back()

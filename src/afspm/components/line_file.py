@@ -69,7 +69,7 @@ class LineFile:
         self._waiting = ""
 
     def _mended(self) -> str:
-        """Cut off half a line at the end; returns the header that has to come before what is written."""
+        # A kill leaves half a line at the end, which is cut off; an empty file gets its header.
         if not self.path.exists():
             return f"{self._header}\n" if self._header else ""
         data = self.path.read_bytes()
@@ -88,7 +88,6 @@ def csv_line(row: Iterable[str]) -> str:
 
 
 def _append(path: Path, text: str) -> None:
-    """All of it or nothing. Raises OSError."""
     size = path.stat().st_size if path.exists() else 0
     try:
         with path.open("ab") as file:

@@ -118,7 +118,6 @@ class Metadata(Component):
         self._written.add(identity)
 
     def _conditions(self, what: str, time_ns: int | None) -> dict[str, str]:
-        """Return those noted when it began, if it is the measurement that they were noted for."""
         if self.memory.get("what") != what:
             return {}
         finished_ns = self.memory["finished_ns"]
@@ -132,7 +131,7 @@ class Metadata(Component):
 
 
 def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the cells that no two rows share; a row of an older version has no note."""
+    # No two rows share these cells; rows of older versions have no note.
     return tuple(
         row.get(column, "").replace("\n", " ") for column in ("time", "measurement", "filename", "channel", "note")
     )

@@ -162,7 +162,7 @@ def _post(url: str, notice: Notification) -> None:
 
 
 def _short(reason: object) -> str:
-    """Why, without what was asked for."""
+    # The text of the error may hold the address of the webhook, which is a secret.
     if isinstance(reason, OSError):
         return reason.strerror or type(reason).__name__
     return type(reason).__name__

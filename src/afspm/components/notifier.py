@@ -112,7 +112,6 @@ class Notifier(Component):
             self._try(waiting)
 
     def _tell(self, what: str, which: str, text: str) -> None:
-        """Have it delivered, once."""
         key = f"{what} {which}"
         if what not in self.on or key in self.memory["told"]:
             return

@@ -94,7 +94,6 @@ class PlannedScans(Component):
                 self.scope.set(name, quantity)
 
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
-        """Wait until a step is due. Returns False if the rounds that were left out were the last."""
         if not step.starts_round or self.memory.get("begun") == step.index:
             return True
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
@@ -121,7 +120,6 @@ class PlannedScans(Component):
         return is_left
 
     def _on_missed(self, rounds: int) -> None:
-        """Do as wanted about rounds that were due while control was lost or nothing ran, and tell log and record."""
         if not rounds:
             return
         if self.missed == "skip":
@@ -157,13 +155,12 @@ class PlannedScans(Component):
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), at)
 
     def _left_s(self, done: int, total: int) -> float:
-        """Return how long the rest takes, as fast as so far, but no faster than the beat."""
+        # As fast as so far, but not faster than `every` allows.
         per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
         return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 
     @property
     def _total(self) -> int | None:
-        """The number of scans, as far as it is known; None: without end."""
         missed = int(self.memory.get("missed", 0)) * len(self.plan.regions)
         return None if self.plan.total is None else max(self.plan.total - missed, int(self.memory.get("done", 0)))
 

@@ -118,7 +118,6 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
 
 
 def _seeds(file: Path) -> Plain:
-    """The seed of each component that has one, as the experiment file says."""
     try:
         said = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -116,7 +116,6 @@ class RecordWriter:
             self._wake()
 
     def _record_all(self, store: RecordStore) -> FileError | None:
-        """Record until it is over, or the journal turns out to be damaged: then return how."""
         try:
             while self._go_on(store):
                 pass
@@ -141,7 +140,7 @@ class RecordWriter:
                 self._put_aside(error)
 
     def _put_aside(self, error: FileError) -> None:
-        """A journal that can't be read is no reason to record nothing."""
+        # A damaged journal must not keep the rest of the night from being recorded.
         number = len(list(self._folder.glob(f"{JOURNAL_FILE}.damaged-*"))) + 1
         for suffix in ("", "-wal", "-shm"):
             file = self._folder / f"{JOURNAL_FILE}{suffix}"
@@ -153,7 +152,6 @@ class RecordWriter:
         self._wake()
 
     def _go_on(self, store: RecordStore) -> bool:
-        """Record what has come; False: it is over."""
         batch, ending = self._next()
         now_s = self._clock.monotonic_s()
         if batch:
@@ -171,7 +169,6 @@ class RecordWriter:
         return False
 
     def _next(self) -> tuple[list[SourcedPacket], bool | None]:
-        """Return the next packets; none if nothing has come for a while, or it is ending."""
         queued, ending = self._inbox.take(within_s=0.0 if self._told_behind else LOOK_S)
         logged: list[SourcedPacket] = []
         try:
@@ -190,7 +187,6 @@ class RecordWriter:
         self._told_behind = behind > (0 if self._told_behind else FAR_BEHIND_BYTES)
 
     def _safely(self, do: Callable[[], None]) -> bool:
-        """Do it as soon as there is room on the disk; False: it is ending, and there was none."""
         while True:
             try:
                 with self._step():
@@ -207,7 +203,7 @@ class RecordWriter:
             return True
 
     def _put_off(self, error: Exception) -> bool:
-        """The disk is full, or gone: said once, and tried again in a while. False: it is ending, and too late."""
+        # The disk is full or gone: logged once, then tried again until it has room, or the run ends.
         if not self._told_full:
             self._told_full = True
             self._logger.critical("nothing can be recorded, the experiment goes on: %s", error)
@@ -225,7 +221,7 @@ class RecordWriter:
             store.settle()
 
     def _commit(self, store: RecordStore) -> None:
-        """Say up to where everything is recorded, so that the log may be written over."""
+        # The log may be overwritten up to here.
         self._committed_s = self._clock.monotonic_s()
         try:
             with self._step():

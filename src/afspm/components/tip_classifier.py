@@ -98,7 +98,8 @@ class TipClassifier(Component):
         self._remember(pair.trace)
 
     def _tell(self, scan: Scan, verdict: Verdict) -> None:
-        """Flag after a bad verdict, so that a solver knows where; clear before a good one, so that it finds no flag."""
+        # A solver needs the verdict to know where the fault is, and must find no flag after a good one:
+        # so flag after a bad verdict, clear before a good one.
         self.log.info("%s: %s (%s)", _name(scan), verdict.opinion.value, verdict.why)
         if self.counter.wants_clear and self._is_flagged:
             self.log.info("the tip is good again: %s", verdict.why)

@@ -117,14 +117,12 @@ class TipCorrector(Component):
                     self._look()
 
     def _note(self, verdict: tuple[int, float] | None, frames: Mapping[int | None, Frame]) -> None:
-        """Keep the frame of the scan last judged bad, until another is judged good."""
         if verdict is None or verdict[1] == tip_verdict.UNCLEAR or "region" in self.memory:
             return
         self.memory["judged_bad"] = frames.get(verdict[0]) if verdict[1] == tip_verdict.BAD else None
         self.memory.save()
 
     def _look(self) -> None:
-        """Repair if that is wanted."""
         if self.memory.get("given_up"):
             if self.scope.is_flagged(self.problem) and self.scope.is_flagged(Problem.DEVICE_MALFUNCTION):
                 return
@@ -168,7 +166,6 @@ class TipCorrector(Component):
         self._give_up(why)
 
     def _of_experiment(self) -> tuple[Region | None, tuple[int, int] | None]:
-        """Region and shape of the experiment's scans, as they were before we moved away."""
         if "region" not in self.memory:
             parameters = self.scope.scan_parameters
             if parameters is None or not isinstance(parameters.region, Region):
@@ -179,11 +176,6 @@ class TipCorrector(Component):
         return _unpacked(self.memory["region"])
 
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
-        """Test scans until it is known whether the tip is good.
-
-        Raises:
-            _Blind: none can be taken.
-        """
         refused: list[str] = []
         for place in looks:
             try:
@@ -202,7 +194,6 @@ class TipCorrector(Component):
         return False
 
     def _own_score(self, scans: ScanSet) -> float:
-        """Judge, and clear the flag of a good tip."""
         for scan in scans.values():
             pair = self.pairing.add(scan)
             if pair is not None and self.judge is not None:
@@ -217,7 +208,6 @@ class TipCorrector(Component):
         return tip_verdict.UNCLEAR
 
     def _score_of_others(self, scans: ScanSet, answers: Events) -> float:
-        """Wait for the verdict on these scans, or for the flag to be removed."""
         times = {scan.time_ns for scan in scans.values()}
         for event in answers:
             if not self.scope.is_flagged(self.problem):
@@ -237,7 +227,6 @@ class TipCorrector(Component):
             self.memory.save()
 
     def _restore(self, region: Region | None) -> None:
-        """Set the scan region back to the experiment's: its next scan may take what it finds."""
         if region is None:
             return
         try:
@@ -253,7 +242,7 @@ class TipCorrector(Component):
         self.memory.save()
 
     def _wait_flag(self, problem: int | str, *, flagged: bool) -> None:
-        """Until the scheduler's word for it is here: what is older must not be taken for a change."""
+        # An older ControlState must not be taken for a change.
         self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
     def _begin_anew(self) -> None:

@@ -278,7 +278,6 @@ class TipJudge:
         return len(kind.first) >= self.reference_scans
 
     def _kind(self, region: Region, shape: tuple[int, int]) -> TipReference:
-        """Return the reference of such scans, begun if there is none; the least recently used makes room for it."""
         kinds = self._state.kinds
         kind = next((one for one in kinds if one.fits(region, shape)), None)
         if kind is not None:
@@ -320,7 +319,7 @@ class TipJudge:
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 
     def _clear_suspicion(self, by: TipReference) -> None:
-        """A fault that comparing like with like has found is over if the same comparison, as fine, finds none."""
+        # Only a comparison at least as fine as the one that found the fault can clear it.
         for kind in self._state.kinds:
             kind.suspect = kind.suspect and by.pixel_m > (1.0 + SAME_SIZE) * kind.pixel_m
 
@@ -378,7 +377,7 @@ def _kind_text(region: Region, shape: tuple[int, int]) -> str:
 
 
 def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
-    """Return detail and unrest as parts of the usual ones, 1 where there is usually none, and the rest as it is."""
+    # Ghost and contrast are correlations already, and need no usual value.
     unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
     return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
 

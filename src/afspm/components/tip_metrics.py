@@ -135,7 +135,6 @@ def ghost(correlation: Array, expected: Array | None = None) -> float:
 
 
 def _levelled(heights: Array) -> Array:
-    """Each line less its median and the common tilt, holes filled."""
     values = _filled(np.array(heights, dtype=np.float64))
     tilt = np.median(np.diff(values, axis=1))
     values = values - tilt * np.arange(values.shape[1])
@@ -154,14 +153,13 @@ def _filled(values: Array) -> Array:
 
 
 def _clipped(slope: Array) -> Array:
-    """Less the common slope, the few steepest limited: one large particle must not outweigh all else."""
+    # Without the limit one large particle would outweigh all other slopes.
     slope = slope - np.median(slope)
     limit = np.quantile(np.abs(slope), 0.995)
     return np.clip(slope, -limit, limit) if limit > 0 else slope
 
 
 def _band_powers(of: Slopes) -> tuple[float, float, float]:
-    """Power of the slopes in the short and the long band, and that of noise in both."""
     nx = of.trace.shape[1]
     window = np.hanning(nx + 2)[1:-1]
     first = np.fft.rfft(of.trace * window, axis=1)
@@ -200,7 +198,7 @@ def _unrest_m(of: Slopes) -> float:
 
 
 def _flat(slope: Array) -> Array:
-    """1 where the scan is flat, 0 near edges: there trace and retrace differ since feedback lags behind."""
+    # 1 where the scan is flat: near edges trace and retrace differ because the feedback lags behind.
     steep = np.abs(slope)
     steep = np.maximum(steep, np.maximum(np.roll(steep, 1, axis=1), np.roll(steep, -1, axis=1)))
     flat = steep <= np.quantile(steep, 0.6)
@@ -209,7 +207,7 @@ def _flat(slope: Array) -> Array:
 
 
 def _smoothed(correlation: Array) -> Array:
-    """The mean of each 3 x 3: a ghost is as wide as an edge, chance is not."""
+    # A ghost is as wide as an edge, so the mean of 3 x 3 keeps it and lowers chance maxima.
     padded = np.pad(correlation, 1, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     smooth: Array = windows.mean(axis=(-1, -2))

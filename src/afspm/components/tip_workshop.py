@@ -52,7 +52,7 @@ class TipWorkshop:
                 self._log.warning("%s was interrupted: %s; retrying at a fresh place", treatment, lost.what)
 
     def _fresh_place(self, number: int) -> XY:
-        """Return where to try the `number`-th treatment. It is counted before: a kill must not make it happen twice."""
+        # Counted before it is done: after a kill a treatment is left out rather than repeated.
         places = int(self._memory.get("places", 0))
         self._memory["tried"], self._memory["places"] = number, places + 1
         if not self._memory.save():
@@ -88,7 +88,7 @@ class TipWorkshop:
         return True
 
     def _go_to(self, place: XY) -> None:
-        """Move the probe to a place; with the scan frame, where the microscope moves its tip in that alone."""
+        # Some microscopes move the tip only together with the scan frame.
         try:
             self._scope.move_probe(place)
         except Refused as refused:
@@ -102,7 +102,6 @@ class TipWorkshop:
             self._scope.move_probe(place)
 
     def _stands_at(self, place: XY) -> bool:
-        """Return whether the probe is published to be nearer to this place than to any other."""
         position = self._scope.probe_position
         return position is not None and math.dist(position.xy_m, place) <= self._spacing / 2
 
@@ -111,7 +110,7 @@ class TipWorkshop:
         return "an unknown place" if position is None else f"at {position_text(position.xy_m)}"
 
     def _act(self, action: str) -> None:
-        """Do it, and let it end: what is asked of a busy microscope it refuses."""
+        # A busy microscope refuses the next action, so wait until this one has ended.
         with self._scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
             try:
                 self._scope.action(action)

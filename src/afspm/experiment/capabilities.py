@@ -57,7 +57,6 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:
-    """Return what an action of the experiment file sets, in SI."""
     given = action.get("set") if isinstance(action, Mapping) else None
     values = table.written(given, where="actions") if isinstance(given, Mapping) else {}
     return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values.items())

@@ -83,7 +83,7 @@ def importing_from(folders: Sequence[Path]) -> Iterator[None]:
 
 
 def _is_from(folder: Path, name: str) -> bool:
-    """Return whether a module was imported from a folder, and not from an environment (.venv) that lies in it."""
+    # A module of an environment (.venv) inside the folder is not the user's file.
     file = getattr(sys.modules[name], "__file__", None)
     if not file:
         return False
@@ -147,7 +147,7 @@ def role_of(component: type) -> Role | None:
 
 
 def _attribute(module: ModuleType, name: str) -> Any:
-    """Return a name of a module, which a package may only import when it is asked for."""
+    # Packages may import a name lazily, by a module-level `__getattr__`.
     try:
         return getattr(module, name)
     except AttributeError:
@@ -160,7 +160,7 @@ def _attribute(module: ModuleType, name: str) -> Any:
 
 
 def _hidden(module: ModuleType) -> str:
-    """Return what to do where a file of the user's has the name of a module of Python's; empty where none has."""
+    # Python imported another module of this name instead of the user's file.
     for folder in sys.path:
         file = Path(folder, f"{module.__name__}.py")
         if file.exists():
@@ -199,7 +199,6 @@ def _search_paths(parent: str) -> list[str]:
 
 
 def _where(error: BaseException) -> str:
-    """Return the last line of a traceback with file and line, in one line."""
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     said = str(error)
@@ -213,7 +212,6 @@ def _public_classes(module: ModuleType) -> list[str]:
 
 
 def _names(value: object) -> tuple[str, ...] | None:
-    """Return a text or texts as a tuple of texts; enum members by their name. None for what is not declared."""
     if value is None or isinstance(value, property):
         return None
     if isinstance(value, str):

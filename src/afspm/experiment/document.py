@@ -120,7 +120,6 @@ _HABITS = (
 
 
 def _habit(what: str, written: str) -> str:
-    """Return what to write instead of a line that would be right elsewhere."""
     return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
 
 

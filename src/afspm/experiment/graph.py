@@ -51,7 +51,6 @@ class ProcessBox:
 
     @property
     def _sides(self) -> tuple[float, float]:
-        """The room that the two arrows and their labels take, left and right of the middle between the arrows."""
         left = max([text_width(label, LABEL_SIZE) for label in self.labels], default=0.0)
         right = text_width("requests", LABEL_SIZE) if self.asks else 0.0
         return left + ARROW_AT + 8, right + ARROW_AT + 8
@@ -129,7 +128,7 @@ class _Drawing:
         return ProcessBox(part, lines, labels, asks=not written)
 
     def _from_scheduler(self, part: ExperimentPart) -> list[str]:
-        """Return what it hears from the scheduler: not what only other components publish; at least that it is over."""
+        # KILL reaches every component, so no list is empty.
         prefixes = self.resolved.processes[part.name].envelopes
         if prefixes is None or "" in prefixes:
             return ["all envelopes"]
@@ -156,7 +155,6 @@ class _Drawing:
     # --- where it goes --------------------------------------------------------------------------------------------
 
     def _top(self) -> float:
-        """Return the y of the components' upper edge."""
         return MARGIN + 34 + LANE * len(self.lanes)
 
     def _place(self) -> None:
@@ -191,7 +189,6 @@ class _Drawing:
             self._down(box.x + box.arrows_at + ARROW_AT, top, bottom)
 
     def _hears_scheduler(self, box: ProcessBox) -> bool:
-        """Some only listen to other components."""
         sources = self.resolved.net.links[box.part.name].subscribe
         own = {f"{p.name}/publish" for p in self.resolved.with_role(Role.SCHEDULER)}
         own |= {slot.address for key, slot in self.resolved.net.slots.items() if key in own and slot.address}
@@ -200,7 +197,6 @@ class _Drawing:
         return any(source in own or source not in others for source in sources)
 
     def _up(self, x: float, top: float, bottom: float, labels: Sequence[str]) -> None:
-        """Envelopes, from below to above, with their names to the left."""
         self.svg.line([(x, bottom), (x, top + 1)], stroke=ENVELOPES)
         y = (top + bottom) / 2 - LINE * (len(labels) - 1) / 2 + 4
         for label in labels:
@@ -208,7 +204,6 @@ class _Drawing:
             y += LINE
 
     def _down(self, x: float, top: float, bottom: float) -> None:
-        """Requests, from above to below."""
         self.svg.line([(x, top), (x, bottom - 1)], stroke=CONTROL)
         self.svg.text(x + 8, (top + bottom) / 2 + 4, "requests", size=LABEL_SIZE, fill=CONTROL, anchor="start")
 
@@ -226,7 +221,6 @@ class _Drawing:
         self.svg.text(middle, y - 6, lane.label, size=LABEL_SIZE, fill=ENVELOPES, halo=True)
 
     def _entry(self, lane: PublisherLane, box: ProcessBox) -> float:
-        """Return where a lane comes down to a listener: each at a place of its own, left of the box's own."""
         arriving = [other for other in self.lanes if box in other.listeners]
         return box.x - box.width / 4 + arriving.index(lane) * min(14.0, box.width / 2 / (len(arriving) + 1))
 
@@ -240,7 +234,6 @@ class _Drawing:
         self._addresses(part.name, self.bar_x + 14, self.bar_x + self.bar_width - 14, self.bar_y + 27)
 
     def _addresses(self, name: str, left: float, right: float, y: float) -> None:
-        """Where a process publishes (left) and answers (right)."""
         for use, said, x, anchor, colour in (
             ("publish", "publishes", left, "start", ENVELOPES),
             ("serve", "answers", right, "end", CONTROL),
@@ -251,7 +244,6 @@ class _Drawing:
                 self.svg.text(x, y + LINE, _at(slot.address), size=TEXT_SIZE, fill=GREY, anchor=anchor)
 
     def _translator(self, box: ProcessBox) -> float:
-        """Return the translator below the bar and its microscope below it; returns where that ends."""
         middle = self.bar_x + self.bar_width / 2
         top = self.bar_y + BAR_HEIGHT
         name = box.part.name

@@ -207,7 +207,6 @@ class LimitsReader:
         return Region(center, size, box.angle)
 
     def _check_sizes(self, limits: ExperimentLimits) -> None:
-        """The smallest scan allowed must fit into the region allowed."""
         if limits.region is None:
             return
         longest_m = math.hypot(*limits.region.size_m)
@@ -230,7 +229,6 @@ def _unit_given(given: Table) -> str | None:
 
 
 def _rate(value: Quantity, unit: str) -> float:
-    """Return a change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
     if not isinstance(value, str):
         require_unit(value, unit)
         return float(value)

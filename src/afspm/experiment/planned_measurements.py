@@ -137,7 +137,6 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
 
 
 def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
-    """Return how a plan would lie within the region allowed: the nearest region, or how far all of it has to move."""
     points = [point for region in planned.regions for point in region.corners_m()] + list(planned.positions)
     if allowed is None or not points:
         return ""
@@ -174,7 +173,7 @@ def nearest_region(region: Region, allowed: Region) -> Region:
 
 
 def _rounded(region: Region) -> Region:
-    """Return a region in the digits of `lengths_text`; a centre that is zero but for the arithmetic is zero."""
+    # The digits of `lengths_text`; a centre of 1e-22 m from rounding is shown as zero.
     width, height = (float(f"{size_m:.5g}") for size_m in region.size_m)
     x, y = (float(f"{place_m:.5g}") if abs(place_m) > 1e-6 * width else 0.0 for place_m in region.center_m)
     return replace(region, center_m=(x, y), size_m=(width, height))
@@ -189,7 +188,6 @@ def _nearest(region: Region, allowed: Region, margin: float) -> Region:
 
 
 def _extent(points: Iterable[XY], allowed: Region) -> list[tuple[float, float]]:
-    """Return the lowest and highest place of points along the sides of the region allowed, from its centre."""
     cos, sin = math.cos(allowed.angle_rad), math.sin(allowed.angle_rad)
     places = [(float(x) - allowed.center_m[0], float(y) - allowed.center_m[1]) for x, y in points]
     along = [cos * x + sin * y for x, y in places]
@@ -198,7 +196,6 @@ def _extent(points: Iterable[XY], allowed: Region) -> list[tuple[float, float]]:
 
 
 def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
-    """Return the shortest shift by which points come to lie within a region; None: they are too far apart."""
     moves = []
     for (low, high), size in zip(_extent(points, allowed), allowed.size_m, strict=True):
         if high - low > size * (1 + 1e-12):

@@ -122,11 +122,8 @@ def not_installed(resolved: ResolvedExperiment, names: Collection[str]) -> Itera
 
 
 def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], without: set[str]) -> ProcessSockets:
-    """Return the sockets of a process, without those that nobody can know of.
-
-    A component that is left out, and has no address, is not there. And nobody has to write down an address for the
-    sake of what is not in the file.
-    """
+    # Left out: publishers without an address that are not started here. Parts that the file does not mention must not
+    # force an address into it.
     links, is_implied = resolved.net.links[name], resolved.processes[name].part.implied
     unknown = {
         key
@@ -143,7 +140,6 @@ def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], with
 def _require_addresses(
     resolved: ResolvedExperiment, links: Mapping[str, ProcessSockets], chosen: set[str], implied: set[str]
 ) -> None:
-    """Between a process started here and one started elsewhere the address must be written down."""
     missing: dict[str, set[str]] = {}
     for name in links.keys() - implied:
         for key in (links[name].control, *links[name].subscribe):
@@ -208,7 +204,7 @@ def _start(
 
 
 def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
-    """Environment variables that hold secrets of others."""
+    # Environment variables with secrets of other processes.
     every = {DASHBOARD_PASSWORD, *_variable(resolved.sections.notify.webhook)}
     every.update(*map(_secrets, resolved.processes.values()))
     return tuple(sorted(every - _secrets(process)))
@@ -219,7 +215,6 @@ def _secrets(process: ResolvedProcess) -> set[str]:
 
 
 def _variable(secret: object) -> list[str]:
-    """The environment variable that is named instead of a secret."""
     return [secret[1:]] if isinstance(secret, str) and secret.startswith("$") else []
 
 
@@ -246,7 +241,6 @@ def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | Non
 
 
 def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mapping[str, str]) -> dict[str, str] | None:
-    """Return the folder of the keys, and whose key to expect at each address; see `Network.from_launch`."""
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.sections.security.insecure else None
     slots = resolved.net.slots.items()
@@ -265,25 +259,22 @@ def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mappin
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
-    """Return whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
 
 
 def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str, ...]:
-    """Return the problems that components solve, here or on another computer."""
     solvers = (process for process in resolved.processes.values() if process.name not in without)
     return tuple(sorted({problem for process in solvers for problem in process.declared.solves}))
 
 
 def _retracts(resolved: ResolvedExperiment) -> bool:
-    """Return whether a tip without feedback is to be retracted when nobody is in control any more."""
+    # A tip without feedback drifts into the sample: it is retracted once no component is in control.
     watchdog = resolved.sections.control.watchdog()
     return watchdog.retract is not None and FEEDBACK_OFF in watchdog.dangerous
 
 
 def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
-    """Return the sections that the scheduler enforces, as arguments of its constructor: plain data, in SI."""
     control = resolved.sections.control
     if control.roles.operate is None:
         # components by which a person may command, and a dashboard that joins later, which is under no other's name

@@ -100,7 +100,7 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
 
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
-    """Return what the class says; a setting `problem` takes the place of its default there."""
+    # A setting `problem` replaces its default value in what the class solves and flags.
     said = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
@@ -113,7 +113,6 @@ def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
 
 
 def _resolve_sections(resolved: ResolvedExperiment) -> None:
-    """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
     parts, document = resolved.parts, resolved.document
     resolved.caching = _cache_section(parts.sections.get("cache", {}), document)
     translators = resolved.with_role(Role.TRANSLATOR)
@@ -170,10 +169,8 @@ def _check_cache_mapping(name: str, document: Document) -> None:
 
 
 def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
-    """Report errors within the tables of a component some of whose other settings are wrong already.
-
-    Only settings that are right as far as was seen count: what does not fit together may do so when others are mended.
-    """
+    # Some settings are wrong already, so the component can't be made properly; its errors count only within
+    # tables that were sound, since settings that contradict each other may agree once the others are corrected.
     sound = process.settings.keys() - (process.wrong or ())
     try:
         planned_measurements.plan_of(component, process.settings)
@@ -193,7 +190,7 @@ def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:
-    """Return where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
+    # "panel[1].set" is ("panel", 1, "set").
     where = error.where.removeprefix("simulation.").removeprefix("the experiment file, ")
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
@@ -201,7 +198,7 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
 def _resolve_plan(
     process: ResolvedProcess, component: type, resolved: ResolvedExperiment, has: MicroscopeCapabilities | None
 ) -> None:
-    """Make a ready-made component once: it knows best whether its settings fit together."""
+    # The component is made once, since its constructor checks best whether settings fit together.
     name = process.name
     try:
         plan = planned_measurements.plan_of(component, process.settings)
@@ -234,7 +231,7 @@ def _resolve_plan(
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
-    """By the key `role`, else by the wiring keys that only one role has."""
+    # A command has no class to derive from: the key `role` decides, else wiring keys that only one role has.
     written = part.own.get("role")
     if written is not None:
         if written in [role.value for role in Role]:
@@ -247,7 +244,6 @@ def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
 
 
 def _messages(given: object, document: Document) -> tuple[str, ...]:
-    """`messages`: .proto files, absolute, and modules with messages of the user."""
     if not isinstance(given, list) or not all(isinstance(one, str) for one in given):
         document.error("`messages` is not a list of texts", "messages", hint='messages = ["my.proto"]')
         return ()
@@ -267,7 +263,6 @@ def _messages(given: object, document: Document) -> tuple[str, ...]:
 
 
 def _problems(table: Table, document: Document) -> dict[str, int]:
-    """[problems]: each name with its number; a wrong one is reported and left out."""
     named: dict[str, int] = {}
     for name, number in table.items():
         if not isinstance(number, int) or isinstance(number, bool):

@@ -23,7 +23,7 @@ _ORCID: Final = re.compile(r"(?:https://orcid\.org/)?(\d{4}-\d{4}-\d{4}-\d{3}[\d
 
 
 def _checked_orcid(text: str) -> str:
-    """Return an ORCID iD as a URI. The last digit is checked after ISO 7064 (MOD 11-2)."""
+    # The last digit is a check digit after ISO 7064 (MOD 11-2).
     found = _ORCID.fullmatch(text)
     if found is None:
         raise ValueError("an ORCID iD looks like 0000-0002-1825-0097")

@@ -72,7 +72,7 @@ def check(
 
 
 def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
-    """Return what to do about a setting of a class that a later file has replaced; empty: none has."""
+    # A later file that changes the class alone leaves behind settings that only the earlier class had.
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
@@ -135,7 +135,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
 
 
 def _object(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
-    """Return an intermediary class of the user's own: checked here, made by the process."""
+    # An intermediary class of the user's is checked here, and made in its process.
     settings = {key: item for key, item in value.items() if key != "class"}
     try:
         wanted = class_loader.load(value["class"])
@@ -149,7 +149,6 @@ def _object(value: Settings, path: tuple[str, ...], document: Document) -> Setti
 
 
 def _is_quantity(value: object) -> bool:
-    """Return whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
     for unit in _ANNOTATED:
@@ -172,7 +171,6 @@ def _has_own_config(annotation: object) -> bool:
 
 @cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of the constructor, and those of its base classes that it hands **settings on to."""
     found: dict[str, inspect.Parameter] = {}
     for init in _constructors(component):
         own = list(inspect.signature(init).parameters.values())[1:]  # without self
@@ -183,7 +181,6 @@ def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
 
 @cache
 def _constructors(component: type) -> Sequence[Callable[..., object]]:
-    """`__init__` of the class, and of its bases for as long as each passes **keywords on."""
     chain: list[Callable[..., object]] = []
     for base in component.__mro__:
         init = vars(base).get("__init__")
@@ -197,7 +194,7 @@ def _constructors(component: type) -> Sequence[Callable[..., object]]:
 
 @cache
 def _annotations(component: type) -> Table:
-    """Of every parameter, resolved; those that can't be (imported for typing only) are left out."""
+    # Annotations imported under TYPE_CHECKING only can't be resolved, and are left out.
     kinds: Settings = {}
     for init in reversed(_constructors(component)):
         try:

@@ -74,7 +74,6 @@ def check_roles(resolved: ResolvedExperiment) -> None:
 
 
 def _not_a_component(resolved: ResolvedExperiment, role: Role) -> str | None:
-    """Return the table of a class of this role that lacks `component = true`."""
     for name, table in resolved.parts.intermediaries.items():
         with contextlib.suppress(class_loader.Unloadable):
             if (
@@ -241,7 +240,7 @@ def _may_publish_lines(translator: ResolvedProcess) -> bool:
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
-    """A prefix fits what it begins; scans, spectra and what rules of the cache fill in go on behind their beginning."""
+    # Names of scans, spectra, and rules of the cache with {fields} go on after their beginning.
     continued = [*(f"{one.name}_" for one in wire.declared() if one.named), *filter(None, made)]
     return any(name.startswith(prefix) for name in published) or prefix.startswith(tuple(continued))
 
@@ -301,7 +300,7 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
 
 
 def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
-    """False for a person of a dashboard or gateway that does not know the password of this person."""
+    # A role for a person who has no password at this page would be open to anyone who types the name.
     name, _, person = member.partition(PERSON)
     process = resolved.processes.get(name)
     if not person or process is None or not process.says("has_people"):
@@ -362,7 +361,6 @@ def check_handlers(resolved: ResolvedExperiment) -> None:
 
 
 def _handlers_of(component: type[Component]) -> Iterator[tuple[str, Callable[..., object]]]:
-    """Methods of the user's that are called, or look so."""
     ours = set(Component.__mro__)
     seen: set[str] = set()
     for base in (base for base in component.__mro__ if base not in ours):
@@ -373,7 +371,6 @@ def _handlers_of(component: type[Component]) -> Iterator[tuple[str, Callable[...
 
 
 def _hint_on_handler(name: str, resolved: ResolvedExperiment) -> str:
-    """Return what to do about a handler that is never called; empty: it is."""
     valid = {*_CALLED_METHODS, *(message.handler for message in wire.declared())}
     near = closest(name, valid, _HANDLER_CUTOFF)
     if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own

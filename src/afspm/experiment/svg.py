@@ -100,7 +100,6 @@ class Svg:
 
 
 def _rounded(points: Sequence[tuple[float, float]], radius: float = 8) -> str:
-    """Return a path with right angles rounded off."""
     x, y = points[0]
     path = [f"M{x:.1f} {y:.1f}"]
     for (ax, ay), (bx, by), (cx, cy) in zip(points, points[1:], points[2:], strict=False):

@@ -33,7 +33,6 @@ def to_toml(parts: ExperimentParts, *, secrets: bool = True) -> str:
 
 
 def _secrets_in(value: object) -> list[str]:
-    """Return the secrets in a document, each once, wherever they are."""
     if isinstance(value, list | tuple):
         return list(dict.fromkeys(secret for one in value for secret in _secrets_in(one)))
     if not isinstance(value, Mapping):
@@ -44,7 +43,7 @@ def _secrets_in(value: object) -> list[str]:
 
 
 def _without(secrets: list[str], value: object) -> Any:
-    """Return a document with names of environment variables instead of secrets, which a variable may hold, too."""
+    # A variable may hold the same secret, so values are compared, not keys.
     if isinstance(value, Mapping):
         return {key: _without(secrets, one) for key, one in value.items()}
     if isinstance(value, list | tuple):

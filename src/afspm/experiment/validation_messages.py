@@ -73,7 +73,7 @@ def name_of(path: SettingPath) -> str:
 
 
 def _place(one: ErrorDetails, given: Any) -> SettingPath:
-    """Return where in the given value an error is: its location without the names of alternatives and validators."""
+    # pydantic's location also holds names of union members and validators, which the file does not.
     place: list[str | int] = []
     for number, part in enumerate(one["loc"], 1):
         if part in (given if isinstance(given, Mapping) else range(len(given)) if isinstance(given, list) else ()):
@@ -85,7 +85,6 @@ def _place(one: ErrorDetails, given: Any) -> SettingPath:
 
 
 def _sentence(errors: Sequence[ErrorDetails], shown: str, known: Iterable[str]) -> tuple[str, str]:
-    """Return what is wrong with one value, and the hint."""
     given = errors[0].get("input")
     if len(errors) > 1 and isinstance(given, list | Mapping):  # alternatives: it is not meant as a quantity
         errors = [one for one in errors if _cause(one) is None] or errors

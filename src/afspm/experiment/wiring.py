@@ -133,7 +133,6 @@ def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wir
 def _sources(
     process: ResolvedProcess, scheduler: ResolvedProcess | None, processes: Mapping[str, ResolvedProcess], net: Wiring
 ) -> tuple[str, ...]:
-    """Return where it subscribes: as said, else at the scheduler and at publishers of what it listens to."""
     own = process.wires
     published = f"{scheduler.name}/publish" if scheduler else ""
     if own.subscribe is not None:
@@ -154,5 +153,5 @@ def _sources(
 
 
 def _overlap(published: Collection[str], prefixes: Collection[str] | None) -> bool:
-    """Return whether any envelope of the one is wanted by the other; no prefixes means all are."""
+    # No prefixes: all envelopes are wanted.
     return prefixes is None or any(e.startswith(p) or p.startswith(e) for e in published for p in prefixes)

@@ -70,7 +70,6 @@ def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands
 
 
 def _file(experiment: Experiment) -> Iterator[Diagnosis]:
-    """Yield the errors that `afspm check` tells."""
     errors = [one for one in experiment.check() if one.is_error]
     for one in errors:
         yield Diagnosis("file", Severity.ERROR, str(one.place), one.what, one.hint)
@@ -79,7 +78,6 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
 
 
 def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
-    """Yield what is wrong with the key files of this computer."""
     if (folder := experiment.keys_folder) is None:
         return
     here = sorted(file.stem for file in (folder / "private").glob("*.key_secret"))
@@ -108,7 +106,6 @@ def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
 
 
 def _disk(runs: Path) -> Iterator[Diagnosis]:
-    """Yield space and speed of the disk of the run folders."""
     folder = next(one for one in (runs.resolve(), *runs.resolve().parents) if one.is_dir())
     clock, file = ExperimentClock.real(), folder / f".afspm-doctor-{os.getpid()}"
     try:
@@ -127,7 +124,6 @@ def _disk(runs: Path) -> Iterator[Diagnosis]:
 
 
 def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
-    """Return what processes of this computer take, bytes."""
     sizes: dict[str, int] = {}
     for name, pid in pids.items():
         with suppress(psutil.Error):
@@ -155,7 +151,6 @@ class _Connections:
             self._into.found.append(diagnosis.of_versions(probe.versions_here(), None))
 
     def _addresses(self) -> dict[str, Reach]:
-        """Look at every address that the file holds."""
         slots = [slot for slot in self._experiment.resolved.net.slots.values() if slot.address]
         reached = {
             slot.address: (slot, probe.reach(connectable(slot.address)))
@@ -170,7 +165,7 @@ class _Connections:
         return {connectable(address): one for address, (_, one) in reached.items()}
 
     def _launch(self) -> Launch | None:
-        """Return how the scheduler is asked: as the file says, or as the run that goes on here does."""
+        # A run that goes on here is joined as a guest: keys made for a run are in its folder, not in the file.
         experiment = self._experiment
         asking = experiment.asking([part.name for part in experiment.resolved.with_role(Role.COMPONENT)])
         publish = experiment.resolved.net.slots.get(f"{self._scheduler}/publish")
@@ -184,7 +179,6 @@ class _Connections:
         return replace(asking, name=name, sockets=sockets, keys=told, messages=messages)
 
     def _guest(self) -> Launch | None:
-        """Return how a guest joins the newest run here; None: nothing goes on."""
         try:
             folder = find_run(self._experiment.files[0])
             return guest_of(folder, f"guest:doctor-{os.getpid()}") if goes_on(folder) else None
@@ -192,13 +186,11 @@ class _Connections:
             return None
 
     def _owner_of_key(self) -> str:
-        """Return whose key the doctor uses: that of the supervisor, or another that is here."""
         folder = self._experiment.keys_folder
         here = [] if folder is None else [file.stem for file in sorted((folder / "private").glob("*.key_secret"))]
         return next((name for name in (*_ASKED_AS, *here) if name in here), SUPERVISOR)
 
     def _speak(self, launch: Launch, listen_s: float) -> None:
-        """Exchange keys with the scheduler; then ask for its time, and listen."""
         address, owner = str(launch.sockets.control), launch.name.partition(":")[0]
         try:
             network = Network.from_launch(launch.name, launch.keys)
@@ -214,7 +206,6 @@ class _Connections:
             self._into.found.append(Diagnosis("key-file", Severity.ERROR, error.where, error.what, error.hint))
 
     def _listen(self, launch: Launch, listen_s: float) -> None:
-        """Ask what time it is, and count what is published."""
         wall = ExperimentClock.real()
         port = open_port(launch, wall)
         until_s, asked_s, caught_up_s = wall.monotonic_s() + listen_s + probe.WITHIN_S, 0.0, None
@@ -244,7 +235,6 @@ class _Connections:
         self._into.found.append(told)
 
     def _compare(self, told: Plain, asked_s: float, answered_s: float) -> None:
-        """Compare clocks and versions with those of the scheduler."""
         if not told.get("waits"):  # a simulated time that slows down does not tell real time
             now_s, start_s, origin_s, speed = (float(told[name]) for name in ("now_ns", "start_s", "origin_s", "speed"))
             real_s = origin_s + (now_s / NS_PER_S - start_s) / speed
@@ -255,7 +245,6 @@ class _Connections:
         self._into.found.append(diagnosis.of_versions(probe.versions_here(), theirs))
 
     def _processes(self, states: object) -> None:
-        """Note which processes are not well, as their supervisors tell."""
         if not isinstance(states, ProcessStates):
             return
         if states.supervisor.startswith(computer_name()):

@@ -95,7 +95,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
 
 @contextmanager
 def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) -> Iterator[None]:
-    """Heartbeats while in the block. Only an end on purpose is announced: after an error the silence tells."""
+    # Only an end on purpose is announced; after an error the supervisor sees the beats stop.
     if launch.sockets.heartbeat is None:
         yield
         return
@@ -112,7 +112,7 @@ def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) 
 
 
 def _watched_age_s(activity: ProcessActivity, logger: logging.Logger) -> Callable[[], float]:
-    """Return what tells the age of a step to the heartbeats' thread, and logs where one hangs, before it is killed."""
+    # The thread of the heartbeats calls it: it runs while a step hangs, and can log where before the supervisor kills.
     logged_since_s: float | None = None
 
     def age_s() -> float:
@@ -129,7 +129,6 @@ def _watched_age_s(activity: ProcessActivity, logger: logging.Logger) -> Callabl
 
 
 def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[str, ...] | None) -> Port:
-    """Return the port of a component, which also hears what its `Scope` follows."""
     envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
     if heard is not None:
         envelopes = heard
@@ -142,7 +141,7 @@ def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[s
 
 
 def _allow_many_connections() -> None:
-    """Raise the limit of open files: strangers that connect use up a thousand, and then nothing can be written."""
+    # Strangers that connect use up the usual thousand open files, and then no file can be written.
     try:
         import resource
     except ImportError:  # Windows has no such limit

@@ -69,14 +69,14 @@ def _scheduler(experiment: Experiment) -> str:
 
 
 def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
-    """Return a start with its keys; `scheduler`: whom alone a translator obeys."""
+    # A translator obeys the scheduler of this name alone.
     if own is None:
         return start
     return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
 
 
 def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
-    """Return the keys of a process out of the folder, with those of others only where it has to know them."""
+    # A Python process that binds nothing needs the public keys of its servers alone.
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
     if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
@@ -86,10 +86,8 @@ def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
 
 
 def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Return the encrypted addresses and who binds them: all who may connect to them are started here.
-
-    They are those by which requests come, and all that other users of this computer can reach.
-    """
+    # Encrypted are sockets for requests, and publishers that other users of this computer can reach, but only where
+    # every process that connects is started here: no other gets the keys of this run.
     slots = experiment.resolved.net.slots
     here = {start.launch.name for start in starts}
     complete = here >= set(experiment.component_names)
@@ -118,7 +116,6 @@ def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[s
 
 
 def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], scheduler: str) -> KeyHandout:
-    """New pairs for all that is started, for those who join, and for who reports."""
     pairs = {name: keys.pair() for name in [*(start.launch.name for start in starts), SUPERVISOR, GUEST]}
     public = {name: pair[0] for name, pair in pairs.items()}
 

@@ -102,7 +102,7 @@ class RunLog:
             self._shown.add(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
 
     def _experiment_time(self) -> str:
-        """Return the time in the experiment, where it is another than the one on the wall."""
+        # Empty where the experiment's time is the wall clock's.
         now_ns = self._clock.now_ns()
         if abs(now_ns - self._wall.now_ns()) < NS_PER_S:
             return ""
@@ -169,7 +169,6 @@ class _Shown:
 
 
 def _into(path: Path) -> tuple[Show, Callable[[], None]]:
-    """Raises OSError: the file can't be opened."""
     file = path.open("a", encoding="utf-8", errors="replace")
     SYNCER.folder_soon(path.parent)
 

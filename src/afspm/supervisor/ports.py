@@ -90,7 +90,7 @@ class SocketFolder:
 
 
 def _private_folder() -> Path:
-    """Make it where the system has a place for the sockets of a login session, else among temporary files."""
+    # XDG_RUNTIME_DIR is preferred: it has mode 0700, and the system empties it after the login session.
     tried = [os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir(), "/tmp"]
     for parent in filter(None, tried):
         if len(os.fsencode(parent)) < LONGEST_FOLDER and os.access(parent, os.W_OK | os.X_OK):
@@ -145,7 +145,7 @@ def require_free(bound: Mapping[str, str]) -> None:
 
 
 def _can_be_bound(host: str, port: int) -> bool:
-    """False only if somebody listens there; all else that is wrong with an address is said by who binds it."""
+    # False for a port in use or reserved; the process that binds the address reports any other error better.
     host = {"*": "0.0.0.0", "localhost": LOOPBACK}.get(host, host)
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -162,7 +162,7 @@ def _can_be_bound(host: str, port: int) -> bool:
 
 
 def _is_free(host: str, port: int) -> bool:
-    """Return whether nobody has bound it; if so it is held from now on, where that can be."""
+    # Where possible the port stays bound from here on, so that no other program takes it before our process binds it.
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         try:
             probe.bind((host, port))

@@ -94,7 +94,6 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
 
 
 def _recorded(folder: Path) -> list[str]:
-    """Return what the record counts, where there is one."""
     try:
         with open_run(folder) as run:
             whole = sum(not row.interrupted for row in run.scans)
@@ -105,7 +104,7 @@ def _recorded(folder: Path) -> list[str]:
 
 
 def _tabled(table: Path) -> list[str]:
-    """Return what the table of measurements counts, where the experiment kept one; a scan's channels are one scan."""
+    # The table has a row a channel; the channels of one scan count as one scan.
     try:
         with table.open(encoding="utf-8", newline="") as file:
             rows = {(row.get("measurement"), row.get("time")) for row in csv.DictReader(file)}

@@ -111,7 +111,6 @@ def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
 
 
 def _said(run: Run) -> tuple[str | None, str | None]:
-    """Return where the scheduler was, as far as the experiment file says so."""
     try:
         tables = [table for table in run.experiment.values() if isinstance(table, dict)]
     except (FileError, tomllib.TOMLDecodeError):
@@ -124,7 +123,6 @@ def _said(run: Run) -> tuple[str | None, str | None]:
 
 
 def _guest(run: Run) -> Launch:
-    """Return the launch line of whoever joins."""
     recorded = run.facts.get(GUEST)
     guest = Launch.from_json(json.dumps(recorded)) if isinstance(recorded, dict) else Launch("guest")
     return replace(guest, keys=None, run="", simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)
@@ -132,7 +130,6 @@ def _guest(run: Run) -> Launch:
 
 @contextmanager
 def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Iterator[Path]:
-    """A run folder, by which the replay is found; when the block is left it says that it is over."""
     folder = run_folder.create(runs, f"replay-{run.folder.name}", now())
     sockets = Sockets(subscribe=(publish,), control=serve)
     joined = replace(

@@ -213,7 +213,6 @@ class Reporter:
             port.close()
 
     def _send(self, port: ZmqPort) -> None:
-        """Send the open request again, or the next one, if it is time for either."""
         request, now_s = self._request, self._clock.monotonic_s()
         if not request.connected or (request.sent and now_s < request.sent_s + RESEND_AFTER_S):
             return
@@ -288,7 +287,7 @@ class _OpenRequest:
 
 
 def _in_use(response: Response) -> str | None:
-    """Return by whom the microscope is in use; empty: it is not; None: a scheduler that can't say."""
+    # Empty: not in use; None: an older scheduler, which has no such answer.
     try:
         told = json.loads(response.payload) if response.ok else {}
         return str(told["in_use"])
@@ -330,7 +329,6 @@ def computer_name() -> str:
 
 
 def _local(scheduler: ProcessStart) -> Launch | None:
-    """Return how a scheduler is asked that is started here."""
     launch = scheduler.launch
     if scheduler.command or launch.sockets.serve is None:
         return None

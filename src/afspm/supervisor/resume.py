@@ -114,10 +114,8 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
 
 
 def _own(experiment: Experiment, options: RunOptions, found: ResumableRun) -> RunIdentity:
-    """Return what this part had before, with real time, or the simulated time after the last that anybody has seen.
-
-    Where parts run on other computers, to which time has gone on, it has gone on here.
-    """
+    # Simulated time goes on after the last time in the record. If only some processes are resumed, those on other
+    # computers have kept the old clock, so it is kept here.
     facts = found.facts
     simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
     if not simulated:
@@ -158,11 +156,7 @@ def last_seen_ns(folder: Path) -> int:
 
 
 def _wait_until_gone(facts: Plain, folder: Path) -> None:
-    """Wait until processes that lost their parent have ended: two of one name must not share a folder.
-
-    Raises:
-        FileError: somebody stays.
-    """
+    # Processes that lost their parent end by themselves, within seconds; two of one name must not share a folder.
     until_s = ExperimentClock.real().monotonic_s() + GONE_WITHIN_S
     ports = {
         int(match[2]): name
@@ -180,7 +174,7 @@ def _wait_until_gone(facts: Plain, folder: Path) -> None:
 
 
 def _is_gone(port: int, until_s: float) -> bool:
-    """Return whether nobody listens on a port any more; a connection that is closed says so."""
+    # A listener that ends closes the connection, which is noticed at once.
     clock = ExperimentClock.real()
     while (left_s := until_s - clock.monotonic_s()) > 0.0:
         try:
@@ -218,7 +212,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
 
 
 def _whole(experiment: Experiment) -> dict[str, object]:
-    """Return what is in force, defaults too, whoever wrote it down."""
+    # Both files expanded, so that a default written out by hand counts as no difference.
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))
 

@@ -206,7 +206,6 @@ def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) ->
 
 
 def _example_of_a_guest(starts: Sequence[ProcessStart]) -> Launch | None:
-    """The launch line of somebody who is connected as a guest would be; None where that can't be known."""
     by_role = {start.role: start.launch for start in reversed(starts)}
     scheduler = by_role.get(Role.SCHEDULER)
     if scheduler is None or scheduler.sockets.publish is None or scheduler.sockets.serve is None:
@@ -243,7 +242,6 @@ def _starts(
 
 
 def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
-    """Return what this part of the experiment would have by itself."""
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
     if speed is not None and not experiment.resolved.simulated:

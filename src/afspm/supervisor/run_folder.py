@@ -61,7 +61,6 @@ def _new_folder(runs: Path, stamp: str) -> Path:
 
 
 def _point_to(runs: Path, name: str) -> None:
-    """Make the newest run found in the folder of all runs: by a link, or a file where links can't be made."""
     aside = runs / f".{LATEST_LINK}-{name}"
     try:
         aside.symlink_to(name, target_is_directory=True)
@@ -72,5 +71,4 @@ def _point_to(runs: Path, name: str) -> None:
 
 
 def _replace(file: Path, text: str) -> None:
-    """Write so that a reader sees the old or the new text, never half of it; after a power cut, too."""
     replace_file(file, [text.encode()])

@@ -80,7 +80,6 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
 
 
 def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
-    """Return what was told between two moments of real time, with the clock as it is to be read on this computer."""
     if not response.ok:
         raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
     try:

@@ -158,7 +158,6 @@ class Supervisor:
         self._wakeup.post(EndSignal(number))
 
     def _wait(self) -> None:
-        """Wait for whatever comes first, and take all of it in."""
         for beat in self._beats.poll(self._timeout_s()):
             self._step(Beaten(beat.name, beat))
         # a person who wants it to end does not wait behind what the processes print
@@ -178,7 +177,6 @@ class Supervisor:
                     self._log.write(LOGGED_AS, logging.WARNING, event.text)
 
     def _timeout_s(self) -> float | None:
-        """Return the time until there is something to do if nothing happens; None: for ever."""
         deadlines = [self._core.deadline_s(), *(monitor.again_s for monitor in self._monitors.values())]
         if self._reporter is not None:
             deadlines.append(self._reported_s + REPORT_PERIOD_S)
@@ -196,7 +194,6 @@ class Supervisor:
             self._step(replace(exited, last_error=self._lines[exited.name].last_error, fault=fault))
 
     def _look(self) -> None:
-        """Look at the clock on the wall, and from outside at processes whose beat is late, or that are to end."""
         if warning := self._clock_check.warning():
             self._log.write(LOGGED_AS, logging.WARNING, warning)
         now_s = self._clock.monotonic_s()
@@ -208,7 +205,6 @@ class Supervisor:
             self._step(ActivitySeen(name, monitor.work(now_s), monitor.processor_s))
 
     def _report(self) -> None:
-        """Hand the states of all processes to the reporter, now and then."""
         now_s = self._clock.monotonic_s()
         if self._reporter is None or now_s < self._reported_s + REPORT_PERIOD_S:
             return

@@ -192,8 +192,6 @@ def test_rows_wait_while_another_program_has_locked_the_table(
 
 
 def _full_after(real: Any, room: int) -> Any:
-    """Path.open of a disk that has room for so many more bytes."""
-
     def opened(path: Path, mode: str) -> Any:
         file = real(path, mode)
         written = file.write

@@ -141,7 +141,6 @@ def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
-    """Run a component that is killed -9 at a call to the network, start it again, and let it end."""
     lab = Lab("series")
     context = context_of(lab, state_dir)
     context.open_port = lambda: LabPort(lab, call, is_late=is_late)  # type: ignore[assignment,return-value]

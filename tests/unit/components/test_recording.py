@@ -315,12 +315,10 @@ class _Disk:
 
 
 def _all_times(bench: Bench) -> list[int]:
-    """Of what is recorded, whoever published it."""
     return [row[0] for row in afspm.open_run(bench.folder)._query("SELECT time_ns FROM packets ORDER BY time_ns")]
 
 
 def _until(condition: Callable[[], bool]) -> None:
-    """Wait for what another thread does."""
     changed = threading.Event()
     clock = ExperimentClock.real()
     until_s = clock.monotonic_s() + DEADLINE_S

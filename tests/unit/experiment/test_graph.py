@@ -68,7 +68,7 @@ def test_an_experiment_of_nothing_but_scheduler_and_translator_can_be_drawn(writ
 
 
 def _extent(e: ElementTree.Element) -> tuple[float, float, float, float, str]:
-    """Left, top, right and bottom of a text."""
+    # left, top, right, bottom of a text
     x, y, size = (float(e.get(key, "0")) for key in ("x", "y", "font-size"))
     text = e.text or ""
     wide = text_width(text, size, bold=e.get("font-weight") is not None)

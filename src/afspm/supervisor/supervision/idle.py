@@ -72,7 +72,6 @@ def describe_idle(children: Collection[SupervisedChild]) -> str:
 
 
 def _is_at_work(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> bool:
-    """Return whether a process starts, is to be restarted, does not beat, or is a component at work on a step."""
     if child.is_over or child.spec.acts:
         return False
     if child.life is None or child.watch.phase is not ChildPhase.RUNNING:

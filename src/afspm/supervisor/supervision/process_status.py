@@ -53,7 +53,7 @@ class ProcessStatus:
         return tuple(found), changed
 
     def _alive_since_ns(self, name: str, pid: int, now_ns: int) -> int:
-        """Return since when a process is alive: one at work on a step, or late with a beat, was alive as well."""
+        # A process at work on a step, or late with a beat, counts as alive.
         if self._alive.get(name, (0, 0))[0] != pid:
             self._alive[name] = (pid, now_ns)
         return self._alive[name][1]

@@ -220,7 +220,6 @@ class SupervisorCore:
             self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
 
     def _look_whether_idle(self) -> None:
-        """End a run in which nothing that acts is left, unless the microscope is in use, or the file says to stay."""
         if not self._idle.look(self.children.values(), self._now_s, self._liveness):
             return
         if not self._idle.is_logged:
@@ -267,7 +266,7 @@ class SupervisorCore:
             self._look_whether_idle()
 
     def _await_scheduler(self) -> None:
-        """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
+        # A scheduler that beats but does not answer us (for want of a key, perhaps) may still answer the components.
         if not self._awaits_scheduler:
             return
         for child in self._with_role(Role.COMPONENT):
@@ -327,12 +326,11 @@ class SupervisorCore:
     # --- the end ---
 
     def _may_be_rescued(self, child: SupervisedChild) -> bool:
-        """Return whether it is started once more though the experiment has ended: it had not finished when it died."""
+        # A component that dies after the end of the experiment had not finished: it gets one more start to do so.
         return self._has_just_ended and child.spec.beats and child.spec.role is Role.COMPONENT and not child.rescued
 
     @property
     def _has_just_ended(self) -> bool:
-        """True while the experiment itself has ended, and nobody has been asked to leave."""
         ending = self.ending
         return ending is not None and ending.why.is_announced and ending.last is None
 
@@ -366,10 +364,8 @@ class SupervisorCore:
                 child.life = None
 
     def _release_scheduler(self) -> None:
-        """Kill components that are frozen; once all others have ended let the recorder go, then the scheduler.
-
-        One that is busy is not: it would have END_WITHIN_S for what it has yet to write.
-        """
+        # Order: components, then the recorder, then the scheduler, so that the last packets are published and recorded.
+        # Frozen components are killed; a busy one keeps END_WITHIN_S for what it has yet to write.
         left = [child for child in self.children.values() if child.life is not None]
         recorders = [child for child in left if child.spec.leaves_last]
         others = [child for child in left if child.spec.role is not Role.SCHEDULER and child not in recorders]
