@@ -1,4 +1,4 @@
-"""Examines an experiment from one of its computers, whether it runs, does not yet, or runs in part."""
+"""Examination of an experiment from one of its computers, before, during or after its run."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.G
 
 @dataclass
 class Examination:
-    """The findings, the packets counted by sender, and the experiment's processes on this computer."""
+    """Findings, packets counted by sender, and the experiment's processes on this computer."""
 
     found: list[Diagnosis] = field(default_factory=list)
     heard: list[Heard] = field(default_factory=list)
@@ -52,12 +52,12 @@ class Examination:
 
 
 def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands: Collection[str] = ()) -> Examination:
-    """Look at everything that can be seen from here, and listen to the scheduler for so long.
+    """Examine an experiment from this computer, and listen to its scheduler for `listen_s`.
 
-    Without an experiment, look at this computer alone.
+    Without an experiment only this computer is examined.
 
     Args:
-        commands: of the core, which no package replaces.
+        commands: names of the core's commands, which no package can replace.
     """
     found = Examination([] if experiment is None else [*_file(experiment)])
     found.found += diagnosis.of_packages(entry_points.inventory(commands))
@@ -132,14 +132,14 @@ def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
 
 
 class _Connections:
-    """Looks at the addresses of an experiment, then speaks with its scheduler."""
+    """Examines the addresses of an experiment, then talks to its scheduler."""
 
     def __init__(self, experiment: Experiment, into: Examination) -> None:
         self._experiment, self._into = experiment, into
         self._scheduler = next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "scheduler")
 
     def examine(self, listen_s: float) -> None:
-        """Look at addresses, keys, clock, versions, and at what is published."""
+        """Examine addresses, keys, clock, versions, and the packets published."""
         reached = self._addresses()
         launch = self._launch()
         if launch is None or not launch.sockets.control:

@@ -1,4 +1,4 @@
-"""`python -m afspm.supervisor.host` hosts one process of an experiment, as the line on its standard input says."""
+"""`python -m afspm.supervisor.host` hosts one Python process of an experiment; its launch line is on standard input."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def main() -> int:
         return ExitCode.CONFIG
     except StopRequested:
         return ExitCode.ORPHAN
-    except Exception as error:
+    except Exception as error:  # a component may raise anything: logged here, and the exit code has it restarted
         if parent.gone:
             logger.debug("while ending: %s", error, exc_info=True)
             return ExitCode.ORPHAN

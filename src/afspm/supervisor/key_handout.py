@@ -1,4 +1,4 @@
-"""Hands each process its own keys alone: those of the file, or a pair that is made for this run."""
+"""Keys for the processes of a run: those of the file, or pairs made for this run. Each process gets only its own."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class KeyHandout:
     """The processes to start, with their keys.
 
     Attributes:
-        guest, supervisor: the keys of those who join the run, and of who reports to its scheduler, as launch lines
-            have them; None: the file says where keys are, or that there are none.
+        guest, supervisor: keys, in the form of launch lines, of programs that join the run and of the supervisor's
+            reporter; None: the file gives a keys folder, or there are no keys.
     """
 
     starts: Sequence[ProcessStart]
@@ -38,7 +38,7 @@ class KeyHandout:
 
     @contextmanager
     def laid_down(self, folder: Path) -> Iterator[None]:
-        """Keep the guests' key in the run's folder while in the block, unless its disk fails."""
+        """Keep the guests' key in the run's folder while in the block; a failing disk is no error."""
         file = folder / STATE_DIR / GUEST_KEYS
         if self.guest is not None:
             text = json.dumps(self.guest).encode()
@@ -52,10 +52,10 @@ class KeyHandout:
 
 
 def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHandout:
-    """Give each process that is to be started its keys.
+    """Give each process to start its keys.
 
     Raises:
-        ConfigError: a key of the file is missing, or others may read it.
+        ConfigError: a key of the file is missing, or readable for other users.
     """
     if experiment.keys_folder is not None:
         return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])

@@ -1,4 +1,4 @@
-"""One log of a run: the lines of all processes, in the terminal with name and colour, and in log.txt."""
+"""One log of a run: lines of all processes, in log.txt and, with names in colour, in the terminal."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ _LEVELLED = re.compile(rf"(?P<level>{'|'.join(_LEVELS)})\b:?\s*(?P<text>.*)", re
 
 
 class LineReader:
-    """Tells the level of the lines that one process writes.
+    """Reads the levels of the lines of one process.
 
-    On stderr a line may begin with its level ("WARNING the tip is blunt"), as ours do. Lines without one belong to
-    the line before: a traceback below an ERROR. Before any levelled line they are warnings, since a program that
-    complains before it has a log has reason to. What a component prints to stdout is information.
+    On stderr a line may begin with its level ("WARNING the tip is blunt"), as afspm's own do. Lines without a level
+    belong to the line before: a traceback below an ERROR. Lines before the first level are warnings, since a program
+    that writes to stderr before its log is set up has a reason. Lines on stdout are information.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class LineReader:
         """The first line of the last error."""
 
     def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
-        """Return the level (that of `logging`) and the text of a line."""
+        """Return the level (as in `logging`) and the text of a line."""
         if stream == "stdout":
             return logging.INFO, line
         match = _LEVELLED.match(line)
@@ -59,11 +59,10 @@ class LineReader:
 
 
 class RunLog:
-    """Writes every line to `file`, and those of `level` and above to the terminal; `names` are made equally wide.
+    """Writes every line to `file`, and lines of `level` and above to the terminal; `names` are padded to one width.
 
-    A terminal that has gone away is no reason to end a measurement, nor is one that takes nothing more to stop it, as
-    somebody has marked text in it or pressed Ctrl-S: what can't be written there is still in the file. Nor is a disk
-    that is full, or hangs: each of the two has a thread of its own.
+    Neither a terminal that has gone or blocks (text marked in it, Ctrl-S) nor a disk that is full or hangs may stop a
+    measurement, so each has a thread of its own. A line that one of them loses is still in the other.
     """
 
     def __init__(
@@ -87,7 +86,7 @@ class RunLog:
         self._widest = max(map(len, (LOGGED_AS, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
-        """Write one line of the process `name`; `level` is that of `logging`."""
+        """Write one line of the process `name`; `level` is a number of `logging`."""
         wall_ns = self._wall.now_ns()
         stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
         self._file.add(stamp, f"{name:{self._widest}}", level, text)
@@ -109,13 +108,13 @@ class RunLog:
         return f" [{day_and_time(now_ns)}]"
 
     def close(self) -> None:
-        """Write and show what is left, if file and terminal take it."""
+        """Write and show the lines that wait, as far as file and terminal take them."""
         self._shown.close()
         self._file.close()
 
 
 def colour_of(name: str) -> str:
-    """Return the colour of a component's name: the same in every run and on every computer."""
+    """Return the colour of a process name: the same in every run and on every computer."""
     return COLOURS[zlib.crc32(name.encode()) % len(COLOURS)]
 
 
@@ -123,7 +122,7 @@ Show = Callable[[str, str, int, str], None]
 
 
 class _Shown:
-    """Shows lines in a thread of its own, which may have to wait for the terminal, or the disk."""
+    """Writes lines from a thread of its own, which may wait for the terminal or the disk."""
 
     def __init__(self, show: Show, finish: Callable[[], None] = lambda: None) -> None:
         self._show = show
@@ -136,13 +135,13 @@ class _Shown:
         self._thread.start()
 
     def add(self, time: str, name: str, level: int, text: str) -> None:
-        """Append a line; where too many wait, the oldest is dropped."""
+        """Append a line; if the queue is full, the oldest line is dropped."""
         with self._changed:
             self._lines.append((time, name, level, text))
             self._changed.notify()
 
     def close(self) -> None:
-        """Show what waits, if the terminal takes it."""
+        """Write the lines that wait, for SHOWN_WITHIN_S at most."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -157,7 +156,7 @@ class _Shown:
             self._finish()
 
     def hangs(self, longer_than_s: float) -> bool:
-        """Return whether one line takes longer than this."""
+        """Return whether writing one line has taken longer than `longer_than_s`."""
         since_s = self._busy_since_s
         return since_s is not None and CLOCK.monotonic_s() - since_s > longer_than_s
 

@@ -1,4 +1,4 @@
-"""After the end of a run: its summary, its report, and the people who are told that it is over."""
+"""After the end of a run: its summary, its report, and the notifications."""
 
 from __future__ import annotations
 
@@ -58,10 +58,10 @@ def follow(
     *,
     with_report: bool,
 ) -> None:
-    """Tell whoever [notify] names, then say what was measured and write the report, which need the disk and may take
-    long.
+    """Send the notifications of [notify], then log a summary and write the report.
 
-    Of the end of an experiment on several computers that one tells where its scheduler ran.
+    Notifications go first, because the rest needs the disk and may take long. If parts run on several computers, only
+    the one with the scheduler sends them.
     """
     notify = experiment.resolved.sections.notify
     if any(start.role is Role.SCHEDULER for start in starts):
@@ -73,7 +73,7 @@ def follow(
 
 
 def summary(outcome: RunOutcome, folder: Path) -> list[str]:
-    """Return the summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
+    """Return the summary: why the run ended, processes that ran, restarts, processes given up, and the folder."""
     told = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
@@ -123,8 +123,7 @@ def _times(count: int) -> str:
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a run that has a record, in a process of its own, which can neither harm the run nor hold it
-    up for long."""
+    """Write the report of a recorded run, in a process of its own that can neither harm nor delay the run."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # nothing was recorded
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
@@ -155,7 +154,7 @@ def report(folder: Path, log: RunLog) -> None:
 
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
-    """Tell people that a run is over, and how. What fails is tried again, for half a minute."""
+    """Send the notification that a run has ended. Failed deliveries are repeated for half a minute."""
     is_lost = ended.outcome.why in (EndReason.LOST, EndReason.PLANS_LOST)
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:

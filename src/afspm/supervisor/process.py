@@ -1,4 +1,4 @@
-"""One child process: started, fed its launch line, read, waited for and killed. Every platform difference is here."""
+"""One child process: start, launch line, output, exit, kill. Every difference between platforms is here."""
 
 from __future__ import annotations
 
@@ -37,16 +37,16 @@ GUARD = "afspm.supervisor.foreign"
 
 @dataclass(frozen=True)
 class Task:
-    """One process to start, to watch, and to start again.
+    """One process to start, watch and restart.
 
     Attributes:
-        launch: the line for its standard input; the heartbeat's address is the supervisor's to add.
-        command: the program and its arguments.
-        role: what it is in the experiment; without scheduler or translator nothing can go on.
-        folder: where to start it; None: where we are.
-        environment: what it gets besides our own environment.
-        hidden: what it does not get of that.
-        beats: whether it sends heartbeats; what doesn't is only known by its exit.
+        launch: line for its standard input; the supervisor adds the address for heartbeats.
+        command: program and arguments.
+        role: scheduler, translator or component; the experiment can't go on without the first two.
+        folder: working directory; None: the supervisor's.
+        environment: variables in addition to the supervisor's.
+        hidden: variables of the supervisor that the process does not get.
+        beats: whether it sends heartbeats; without them only its exit shows that it is dead.
     """
 
     launch: Launch
@@ -65,12 +65,12 @@ class Task:
 
     @property
     def essential(self) -> bool:
-        """True where the experiment can't go on without it."""
+        """Whether the experiment can't go on without the process."""
         return self.role is not Role.COMPONENT
 
 
 def from_start(start: ProcessStart) -> Task:
-    """Return the task of a process: Python classes run in our host, other languages under our guard."""
+    """Return the task of a process: Python classes run in `host`, other languages under `foreign`."""
     # modules are those beside the experiment file, and never what happens to lie where the run was started
     ours = (*python_command(GUARD), "--", *start.command) if start.command else python_command(HOST)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
@@ -88,15 +88,15 @@ def from_start(start: ProcessStart) -> Task:
 
 
 class ChildProcess:
-    """A running child. Its output and its exit are told to `tell`, from threads of this object.
+    """A running child. Calls `tell` with its output and its exit, from threads of this object.
 
-    The child lives in a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing
-    takes what the child itself has started along. Its stdin stays open until `close_stdin`: the end of it means to the
-    child that its parent wants it to stop, or is dead (then the system closes it).
+    The child has a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing includes
+    the child's own children. Its standard input stays open until `close_stdin`; when it ends, the parent wants the
+    child to stop, or is dead (then the system closes it).
 
     Args:
-        has_tip: it may have a tip to see to when we are killed.
-        may_begin: awaited before the launch line is given to it; None: it may at once.
+        has_tip: whether the child may have to retract a tip after the supervisor was killed.
+        may_begin: event to wait for before the launch line is sent; None: send it at once.
 
     Raises:
         AfspmError: the program can't be started.
@@ -128,7 +128,7 @@ class ChildProcess:
         threading.Thread(target=self._feed_and_wait, args=feeding, name=f"{name}-wait", daemon=True).start()
 
     def close_stdin(self) -> None:
-        """Ask the child to end. One that hasn't even taken its launch line is killed instead."""
+        """Ask the child to end. A child that has not read its launch line yet is killed."""
         if not self._fed.wait(FED_S):
             self.kill()
         elif self._popen.stdin is not None:
@@ -136,7 +136,7 @@ class ChildProcess:
                 self._popen.stdin.close()
 
     def kill(self) -> None:
-        """End the child and everything in its process group, now. A child that is gone already is left in peace."""
+        """Kill the child and its process group now; does nothing after its exit."""
         if sys.platform == "win32":
             with contextlib.suppress(OSError):
                 self._popen.kill()
@@ -191,7 +191,7 @@ def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path 
 
 
 class _JobLimits(ctypes.Structure):
-    """JOBOBJECT_EXTENDED_LIMIT_INFORMATION; of it only the flags are set."""
+    """JOBOBJECT_EXTENDED_LIMIT_INFORMATION; only its flags are set."""
 
     _fields_ = (
         ("per_process_user_time", ctypes.c_int64),
@@ -209,10 +209,10 @@ class _JobLimits(ctypes.Structure):
 
 
 class _WindowsJob:
-    """A child and all that it starts, ended together.
+    """Windows job object of a child and its own children; elsewhere `reaper` does its work.
 
     Args:
-        has_tip: it is not ended with us, since it sees to the tip first; it ends by itself.
+        has_tip: whether the child retracts a tip first: it then ends by itself, not with the supervisor.
     """
 
     def __init__(self, child: subprocess.Popen[bytes], *, has_tip: bool) -> None:
@@ -230,12 +230,11 @@ class _WindowsJob:
         kernel.AssignProcessToJobObject(job, ctypes.c_void_p(int(child._handle)))
 
     def kill(self) -> None:
-        """End all that is in it."""
         if self._handle:
             self._kernel.TerminateJobObject(ctypes.c_void_p(self._handle), _KILLED)
 
     def close(self) -> None:
-        """Let go of it; what is left in it ends, unless it has a tip to see to."""
+        """Close the job; processes left in it end, unless one of them has a tip."""
         if self._handle:
             handle, self._handle = self._handle, 0
             with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
-"""Ends what a supervisor leaves behind when it is killed: a process of its own, which waits for the supervisor's end.
+"""Kills processes that a killed supervisor leaves behind. Runs as a process that waits for the supervisor's end.
 
-A process that the supervisor has started sees the end of its standard input and ends by itself. One that can't see it
-(a library holds Python's lock), or that has started others, is ended from here, some seconds later.
+A child normally ends by itself at the end of its standard input. A child that can't notice it (a library holds Python's
+lock), or has children of its own, is killed from here some seconds later.
 """
 
 from __future__ import annotations
@@ -24,13 +24,16 @@ CLOSED_WITHIN_S = 1.0
 
 
 class Reaper:
-    """Knows the processes of one supervisor that live. On Windows a job object does this, see `jobs`."""
+    """Sends the living process groups of a supervisor to the reaper process.
+
+    Windows has a job object instead, see `process`.
+    """
 
     def __init__(self) -> None:
         self._popen: subprocess.Popen[bytes] | None = None
 
     def begin(self) -> None:
-        """Start it; without it (too many processes, say) all else goes on."""
+        """Start the reaper process. If that fails (too many processes), the run goes on without it."""
         if sys.platform == "win32":
             return
         with contextlib.suppress(OSError):
@@ -43,15 +46,15 @@ class Reaper:
             )
 
     def watch(self, pid: int, *, has_tip: bool) -> None:
-        """Name a process group that is to end with the supervisor; one with a tip to see to has longer for that."""
+        """Register a process group to kill after the supervisor's end; later if it may have a tip to retract."""
         self._tell(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
 
     def forget(self, pid: int) -> None:
-        """Strike out a process that is gone: its number may be given to another."""
+        """Unregister an ended process group: the system may reuse its number."""
         self._tell(f"{pid} 0")
 
     def close(self) -> None:
-        """Close its input: it ends what is left now."""
+        """Close the reaper's input: it kills the groups still registered."""
         if self._popen is not None and self._popen.stdin is not None:
             with contextlib.suppress(OSError):
                 self._popen.stdin.close()
@@ -66,7 +69,7 @@ class Reaper:
 
 
 def main() -> None:
-    """Wait for the end of standard input, then for each process group that is left until its time is up."""
+    """Wait for the end of standard input, then kill each registered group once its time is up."""
     assert sys.platform != "win32"
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

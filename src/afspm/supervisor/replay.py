@@ -1,4 +1,4 @@
-"""A recorded run is published again, with a folder of its own by which it is found like a running experiment."""
+"""Replay: a recorded run published again, from a folder that programs find as if the experiment ran."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class ReplayOptions:
     """Options of a replay.
 
     Attributes:
-        speed: experiment seconds in a real second; None: as it was recorded.
+        speed: experiment seconds in a real second; None: as recorded.
         only: names of messages; empty: all.
         publish, serve: addresses; None: those of the recorded experiment file, else free ones.
-        stay: when all is published.
-        runs: the folder of run folders.
+        stay: whether to serve late joiners after the last packet.
+        runs: folder for the run folder.
     """
 
     speed: float | None = None
@@ -53,7 +53,7 @@ class ReplayOptions:
 
 
 def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> int:
-    """Publish a recorded run again until its end, or Ctrl-C; returns how many packets were published.
+    """Publish a recorded run again until its end or Ctrl-C; return the number of packets published.
 
     Raises:
         FileError: there is no record, or it is damaged.
@@ -91,7 +91,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
 
 
 def _check(only: Sequence[str], run: Run) -> None:
-    # messages of its own are known by the record: their module is not imported, as it may be that of somebody else
+    # the record describes the user's own messages; importing their module would run code of a stranger's record
     for name in only:
         if name not in wire.known_messages() and next(run.packets(messages=(name,)), None) is None:
             raise ConfigError(f"there is no message {name!r}", where="--only", hint="e.g. Scan2d,ControlState")

@@ -1,4 +1,4 @@
-"""A run that was killed, or stopped, goes on in its folder: `afspm run --resume`."""
+"""`afspm run --resume`: a run that was killed or stopped goes on in its folder."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class ResumableRun:
     """A run that can go on.
 
     Attributes:
-        homes: the folders of the files that the experiment was made of.
-        added: names of components that it did not have so far.
+        homes: folders of the files that the experiment was made of.
+        added: names of components that the run did not have before.
     """
 
     folder: Path
@@ -56,25 +56,25 @@ class ResumableRun:
     added: tuple[str, ...] = ()
 
     def with_overlay(self, file: Path) -> ResumableRun:
-        """Return the same run, which goes on with what the file adds."""
+        """Return the same run with the additions of an overlay file."""
         experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
         before = self.experiment.component_names
         added = [name for name in experiment.component_names if name not in before]
         return replace(self, experiment=experiment, added=(*self.added, *added))
 
     def options(self, options: RunOptions) -> RunOptions:
-        """Return the options with the processes that it had on this computer, and those that were added now."""
+        """Return the options restricted to the processes that ran on this computer, and those added now."""
         names = self.experiment.component_names  # without what was added in an earlier life
         only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
         return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
 
 
 def find(where: Path) -> ResumableRun:
-    """Return the run that is meant by its folder, that of all runs (the newest), or the experiment file.
+    """Return the run at `where`: its folder, the folder of all runs (the newest), or its experiment file.
 
     Raises:
-        FileError: there is no run, or what is needed of it can't be read.
-        ConfigError: it has ended, or the experiment file that names it was edited since it was begun.
+        FileError: there is no run, or one of its files can't be read.
+        ConfigError: the run has ended, or its experiment file was edited since its start.
     """
     folder = find_run(where).resolve()
     facts = read_run_json(folder)
@@ -94,9 +94,9 @@ def find(where: Path) -> ResumableRun:
 
 
 def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = None) -> FinishedRun:
-    """Go on with a run until it ends, where every process finds what it remembers. Raises as `run.run`, and
+    """Go on with a run until it ends; every process finds its saved memory. Raises as `run.run`, and
 
-    FileError: it is still going on.
+    FileError: the run is still going on.
     """
     experiment, folder, facts = found.experiment, found.folder, found.facts
     options = found.options(options)
@@ -134,7 +134,7 @@ def _clock_after(facts: Plain, folder: Path) -> ExperimentClock:
 
 
 def last_seen_ns(folder: Path) -> int:
-    """Return the last experiment time that anything in the run's folder knows of; 0 if nothing does."""
+    """Return the latest experiment time in the files of a run's folder; 0 if there is none."""
     seen = [0]
     state = folder / STATE_DIR
     seen += [entry.packet.time_ns or 0 for entry in logged_packets(log_folder(state))]
@@ -166,7 +166,7 @@ def _wait_until_gone(facts: Plain, folder: Path) -> None:
     }
     if not ports:
         return
-    with ThreadPoolExecutor(len(ports)) as pool:  # Windows takes two seconds to say of one that nobody is there
+    with ThreadPoolExecutor(len(ports)) as pool:  # on Windows a refused connection takes two seconds
         for name, is_gone in zip(ports.values(), pool.map(lambda port: _is_gone(port, until_s), ports), strict=True):
             if not is_gone:
                 hint = "end it, then resume the run"
@@ -180,7 +180,7 @@ def _is_gone(port: int, until_s: float) -> bool:
         try:
             with socket.create_connection(("127.0.0.1", port), timeout=left_s) as peer:
                 if peer.recv(1) not in (b"", ZMTP):
-                    return True  # somebody else has the port by now
+                    return True  # another program has the port by now
                 while peer.recv(1024):
                     peer.settimeout(max(0.001, until_s - clock.monotonic_s()))
         except TimeoutError:
@@ -191,14 +191,14 @@ def _is_gone(port: int, until_s: float) -> bool:
 
 
 def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> None:
-    """Refuse to go on with the run in `folder` if that would not be by the files as they are: limits, for instance.
+    """Refuse to resume the run in `folder` if its experiment files have changed: limits, for instance.
 
     Args:
-        files: those that it was begun with.
-        begun: what they said then.
+        files: files that the run was started with.
+        begun: the experiment as it was at the start.
 
     Raises:
-        ConfigError: they say something else now.
+        ConfigError: the files now make another experiment.
     """
     differs = differing(_whole(begun), _whole(load(*files)))
     if differs:
@@ -218,7 +218,7 @@ def _whole(experiment: Experiment) -> dict[str, object]:
 
 
 def differing(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
-    """Return where two experiments differ: each section with its keys."""
+    """Return the differences of two experiments: each section with its keys."""
     found = []
     for name in {**before, **now}:
         then, later = before.get(name), now.get(name)

@@ -1,4 +1,4 @@
-"""A whole run of an experiment: checked, its folder made, started, watched, and summed up."""
+"""A whole run of an experiment: check, folder, start, supervision, summary."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ CLOCK_FILE = "clock"
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a run that the experiment file is not about.
+    """Options of a run that are not in the experiment file.
 
     Attributes:
         runs: the folder of run folders.
         only, without: names of processes to start, or not to start, on this computer.
         speed: experiment seconds in a real second, instead of the file's; for simulated microscopes only.
-        report: whether the report is written when it has ended.
-        metadata: over what the file says in [metadata].
-        log_level: of `logging`; what is shown in the terminal, and what the processes write at all.
+        report: whether to write the report at the end.
+        metadata: entries that override [metadata] of the file.
+        log_level: of `logging`, for the terminal and for what processes write at all.
     """
 
     runs: Path = Path("runs")
@@ -70,7 +70,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run that is over."""
+    """A run that has ended."""
 
     folder: Path
     outcome: RunOutcome
@@ -81,11 +81,11 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
 
     Raises:
         ConfigError: the experiment file has errors, or the options don't fit it; nothing was started.
-        FileError: there is no place for the run folder; nothing was started.
+        FileError: the run folder can't be made; nothing was started.
     """
     experiment.require_valid(options.only, options.without)
     own = _own(experiment, options)
-    # whatever is wrong is told before a folder is made
+    # errors are raised before the folder is made
     first = _starts(experiment, options, own, FreePorts().address)
     key_handout.hand_over(experiment, first)
     names = [start.launch.name for start in first]
@@ -106,7 +106,7 @@ def go(
     terminal: TextIO | None,
     names: Sequence[str],
 ) -> FinishedRun:
-    """Run an experiment in a folder that is there, and locked, until it ends.
+    """Run an experiment in an existing, locked folder until it ends.
 
     Args:
         name: of the experiment; names: of its processes.
@@ -144,7 +144,7 @@ def go(
                 so_far_s = before.get(REAL_S, 0.0)
                 ending[REAL_S] = round(so_far_s + outcome.duration_s, 1)
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
-        except OSError as error:  # a full disk must not keep people from being told of the end
+        except OSError as error:  # a full disk must not prevent the notification of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
         if outcome.why.is_final:
             with suppress(OSError):  # what stays is only space
@@ -155,7 +155,7 @@ def go(
 
 
 def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Return the addresses that are bound here, with the names of their processes."""
+    """Return the addresses bound here, with the names of the processes that bind them."""
     return {
         address: start.launch.name
         for start in starts
@@ -165,9 +165,9 @@ def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
-    """Return what else run.json says, so that the run can be resumed with that file alone.
+    """Return the entries of run.json from which the run can be resumed, without any other file.
 
-    There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.
+    The recorder and other implied processes are named there like all others, and so are chosen by name.
     """
     here = [start.launch.name for start in starts]
     elsewhere = [name for name in experiment.component_names if name not in here]
@@ -179,13 +179,13 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 
 
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
-    """Return what `run` would start, and nothing else. Raises as `run` does."""
+    """Return the processes that `run` would start, and start none. Raises as `run` does."""
     experiment.require_valid(options.only, options.without)
     return _starts(experiment, options, _own(experiment, options), FreePorts().address)
 
 
 def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
-    """Return what run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
+    """Return the contents of run.json: processes, addresses, and the launch line for guests (`afspm.connect`)."""
     facts: dict[str, object] = {
         "name": name,
         RUN: common.run,
@@ -258,10 +258,11 @@ def common_identity(
     options: RunOptions,
     terminal: TextIO | None,
 ) -> RunIdentity:
-    """Return what the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
+    """Return the identity of the whole experiment: the scheduler's, if only other parts are started here.
 
     Raises:
-        ConfigError: the file's time is a simulation's, and here it is not certain that the microscope is simulated.
+        ConfigError: time is simulated, but the microscope is not certain to be; or the speed differs from the
+            scheduler's.
     """
     roles = {start.launch.name: start.role for start in starts}
     launch = None if Role.SCHEDULER in roles.values() else experiment.asking(list(roles))
@@ -292,7 +293,7 @@ def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
 
 
 def now() -> datetime:
-    """Return real time, with the zone of this computer."""
+    """Return real time, in this computer's time zone."""
     return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()
 
 

@@ -1,4 +1,4 @@
-"""The folder that an experiment leaves behind: what was asked for, what happened, and all that was measured."""
+"""The folder that a run leaves behind: experiment file, log, and everything measured."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_RUNS_A_SECOND = 1000
 
 
 def create(runs: Path, experiment: str, started: datetime) -> Path:
-    """Return a new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then leads to it.
+    """Make the run folder `runs/<experiment>-<time>/` and return it, absolute; `runs/latest` then leads to it.
 
     Raises:
         FileError: the folder can't be made.
@@ -42,12 +42,12 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
 
 
 def write_run(folder: Path, facts: Mapping[str, object]) -> None:
-    """Write run.json, which `afspm.connect` reads to find the running experiment."""
+    """Write run.json, from which `afspm.connect` finds the running experiment."""
     _replace(folder / RUN_FILE, json.dumps(facts, indent=2, ensure_ascii=False) + "\n")
 
 
 def write_experiment(folder: Path, text: str) -> None:
-    """Write the experiment file as it was expanded: nothing left to defaults, the whole run in one file."""
+    """Write the expanded experiment file: one file, with every default filled in."""
     _replace(folder / EXPERIMENT_FILE, text)
 
 

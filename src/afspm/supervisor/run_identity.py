@@ -1,4 +1,4 @@
-"""The clock and identity that all parts of a run share; a part without the scheduler asks that for them."""
+"""Clock and identity that all parts of a run share; a part without the scheduler asks the scheduler for them."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _SAME_S = 1e-3  # two processes of one computer agree on real time to that
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """The identity and clock of a run, the same on all of its computers.
+    """Identity and clock of a run, the same on all of its computers.
 
     Attributes:
-        run: the identity of the run, random; empty: it is not known here.
-        simulated: True only if the microscope is simulated for certain.
+        run: random identity of the run; empty: not known here.
+        simulated: True only if the microscope is certain to be simulated.
     """
 
     clock: ExperimentClock
@@ -37,15 +37,15 @@ class RunIdentity:
 
 
 def new_identity() -> str:
-    """Return an identity that no other run has."""
+    """Return a random identity, different for each run."""
     return os.urandom(8).hex()
 
 
 def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
-    """Ask the scheduler that `launch` leads to, which is waited for. One that knows no time goes by real time.
+    """Wait for the scheduler at `launch`, and return its identity. A scheduler without a clock uses real time.
 
     Raises:
-        ConfigError: it does not tell.
+        ConfigError: the scheduler does not answer this request.
     """
     wall = ExperimentClock.real()
     port = open_port(launch, wall)

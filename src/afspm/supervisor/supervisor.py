@@ -1,6 +1,6 @@
-"""The supervisor: one poller on heartbeats, exits, output, signals and the next deadline.
+"""The supervisor: one poller for heartbeats, exits, output, signals and the next deadline.
 
-`supervision.SupervisorCore` decides what to do about it; here it is done.
+`supervision.SupervisorCore` decides; the effects are carried out here.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """The outcome of a run; `duration_s` in real time, up to its end, without what components finish then."""
+    """Outcome of a run; `duration_s` is real time up to its end, without the time that components need to finish."""
 
     why: EndReason
     text: str
@@ -73,12 +73,12 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """Of `afspm run`."""
+        """Exit code of `afspm run`."""
         return self.why.exit_code
 
 
 class Supervisor:
-    """Runs tasks until the experiment ends, everything is done, something essential is lost, or it is stopped."""
+    """Runs tasks until the experiment ends, all are done, an essential process is lost, or a person stops it."""
 
     def __init__(
         self,
@@ -105,7 +105,7 @@ class Supervisor:
         self._processes: dict[str, ChildProcess] = {}
         self._lines = {task.name: LineReader() for task in tasks}
         self._monitors: dict[str, ActivityMonitor] = {}
-        # without a reporter nobody can tell whether the scheduler answers
+        # without a reporter the scheduler's answer can't be seen
         awaits_scheduler = reporter is not None and any(task.role is Role.SCHEDULER for task in tasks)
         self._may_begin = threading.Event()
         if not awaits_scheduler:
@@ -121,7 +121,7 @@ class Supervisor:
         return replace(task, launch=replace(launch, beat_token=token, sockets=sockets, keys=own))
 
     def run(self) -> RunOutcome:
-        """Start everything; returns when nothing of it runs any more."""
+        """Start all processes, and return when none of them runs any more."""
         began_s = self._clock.monotonic_s()
         self._reaper.begin()
         if self._reporter is not None:
@@ -160,7 +160,7 @@ class Supervisor:
     def _wait(self) -> None:
         for beat in self._beats.poll(self._timeout_s()):
             self._step(Beaten(beat.name, beat))
-        # a person who wants it to end does not wait behind what the processes print
+        # Ctrl-C must not wait behind the output of the processes
         for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, EndSignal)):
             match event:
                 case OutputLine():
@@ -261,14 +261,14 @@ TOLERANCE_S = 5.0
 
 
 class ClockCheck:
-    """Warns once if the two differ; simulated time that passes faster never agrees with the wall."""
+    """Warns once if experiment time and wall clock differ; time that is simulated at another speed is not checked."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock
         self._is_done = clock.speed != 1.0
 
     def warning(self) -> str:
-        """Compare them now; returns what to warn of, mostly nothing."""
+        """Compare the clocks now; return the warning, usually empty."""
         if self._is_done or abs(ahead_s := self._clock.wall_ahead_s()) < TOLERANCE_S:
             return ""
         self._is_done = True

@@ -1,4 +1,4 @@
-"""The end of a run in which nothing that acts is left: all plans are done, or the last was given up. Decisions only."""
+"""End of a run that is idle: all plans are done, or the last one was given up. Decisions only."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ ASK_AGAIN_S = 5.0
 
 @dataclass(slots=True)
 class IdleWatch:
-    """The watch for a run in which nothing that acts is left.
+    """Watch for an idle run: no process with a plan is left.
 
     Attributes:
-        ends: whether the run ends then.
-        since_s: when the last plan was over and everything else at rest, in real monotonic time; None: it is not so.
-        asked_s: when the scheduler was asked last whether the microscope is in use.
-        is_logged, is_postponed: whether that was logged.
+        ends: whether an idle run ends.
+        since_s: since when the run is idle, in real monotonic time; None: it is not.
+        asked_s: when the scheduler was last asked whether the microscope is in use.
+        is_logged, is_postponed: whether idleness, and its postponement, were logged.
         is_ending: whether the scheduler was asked to end the experiment.
-        starts: how often processes were started by then.
+        starts: number of process starts up to then.
     """
 
     ends: bool = False
@@ -36,7 +36,7 @@ class IdleWatch:
     starts: int = 0
 
     def look(self, children: Collection[SupervisedChild], now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether nothing that acts has been left for a while."""
+        """Return whether the run has been idle for IDLE_AFTER_S."""
         acting = [child for child in children if child.spec.acts]
         starts_before, self.starts = self.starts, sum(child.starts for child in children)
         if not acting or not all(child.is_over for child in acting):
@@ -52,14 +52,14 @@ class IdleWatch:
         return now_s >= self.since_s + IDLE_AFTER_S
 
     def asks(self, now_s: float) -> bool:
-        """Return whether it is time to ask whether the microscope is in use; that counts as asked."""
+        """Return whether to ask now if the microscope is in use, and note the time."""
         if not self.ends or self.is_ending or now_s < self.asked_s + ASK_AGAIN_S:
             return False
         self.asked_s = now_s
         return True
 
     def deadline_s(self) -> float | None:
-        """Return when to look again; None: no time by itself."""
+        """Return when to look again; None if only an event can change anything."""
         if self.since_s is None or self.is_ending or (self.is_logged and not self.ends):
             return None
         return max(self.since_s + IDLE_AFTER_S, self.asked_s + ASK_AGAIN_S)

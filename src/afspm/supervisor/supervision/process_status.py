@@ -1,4 +1,4 @@
-"""The condition of each process, as the supervisor publishes it."""
+"""Condition of each process, as the supervisor publishes it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WITHOUT_PROCESS = {
 
 
 class ProcessStatus:
-    """Remembers since when each process is in its condition."""
+    """Since when each process has been in its condition."""
 
     def __init__(self, liveness: LivenessPolicy) -> None:
         self._liveness = liveness
@@ -60,7 +60,7 @@ class ProcessStatus:
 
 
 def condition_of(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> ProcessCondition:
-    """Return the process condition to report."""
+    """Return the condition of a process."""
     life = child.life
     if child.given_up:
         return ProcessCondition.GIVEN_UP

@@ -1,4 +1,4 @@
-"""The supervisor's decisions about all processes of a run. Pure: events and real monotonic times in, effects out."""
+"""Decisions of the supervisor about all processes of a run. Pure: events and real monotonic times in, effects out."""
 
 from __future__ import annotations
 
@@ -51,11 +51,11 @@ SCHEDULER_ANSWERS_WITHIN_S = 15.0
 
 
 class SupervisorCore:
-    """Decides what to start, kill, ask to end and log.
+    """Decides which processes to start, kill and ask to end, and what to log.
 
     Args:
-        awaits_scheduler: components begin only when the scheduler has answered.
-        ends_idle: whether the run ends when nothing that acts is left.
+        awaits_scheduler: whether components begin only after the scheduler has answered.
+        ends_idle: whether the run ends once no process with a plan is left.
 
     Attributes:
         ending: how the run ends; None while it goes on.
@@ -82,11 +82,11 @@ class SupervisorCore:
 
     @property
     def is_over(self) -> bool:
-        """True when the run has ended and nothing of it runs any more."""
+        """Whether the run has ended and no process of it is left."""
         return self.ending is not None and not any(child.life for child in self.children.values())
 
     def step(self, event: SupervisorEvent, now_s: float) -> list[SupervisorEffect]:
-        """Take in an event at a real monotonic time; returns what to do, in order."""
+        """Process an event at a real monotonic time; return the effects in order."""
         self._now_s = now_s
         match event:
             case RunBegan():
@@ -127,11 +127,11 @@ class SupervisorCore:
         return effects
 
     def may_start(self, name: str) -> bool:
-        """Return whether a process that is to be started still is: the run may have ended meanwhile."""
+        """Return whether a process may still be started: the run may have ended since."""
         return self.ending is None or self.children[name].rescued
 
     def deadline_s(self) -> float | None:
-        """Return when `TimePassed` is due at the latest; None: it is not."""
+        """Return when `TimePassed` is due at the latest; None if there is no deadline."""
         if self.ending is not None:
             found = [self.ending.deadline_s()]
         else:
@@ -142,9 +142,10 @@ class SupervisorCore:
         return min((s for s in found if s is not None), default=None)
 
     def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
-        """Return the processes to be looked at from outside, with their ids, and the time over which to judge them.
+        """Return the ids of processes to sample from outside, by name, and the time span over which to judge them.
 
-        Those are whose beat is late, at the end of a run also those that start, and all that were asked to end.
+        These are processes whose heartbeat is late, at the end of a run also starting ones, and all that were asked to
+        end.
         """
         overdue: dict[str, int] = {}
         for name, child in self.children.items():
@@ -158,7 +159,7 @@ class SupervisorCore:
         return overdue, self._liveness.silence_s / 2.0
 
     def reports(self) -> tuple[ProcessReport, ...]:
-        """Return what became of each process."""
+        """Return the fate of each process."""
         return tuple(
             ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered)
             for name, child in self.children.items()
@@ -316,10 +317,10 @@ class SupervisorCore:
             child.watch.stop(self._now_s)
             if is_missing and self._may_be_rescued(child):
                 self._rescue(child)
-            # the scheduler tells all others that the experiment has ended; a translator does not listen to it
+            # the scheduler announces the end to all others; a translator does not subscribe to it
             if child.spec.role is Role.TRANSLATOR and child.life:
                 self._command(ProcessAction.CLOSE_INPUT, child)
-        # a run that ended as it should is told of by its summary, in a moment
+        # the summary reports a regular end in a moment
         levels = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL", EndReason.PLANS_LOST: "CRITICAL"}
         self._log(LOGGED_AS, levels.get(why, "DEBUG"), text)
 
