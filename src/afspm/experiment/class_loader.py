@@ -1,4 +1,4 @@
-"""From `class = "module.Name"` to the class itself: imported late, since only checking and starting need it."""
+"""From `class = "module.Name"` to the class: imported only when an experiment is checked or started."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ROLE_BY_BASE = (
 
 @dataclass(frozen=True)
 class ComponentDeclaration:
-    """Declarations of a component in attributes of its class (a command: in its table)."""
+    """Declarations in class attributes of a component (of a command: in its table)."""
 
     solves: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ class ComponentDeclaration:
 
 
 class Unloadable(Exception):
-    """A class that can't be had; the message and the hint are for the user."""
+    """The class can't be loaded; message and hint are for the user."""
 
     def __init__(self, what: str, hint: str = "") -> None:
         super().__init__(what)
@@ -64,9 +64,9 @@ class Unloadable(Exception):
 
 @contextlib.contextmanager
 def importing_from(folders: Sequence[Path]) -> Iterator[None]:
-    """Let modules beside the experiment file be imported within this block.
+    """Make modules beside the experiment file importable within the block.
 
-    Two experiments may both have a `component.py`: what was imported from the folders is forgotten afterwards.
+    Two experiments may both have a `component.py`, so modules imported from the folders are unloaded afterwards.
     """
     before = set(sys.modules)
     added = [str(folder) for folder in folders]
@@ -92,10 +92,10 @@ def _is_from(folder: Path, name: str) -> bool:
 
 
 def full_path(name: str) -> str:
-    """Return a name without a module as the full path of the class that a package declares; other paths as they are.
+    """Return the full path of the class that a package declares under a bare name; return other paths unchanged.
 
     Raises:
-        Unloadable: there is no such class, or several packages declare it.
+        Unloadable: no package declares the class, or several do.
     """
     if "." in name:
         return name
@@ -113,7 +113,7 @@ def load(path: str) -> Any:
     """Return the object `module.Name`.
 
     Raises:
-        Unloadable: no such module or name, or the module fails when it is imported.
+        Unloadable: no such module or name, or its import fails.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name or not name:
@@ -122,13 +122,13 @@ def load(path: str) -> Any:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise _no_module(module_name, error) from error
-    except (Exception, SystemExit) as error:
+    except (Exception, SystemExit) as error:  # the user's module may do anything when imported, even exit
         raise Unloadable(f"importing {module_name} fails: {_where(error)}") from error
     return _attribute(module, name)
 
 
 def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
-    """Return the spec of a module, also from beside the file; None: there is none."""
+    """Return the spec of a module, which may lie beside the file; None if there is none."""
     with importing_from(folders):
         try:
             return importlib.util.find_spec(name)
@@ -137,7 +137,7 @@ def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
 
 
 def role_of(component: type) -> Role | None:
-    """Return scheduler, translator or component, by the bases of a class or its `role`; None: it is none of them."""
+    """Return the role of a class by its bases or its attribute `role`; None if it has none."""
     for base in component.__mro__:
         for package, role in _ROLE_BY_BASE:
             if base.__module__ == package or base.__module__.startswith(package + "."):
@@ -155,7 +155,7 @@ def _attribute(module: ModuleType, name: str) -> Any:
         raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
     except ModuleNotFoundError as error:
         raise _no_module(f"{module.__name__}.{name}", error) from error
-    except (Exception, SystemExit) as error:
+    except (Exception, SystemExit) as error:  # a lazy import may run the user's code, too
         raise Unloadable(f"importing {name} fails: {_where(error)}") from error
 
 

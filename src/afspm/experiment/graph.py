@@ -1,8 +1,7 @@
-"""An experiment as a picture: the scheduler as a bar, its translator below it, the components above.
+"""Picture of an experiment: the scheduler as a bar, its translator below it, the components above.
 
-Every component has a column of its own, in which its envelopes come up from the bar and its requests go down to it;
-what components publish to each other runs in lanes above them. So no two lines share a way, and nothing has to be
-searched for.
+Every component has a column: envelopes go up to it from the bar, its requests go down. Envelopes between components run
+in lanes above them. No two lines share a path, so each can be followed.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ BAR_HEIGHT, ARROW_AT, MOST_LABELS = 62.0, 16.0, 7
 
 @dataclass
 class ProcessBox:
-    """One process and its column. Widths first, then places."""
+    """One process and its column. Widths are set first, then places."""
 
     part: ExperimentPart
     lines: list[tuple[str, str]]
@@ -57,7 +56,7 @@ class ProcessBox:
 
     @property
     def arrows_at(self) -> float:
-        """Where the middle between the arrows is, from the middle of the box: labels are not of one length."""
+        """Offset of the midpoint between the two arrows from the middle of the box: labels differ in length."""
         left, right = self._sides
         most = self.width / 2 - ARROW_AT - 12
         return max(-most, min(most, (left - right) / 2))
@@ -74,7 +73,7 @@ class ProcessBox:
 
 @dataclass(frozen=True)
 class PublisherLane:
-    """The publications of one component to others."""
+    """Envelopes that one component publishes to others."""
 
     publisher: ProcessBox
     listeners: tuple[ProcessBox, ...]

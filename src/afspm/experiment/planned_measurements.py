@@ -1,4 +1,4 @@
-"""The plan of a ready-made component, as far as it is fixed before it runs: made once, never started."""
+"""The plan of a component, as far as its settings fix it. The component is constructed, never started."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 
 @dataclass(frozen=True)
 class PlannedMeasurements:
-    """The measurements of a plan, and what the microscope must have for them.
+    """Measurements of a plan, and the capabilities that it needs.
 
     Attributes:
-        drift_doubts: what to warn of where drift is corrected; `where` names the setting.
+        drift_doubts: warnings for an experiment that corrects drift; `where` names the setting.
         parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
-        period_s: between the beginnings of two rounds; 0: no pause.
+        period_s: between the starts of two rounds; 0: no pause.
         scan_speed_m_s: of a microscope that knows the speed of its first scan.
-        is_listed: whether the file lists the regions, each with a place of its own.
+        is_listed: whether the file lists the regions, each at a place of its own.
     """
 
     regions: tuple[Region, ...] = ()
@@ -55,10 +55,10 @@ class PlannedMeasurements:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A reason for which the limits refuse a part of a plan.
+    """Reason why the limits refuse a part of a plan.
 
     Attributes:
-        where: the setting that it is about; empty: several.
+        where: path of the setting; empty if several are concerned.
     """
 
     reason: str
@@ -67,10 +67,10 @@ class Refusal:
 
 
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
-    """Return the plan of a component with these settings; None where it has none, or none that can be known.
+    """Return the plan of a component with these settings; None if it has none, or none that can be known.
 
-    Only declared classes, and those derived from them, are made: they do nothing in `__init__` but to keep and to
-    check their settings.
+    Only classes declared by entry points, and classes derived from them, are constructed: their `__init__` only stores
+    and checks settings.
 
     Raises:
         AfspmError: the component refuses its settings.
@@ -108,8 +108,8 @@ def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
-    """Return why the limits would refuse what is planned; each reason once."""
-    # steps and rates depend on what is in force by then
+    """Return why the limits would refuse the plan; each reason once."""
+    # steps and rates depend on the value before, which is unknown here
     guard = LimitChecker(_without_changes(limits))
     found: dict[str, Refusal] = {}
 
@@ -164,7 +164,7 @@ _MARGIN = 1e-3
 
 
 def nearest_region(region: Region, allowed: Region) -> Region:
-    """Return the region of the same angle, in round numbers, nearest to one that fits; smaller if need be."""
+    """Return the nearest region of the same angle that fits, in round numbers; smaller if need be."""
     exact = _rounded(_nearest(region, allowed, 0.0))
     reach = replace(allowed, size_m=(allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH)))
     if all(reach.contains(corner) for corner in exact.corners_m()):
@@ -210,10 +210,10 @@ def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
 
 
 def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
-    """Return that a round takes longer than its period; empty: it does not, or its speed is not known.
+    """Return a text if a round takes longer than its period; empty if it does not, or its speed is unknown.
 
     Args:
-        usual_m_s: the speed of a scan where the plan sets none.
+        usual_m_s: scan speed where the plan sets none.
     """
     speeds = [one for one in planned.parameters.get("parameters", ()) if one.name == names.SCAN_SPEED]
     speed_m_s = si(f"{speeds[0].value} {speeds[0].unit or 'm/s'}", "m/s") if speeds else usual_m_s
@@ -231,7 +231,7 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
 
 
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
-    """Return the actions whose settings the limits would always refuse, and why."""
+    """Return the actions whose settings the limits would always refuse, with the reasons."""
     # where the tip is is not known yet
     guard = LimitChecker(replace(_for_all(_without_changes(limits)), actions={}, region=None))
     found = []

@@ -1,4 +1,4 @@
-"""Launch lines of the processes to start."""
+"""Processes to start, with their launch lines."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class ProcessStart:
     """One process to start.
 
     Attributes:
-        launch: the line for its standard input; heartbeat, log, clock and folders are for the supervisor to add
-            where it has not given them to `Experiment.launches`.
+        launch: line for its standard input; the supervisor adds heartbeat, log, clock and folders unless they were
+            given to `Experiment.launches`.
         command: program and arguments; empty: the Python host runs `launch.class_`.
-        folder: to start commands in: that of the experiment file.
-        beats: whether it sends heartbeats; a command that does not (`heartbeats = false`) is only known by its exit.
-        python_path: to be put before PYTHONPATH, so that modules beside the file are found.
-        leaves_last: whether it stays until the other components have ended, to record what they say at the end.
-        acts: whether it follows a plan of its own, as a series does, or that is not known; the others react.
-        hidden: environment variables that hold secrets of others.
+        folder: working directory of commands: the experiment file's folder.
+        beats: whether it sends heartbeats; without them (`heartbeats = false`) only its exit shows that it is dead.
+        python_path: folders to put before PYTHONPATH, so that modules beside the file are found.
+        leaves_last: whether it stays until the other components have ended, to record their last packets.
+        acts: whether it follows a plan of its own, as a series does, or that is unknown; the others react.
+        hidden: environment variables that hold secrets of other processes.
     """
 
     launch: Launch
@@ -61,15 +61,15 @@ class ProcessStart:
 def starts(
     resolved: ResolvedExperiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
 ) -> list[ProcessStart]:
-    """Return the processes chosen, translator and scheduler first; clock and folders are still to be added."""
+    """Return the chosen processes, translator and scheduler first; clock and folders are added later."""
     implied = {name for name, process in resolved.processes.items() if process.part.implied}
     chosen = chosen_names(resolved, only, without)
     if any(scheduler.name in chosen for scheduler in resolved.with_role(Role.SCHEDULER)):
-        chosen |= implied - set(only) - set(without)  # what is not in the file is started where the scheduler is
+        chosen |= implied - set(only) - set(without)  # implied parts start where the scheduler does
     else:
         chosen -= implied - set(only)
     links = {name: _subscribing(resolved, name, chosen, set(without)) for name in chosen}
-    # those that are not chosen run elsewhere; without `only` they may just have been left out
+    # with `only` the others run elsewhere; without, they may just have been left out
     _require_addresses(resolved, {**resolved.net.links, **links} if only else links, chosen, implied)
     addresses = resolved.net.addresses(take_address)
     processes = [process for role in _ORDER for process in resolved.with_role(role) if process.name in chosen]
@@ -81,14 +81,14 @@ def starts(
 
 
 def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
-    """Return who is told the identity of the run: all, unless the scheduler is of another language."""
+    """Return the processes that get the run's identity: all, unless the scheduler is written in another language."""
     if all(not scheduler.part.command for scheduler in resolved.with_role(Role.SCHEDULER)):
         return set(resolved.processes)
     return {*resolved.emulators, *(translator.name for translator in resolved.with_role(Role.TRANSLATOR))}
 
 
 def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: Collection[str]) -> set[str]:
-    """Return the names that are chosen to be started here.
+    """Return the names of the processes to start here.
 
     Raises:
         ConfigError: there is no such component.
@@ -101,9 +101,9 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
 
 
 def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
-    """Return whether a run of these processes ends when nothing that acts is left.
+    """Return whether a run of these processes ends once no process with a plan is left.
 
-    Only where all that act, and the scheduler, are started here: plans on other computers may go on.
+    Only if all processes with plans, and the scheduler, are started here: plans on other computers may go on.
     """
     acting = {name for name, process in resolved.processes.items() if process.role is Role.COMPONENT and process.acts}
     schedulers = {scheduler.name for scheduler in resolved.with_role(Role.SCHEDULER)}
@@ -111,7 +111,7 @@ def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
 
 
 def not_installed(resolved: ResolvedExperiment, names: Collection[str]) -> Iterator[Finding]:
-    """Yield an error for each of these processes whose class requires a package that is not installed here."""
+    """Yield an error for each of these processes whose class needs a package that is not installed here."""
     for process in resolved.processes.values():
         try:
             if process.name in names:
@@ -198,7 +198,7 @@ def _start(
         command = (sys.executable, *command[1:])
     folders = resolved.document.folders
     beats = process.part.own.get("heartbeats") is not False
-    hidden, is_last = _hidden(resolved, process), process.says(RECORDS)
+    hidden, is_last = _hidden(resolved, process), process.declares(RECORDS)
     acts = role is Role.COMPONENT and process.acts
     return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, acts, hidden)
 
@@ -211,7 +211,7 @@ def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str
 
 
 def _secrets(process: ResolvedProcess) -> set[str]:
-    return {*_variable(process.settings.get(SECRET)), *([DASHBOARD_PASSWORD] if process.says("operates") else [])}
+    return {*_variable(process.settings.get(SECRET)), *([DASHBOARD_PASSWORD] if process.declares("operates") else [])}
 
 
 def _variable(secret: object) -> list[str]:
@@ -219,14 +219,14 @@ def _variable(secret: object) -> list[str]:
 
 
 def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | None:
-    """Return a launch line by which to ask a scheduler elsewhere, in the name of the first of `names`.
+    """Return a launch line for requests to a scheduler elsewhere, in the name of the first of `names`.
 
-    None where it is not said where it is, or it is of another language and perhaps knows nothing of our requests.
+    None if its address is not in the file, or it is written in another language and may not know these requests.
     """
     scheduler = next(iter(resolved.with_role(Role.SCHEDULER)), None)
     if scheduler is None or scheduler.part.command:
         return None
-    # as those that are started here reach it; a translator, which asks nobody, by what the scheduler binds
+    # the address that processes here connect to; else (a translator sends no requests) the one the scheduler binds
     known = [*(resolved.net.links[name].control for name in names), f"{scheduler.name}/serve"]
     slots = resolved.net.slots.items()
     addresses = {key: slot.address for key, slot in slots if slot.address is not None}
@@ -277,8 +277,8 @@ def _retracts(resolved: ResolvedExperiment) -> bool:
 def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
     control = resolved.sections.control
     if control.roles.operate is None:
-        # components by which a person may command, and a dashboard that joins later, which is under no other's name
-        operators = resolved.saying("operates")
+        # components through which a person sends requests, and a dashboard that joins later, under its usual name
+        operators = resolved.declaring("operates")
         operate = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
         control = replace(control, roles=replace(control.roles, operate=tuple(operate)))
     return {

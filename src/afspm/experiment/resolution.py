@@ -1,4 +1,4 @@
-"""From the sorted file to what can be started: classes imported, settings in SI, sections parsed, sockets connected."""
+"""Resolution of the sorted file: classes imported, settings in SI, sections parsed, sockets connected."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ DRIFT = "DriftMapping"
 
 
 def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
-    """Resolve all that can be; what can't is reported and left out."""
+    """Resolve the experiment; errors are reported, and the faulty parts left out."""
     resolved = ResolvedExperiment(
         parts=parts,
         document=document,
@@ -179,7 +179,7 @@ def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedEx
             inside = _inside(one)
             if len(inside) > 1 and inside[0] in sound:
                 _report(process.name, one, resolved)
-    except Exception:  # made of what is wrong, it may fail in any way
+    except Exception:  # made of wrong settings, its constructor may raise anything
         return
 
 
@@ -206,7 +206,7 @@ def _resolve_plan(
         for one in individual_errors(error):
             _report(name, one, resolved)
         return
-    except Exception as error:
+    except Exception as error:  # the constructor may be the user's, and raise anything
         resolved.document.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)
         return
     if plan is None:

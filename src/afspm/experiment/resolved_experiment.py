@@ -1,4 +1,4 @@
-"""An experiment as it was resolved: what is known of each process, and of all together, before anything starts."""
+"""The resolved experiment: all that is known of it before it starts."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 
 @dataclass
 class ResolvedProcess:
-    """One process with all that is known of it before it starts.
+    """One process, resolved.
 
     Attributes:
-        component: its class, and `class_path` where that is; None and empty for a command, or what can't be loaded.
-        settings: as its constructor gets them: in SI, of JSON's types.
-        wrong: the settings that were refused; None where all are right.
+        component: its class, loaded from `class_path`; None and empty for a command, or a class that can't be loaded.
+        settings: arguments of its constructor: in SI, of JSON's types.
+        wrong: settings that were refused; None if all are right.
     """
 
     part: ExperimentPart
@@ -46,41 +46,41 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Return whether it follows a plan of its own: a script, unless it solves problems. A command: unknown."""
+        """Whether it follows a plan of its own: a script does, unless it solves problems. True for a command: unknown."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves
 
-    def says(self, attribute: str) -> bool:
-        """Return whether its class has an attribute that is true."""
+    def declares(self, attribute: str) -> bool:
+        """Return whether a flag of its class is true."""
         return getattr(self.component, attribute, False) is True
 
     @property
     def is_microscope(self) -> bool:
-        """True for a simulated microscope, as its class (a command: its table) says."""
-        return self.part.own.get(SIMULATED) is True if self.part.command else self.says(SIMULATED)
+        """Whether it is a simulated microscope, by its class (of a command: by its table)."""
+        return self.part.own.get(SIMULATED) is True if self.part.command else self.declares(SIMULATED)
 
     @property
     def envelopes(self) -> tuple[str, ...] | None:
-        """The prefixes that it subscribes to: as the file says, else as its class declares; None: all."""
+        """Prefixes that it subscribes to: those of the file, else those of its class; None: all."""
         wanted = self.part.own.get("envelopes", self.wires.envelopes)
         if wanted is None:
             return self.declared.listens
         return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
 
     def capabilities(self) -> MicroscopeCapabilities | None:
-        """Return what a translator can do; None where that is not known before it runs."""
+        """Return a translator's capabilities; None if they can't be known before it runs."""
         return None if self.component is None else capabilities.of_class(self.component, self.settings)
 
 
 @dataclass
 class ResolvedExperiment:
-    """Everything about the experiment that is known before it starts.
+    """An experiment, resolved.
 
     Attributes:
         processes: by name, in the order of the file.
-        listening: where components listen by settings of their own, beside the wiring.
-        plans: by component, as far as they are fixed before it runs.
+        listening: sockets that components bind by settings of their own, beside the wiring.
+        plans: by component, as far as its settings fix them.
     """
 
     parts: ExperimentParts
@@ -100,39 +100,39 @@ class ResolvedExperiment:
         return ProblemNames(self.named_problems)
 
     def metadata(self) -> dict[str, str]:
-        """Return the metadata of a run: that of the microscope's class, overridden by [metadata] of the file."""
+        """Return the metadata of a run: [metadata] of the file, completed by the microscope's class."""
         given = {name: value for name, value in self.sections.metadata.model_dump().items() if value is not None}
         translators = self.with_role(Role.TRANSLATOR)
         return (_metadata_of_class(translators[0]) if translators else {}) | given
 
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Report an error at the line where `path` is set."""
+        """Add an error at the line where `path` is set."""
         self.document.error(what, *path, hint=hint)
 
     def warning(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Report a warning at the line where `path` is set."""
+        """Add a warning at the line where `path` is set."""
         self.document.warning(what, *path, hint=hint)
 
     def with_role(self, role: Role) -> list[ResolvedProcess]:
         return [process for process in self.processes.values() if process.role is role]
 
-    def saying(self, attribute: str) -> list[str]:
-        """Return the names of the processes whose class has an attribute that is true."""
-        return [name for name, process in self.processes.items() if process.says(attribute)]
+    def declaring(self, attribute: str) -> list[str]:
+        """Return the names of the processes with a flag of their class that is true."""
+        return [name for name, process in self.processes.items() if process.declares(attribute)]
 
     @property
     def keys_folder(self) -> Path | None:
-        """The folder of [security] keys, absolute."""
+        """Folder of [security] keys, absolute; None if no keys are used."""
         keys = self.sections.security.keys
         return None if keys is None else self.document.folder_of("security", "keys") / keys
 
     @property
     def simulated(self) -> bool:
-        """True if the microscope is simulated for certain, where all of the file is started on this computer."""
+        """Whether the microscope is certain to be simulated, if the whole file is started on this computer."""
         return self.simulated_with(self.processes)
 
     def simulated_with(self, started: Collection[str]) -> bool:
-        """Return whether the microscope is simulated for certain, where these processes are started together.
+        """Return whether the microscope is certain to be simulated, if these processes are started together.
 
         Either the translator is the microscope itself, or it is wired to an emulator that is started with it.
         """
@@ -142,9 +142,9 @@ class ResolvedExperiment:
         )
 
     def controller_of(self, translator: str, started: Collection[str]) -> str:
-        """Return the name of the emulator that a translator is wired to; empty: none that is started with it.
+        """Return the name of the emulator that a translator is wired to; empty if none is started with it.
 
-        A translator of another language can't be: nothing proves to whom it talks.
+        Always empty for a translator written in another language: nothing proves which controller it talks to.
         """
         process = self.processes[translator]
         if process.is_microscope or process.part.command or translator not in started:
@@ -153,8 +153,8 @@ class ResolvedExperiment:
 
     @property
     def emulators(self) -> list[str]:
-        """The emulated controllers among the components."""
-        return self.saying(EMULATED)
+        """Names of the emulated controllers."""
+        return self.declaring(EMULATED)
 
 
 def _metadata_of_class(translator: ResolvedProcess) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Our own sections of the experiment file, as pydantic models. Only loaded where a file is checked or run."""
+"""Sections of the experiment file as pydantic models. Loaded only when a file is checked or run."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ Orcid = Annotated[str, pydantic.AfterValidator(_checked_orcid)]
 
 
 class Section(pydantic.BaseModel):
-    """Base: an unknown key is an error."""
+    """Base class: unknown keys are errors."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
 class ClockSection(Section):
-    """[clock]: when the experiment's time begins and how fast it goes (simulated microscopes only)."""
+    """[clock]: start and speed of experiment time (simulated microscopes only)."""
 
     start: datetime | None = None
     speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
@@ -54,7 +54,7 @@ class ClockSection(Section):
 
 
 class SecuritySection(Section):
-    """[security]: the folder of CURVE keys, or consent that there are none."""
+    """[security]: the folder of CURVE keys, or consent to run without."""
 
     keys: str | None = None
     plain: StrictBool = False
@@ -65,12 +65,12 @@ class SecuritySection(Section):
 
     @property
     def are_sockets_private(self) -> bool:
-        """Whether sockets without an address in the file are unix sockets, where the system has them."""
+        """Whether sockets that the file leaves open are unix sockets, where the system has them."""
         return not (self.keys or self.insecure or self.tcp)
 
 
 class RestartSection(Section):
-    """[restart]: how patiently processes are watched, and how often they are started again. Real time."""
+    """[restart]: time limits and restarts of processes. Real time."""
 
     beat_period: PositiveDuration = 1.0
     missed_beats: Annotated[int, Field(ge=1)] = 3
@@ -85,7 +85,7 @@ class RestartSection(Section):
 
 
 class RecordSection(Section):
-    """[record]: what is kept of a run, beside what components write."""
+    """[record]: contents of the record of a run, beside files that components write."""
 
     on: StrictBool = True
     scans: StrictBool = True
@@ -93,7 +93,7 @@ class RecordSection(Section):
 
 
 class MetadataSection(Section):
-    """[metadata]: what is written into every file of the run; None: not known."""
+    """[metadata]: entries written into every file of the run; None: unknown."""
 
     technique: Literal["STM", "STS", "AFM"] | None = None
     """STM, STS or AFM; of a microscope that is always the same, its class knows it."""
@@ -108,7 +108,7 @@ class MetadataSection(Section):
 
 
 class NotifySection(Section):
-    """[notify]: who is told, outside of the experiment, of what."""
+    """[notify]: targets and occasions of notifications."""
 
     command: tuple[str, ...] = ()
     webhook: str = ""
@@ -120,7 +120,7 @@ class NotifySection(Section):
 
 
 class ExperimentSections(Section):
-    """The sections that mean the same whatever components there are."""
+    """Sections that do not depend on the components."""
 
     clock: ClockSection = ClockSection()
     control: ControlSettings = ControlSettings()
@@ -132,7 +132,7 @@ class ExperimentSections(Section):
 
 
 def read_sections(tables: Mapping[str, Settings], document: Document) -> ExperimentSections:
-    """Read them all; what is wrong with one is reported, and its defaults taken."""
+    """Read all sections; a faulty section is reported, and its defaults are used."""
     return ExperimentSections.model_construct(
         **{
             name: parse(type(field.default), name, tables.get(name, {}), document)
@@ -145,7 +145,7 @@ S = TypeVar("S")
 
 
 def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
-    """Return the section `[name]`, a model or a dataclass; report errors, and return the defaults then."""
+    """Return the section `[name]`, a model or a dataclass. Report errors, and return the defaults then."""
     try:
         return pydantic.TypeAdapter(kind).validate_python(table)
     except pydantic.ValidationError as error:

@@ -1,4 +1,4 @@
-"""A component's settings against the constructor of its class: names, types and units, all before anything starts."""
+"""Check of a component's settings against its constructor: names, types and units, before anything starts."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def check(
     given: Collection[str] = (),
     wrong: set[str] | None = None,
 ) -> Settings:
-    """Return the settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
+    """Return the settings for the process: validated, in SI units, of JSON's types. Reports errors.
 
     Args:
-        given: parameters that are not for the table to set.
-        wrong: those whose values are wrong are added to it.
+        given: parameters that the table must not set.
+        wrong: names of settings with errors are added to it.
     """
     everything = _parameters(component)
     parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
@@ -80,13 +80,13 @@ def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
 
 
 def default_of(component: type, name: str) -> Any:
-    """Return the default of a setting; None where it has none."""
+    """Return the default of a setting; None if it has none."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
 
 def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
-    """Yield (setting, address, whether keys guard it) of each place at which a component will listen."""
+    """Yield (setting, address, whether keys guard it) of each socket that a component binds by its settings."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
         for mark in getattr(annotation, "__metadata__", ()):
@@ -97,7 +97,7 @@ def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool
 
 
 def jsonable(value: Any, folder: Path) -> Any:
-    """Return `value` in JSON's own types; a relative path is one beside the experiment file."""
+    """Return `value` in JSON's types; a relative path is resolved against the experiment file's folder."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Path):

@@ -36,9 +36,9 @@ _MISSING = {
 
 
 def check(resolved: ResolvedExperiment) -> None:
-    """Run every check; what is found goes to the findings of its document.
+    """Run every check; errors and warnings go to the document's findings.
 
-    Nothing is said of what a missing scheduler or translator, or a class that can't be loaded, may have provided.
+    If scheduler or translator is missing, or a class can't be loaded, checks that depend on them are left out.
     """
     for one in CHECKS if _is_complete(resolved) else ALWAYS:
         one(resolved)
@@ -55,7 +55,7 @@ def _all_loaded(resolved: ResolvedExperiment) -> bool:
 
 
 def check_roles(resolved: ResolvedExperiment) -> None:
-    """Require one scheduler, one translator, and no two names that only differ in upper and lower case."""
+    """Require one scheduler, one translator, and names that differ by more than case."""
     for role, hint in _MISSING.items():
         having = resolved.with_role(role)
         if not having and (name := _not_a_component(resolved, role)):
@@ -86,7 +86,7 @@ def _not_a_component(resolved: ResolvedExperiment, role: Role) -> str | None:
 
 
 def check_names(resolved: ResolvedExperiment) -> None:
-    """Require names that can be those of files, on every system, and of connections."""
+    """Require names that are valid for files, on every system, and for connections."""
     for name in resolved.processes:
         if not is_process_name(name):
             hint = f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]"
@@ -94,7 +94,7 @@ def check_names(resolved: ResolvedExperiment) -> None:
 
 
 def check_commands(resolved: ResolvedExperiment) -> None:
-    """Find the program of each command."""
+    """Require that the program of each command exists."""
     for part in resolved.parts.components:
         if part.command and not is_program(part.command[0], resolved.document.folders[0]):
             what = f"[{part.name}] there is no program {part.command[0]!r}"
@@ -102,7 +102,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
-    """Check intermediary tables: settings that their kind knows, and addresses where they belong."""
+    """Check intermediary tables: known settings only, and addresses where they belong."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
         kind = wire_of(table)
@@ -124,7 +124,7 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
 
 
 def check_addresses(resolved: ResolvedExperiment) -> None:
-    """Refuse addresses bound twice, open to the network without keys, or connected to and bound by nobody."""
+    """Refuse addresses that are bound twice, open to the network without keys, or connected to but not bound."""
     bound: dict[str, BoundSocket] = {}
     security = resolved.sections.security
     secure = security.keys is not None or security.insecure
@@ -143,7 +143,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
                 'make keys with `afspm keys` and set [security] keys = "keys"; or say [security] insecure = true',
             )
     if not all(is_address(address) for address in bound):
-        return  # what is no address has been reported as such; whoever looks for it may be right
+        return  # a text that is no address was reported above; connections to it may be right
     for name, links in resolved.net.links.items():
         for target in (links.control, *links.subscribe):
             if target is None or target in resolved.net.slots or not is_address(target):
@@ -154,7 +154,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
 
 
 def check_self_subscription(resolved: ResolvedExperiment) -> None:
-    """Refuse components that listen to themselves: each packet would be the cause of the next."""
+    """Refuse components that subscribe to themselves: each packet would cause the next."""
     for name, links in resolved.net.links.items():
         own = resolved.net.slots.get(links.publish or "")
         if own is None or resolved.processes[name].role is not Role.COMPONENT:
@@ -165,7 +165,7 @@ def check_self_subscription(resolved: ResolvedExperiment) -> None:
 
 
 def check_listens_to(resolved: ResolvedExperiment) -> None:
-    """Require that `listens_to` names others that publish."""
+    """Require that `listens_to` names other components that publish."""
     publishers = {slot.owner for slot in resolved.net.slots.values() if slot.use == "publish"}
     for name, process in resolved.processes.items():
         wanted = process.part.own.get("listens_to", [])
@@ -181,7 +181,9 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Require that problems exist, and that each one flagged is solved by somebody, or ends the experiment."""
+    """Require that problems exist, and that each flagged one is solved by a component or a person, or ends the
+    experiment.
+    """
     control = resolved.sections.control
     by_hand = (*control.solved_by_hand, *control.end_on)
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
@@ -259,7 +261,7 @@ def check_controller(resolved: ResolvedExperiment) -> None:
 
 
 def check_clock(resolved: ResolvedExperiment) -> None:
-    """Refuse a time other than real where the microscope is not simulated."""
+    """Refuse simulated time if the microscope is not simulated."""
     if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
         return
     if (speed := resolved.sections.clock.speed) != 1.0:
@@ -290,7 +292,7 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
         hint = "leave [security] insecure away, or make keys with `afspm keys` and set [security] keys"
         what = "[control.roles] without keys: any program that takes the name has the role"
         resolved.document.warning(what, "control", "roles", hint=hint)
-    for name in resolved.saying(OPENS_PLAIN):
+    for name in resolved.declaring(OPENS_PLAIN):
         if not (security.plain or security.insecure):
             what = f"[{name}] lets programs without keys command the microscope"
             resolved.document.error(what, name, "class", hint="[security] plain = true allows that")
@@ -303,13 +305,13 @@ def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
     # A role for a person who has no password at this page would be open to anyone who types the name.
     name, _, person = member.partition(PERSON)
     process = resolved.processes.get(name)
-    if not person or process is None or not process.says("has_people"):
+    if not person or process is None or not process.declares("has_people"):
         return True
     return person in (process.settings.get("people") or {})
 
 
 def check_likely_typos(resolved: ResolvedExperiment) -> None:
-    """Warn of texts that are nearly a variable's name."""
+    """Warn of texts that almost equal a variable's name."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for part in resolved.parts.components:
         for path, text in _texts(part.settings, (part.name,)):
@@ -328,7 +330,7 @@ def _texts(value: object, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[s
 
 
 def check_needs(resolved: ResolvedExperiment) -> None:
-    """Require the actions and parameters that components need, where the microscope tells before it runs."""
+    """Require the actions and parameters that components need, if the microscope's capabilities are known."""
     for translator in resolved.with_role(Role.TRANSLATOR):
         has = translator.capabilities()
         if has is None:
@@ -345,7 +347,7 @@ def check_needs(resolved: ResolvedExperiment) -> None:
 
 
 def check_handlers(resolved: ResolvedExperiment) -> None:
-    """Check methods that look like handlers: their names, and the arguments that they take."""
+    """Check the names and arguments of methods that look like handlers."""
     for process in resolved.with_role(Role.COMPONENT):
         component = process.component
         if component is None or not issubclass(component, Component):

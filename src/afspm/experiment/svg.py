@@ -1,4 +1,4 @@
-"""The few SVG shapes that a drawing of an experiment needs, and how wide a text will be."""
+"""SVG shapes for drawings of an experiment, and an estimate of text widths."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _NARROW, _WIDE = set("iljtfrI.,:;'|!()[]/ -"), set("mwMW@%")
 
 
 def text_width(text: str, size: float, *, bold: bool = False) -> float:
-    """Return about the width of a text in a sans-serif font, rather too wide than too narrow."""
+    """Return the approximate width of a text in a sans-serif font, too wide rather than too narrow."""
     ems = sum(0.34 if c in _NARROW else 0.9 if c in _WIDE else 0.73 if c.isupper() else 0.62 for c in text)
     return ems * size * (1.07 if bold else 1.0)
 
 
 class Svg:
-    """Collects shapes; lines first, then boxes, then texts, so that no line runs over what is to be read."""
+    """Collects shapes; lines come first, then boxes, then texts, so that no line covers a text."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -84,7 +84,7 @@ class Svg:
         )
 
     def document(self, width: float, height: float, title: str, colours: Iterable[str]) -> str:
-        """Return the whole picture, on white."""
+        """Return the whole picture as SVG, on white."""
         heads = "".join(
             f'<marker id="head-{c[1:]}" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" '
             f'orient="auto-start-reverse"><path d="M0 0.8 L10 5 L0 9.2 z" fill="{c}"/></marker>'

@@ -1,4 +1,4 @@
-"""Where in a TOML text each key stands: the standard parser gives values, but no lines."""
+"""Line numbers of the keys in a TOML text: the standard parser returns values without lines."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def locate(text: str) -> dict[Path, int]:
 
 
 class _Scanner:
-    """Reads the tokens of a text that `tomllib` has accepted, so it need not look for errors."""
+    """Scans a text that `tomllib` has accepted, so it need not detect errors."""
 
     def __init__(self, text: str) -> None:
         self.lines: dict[Path, int] = {}

@@ -1,4 +1,4 @@
-"""The experiment written out as one TOML text: references replaced and defaults filled in."""
+"""The experiment as one TOML text: references replaced and defaults filled in."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ _NAMED_INSTEAD = "$AFSPM_WEBHOOK"
 
 
 def to_toml(parts: ExperimentParts, *, secrets: bool = True) -> str:
-    """Return variables, sections and components as they are in force; they read back as the same experiment.
+    """Return variables, sections and components as TOML; reading the text gives the same experiment.
 
     Args:
-        secrets: else an environment variable is named in place of each, which has to be set where it is read back.
+        secrets: whether to include secrets; otherwise each is replaced by the name of an environment variable, which
+            must be set where the text is read.
     """
     tables: Settings = dict(parts.variables)
     tables.update(parts.sections)
@@ -71,7 +72,7 @@ def _key(key: str) -> str:
 
 
 def value(of: object) -> str:
-    """Return a value as TOML writes it."""
+    """Return a value in TOML's notation."""
     if isinstance(of, bool):
         return "true" if of else "false"
     if isinstance(of, str):

@@ -1,4 +1,4 @@
-"""The errors of pydantic in the words of an experiment file: one sentence for each value that is wrong."""
+"""Errors of pydantic, reworded for an experiment file: one sentence for each wrong value."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ def report(
     document: Document,
     known: Callable[[SettingPath], Iterable[str]] = lambda place: (),
 ) -> None:
-    """Report what is wrong with the value given at `path` of the document, once for each place within it.
+    """Report the errors of the value given at `path` of the document, one for each place within it.
 
     Args:
-        known: returns the names that are valid beside an unknown one.
+        known: returns the valid names for the place of an unknown one.
     """
     by_place: dict[SettingPath, list[ErrorDetails]] = {}
     for one in error.errors(include_url=False):

@@ -1,8 +1,7 @@
-"""The sockets that each process binds or connects to; the file may leave addresses open.
+"""Sockets that each process binds or connects to; the file may leave addresses open.
 
-Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's,
-every component to the scheduler's; a component that publishes has an address of its own, to which those connect that
-listen to what it publishes.
+Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's, every
+component to the scheduler's. A component that publishes binds a publisher, to which its listeners connect.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from afspm.model import Role
 
 
 def read_wires(part: ExperimentPart, document: Document) -> WiringKeys:
-    """Return what the wiring keys of a component mean; reports what doesn't fit them."""
+    """Return the wiring keys of a component as addresses; report wrong ones."""
     wires = WiringKeys()
     for key, kinds in WIRE_KEYS.items():
         if key not in part.own:
@@ -95,7 +94,7 @@ def _apply_timeouts(wires: WiringKeys, table: Table) -> None:
 
 
 def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wiring:
-    """Fill in what the wiring keys leave out."""
+    """Return the sockets of all processes: as the wiring keys say, defaults elsewhere."""
     net = Wiring()
     scheduler = next((p for p in processes.values() if p.role is Role.SCHEDULER), None)
     translator = next((p for p in processes.values() if p.role is Role.TRANSLATOR), None)

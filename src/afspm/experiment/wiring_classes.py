@@ -1,4 +1,4 @@
-"""The sockets of processes: the intermediary classes that name them in a file, and what they are once connected."""
+"""Sockets of processes: the intermediary classes that name them in a file, and the resolved addresses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.experiment.findings import SourceLocation
 
 
 class WiringClass(Enum):
-    """The kinds of intermediary classes: they say where sockets are, and are not imported."""
+    """Kinds of intermediary classes: they name sockets, and are not imported."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -41,7 +41,7 @@ WIRE_SETTINGS: Final[dict[WiringClass, frozenset[str]]] = {
 }
 """The settings that each kind understands."""
 
-# The keys by which a component names its intermediaries, and the kinds that fit.
+# Keys of a component that name its intermediaries, and the kinds that fit.
 WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
     "subscriber": (WiringClass.SUBSCRIBER,),
     "control_client": (WiringClass.CLIENT,),
@@ -53,14 +53,14 @@ WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
 
 
 def wire_of(table: object) -> WiringClass | None:
-    """Return the kind of intermediary that a value is, or None."""
+    """Return the kind of an intermediary table; None for any other value."""
     name = table.get("class") if isinstance(table, Mapping) else None
     return WIRE_CLASSES.get(name) if isinstance(name, str) else None
 
 
 @dataclass(frozen=True)
 class BoundSocket:
-    """One end that a process binds: the address the file gives under `key`, or None where it is left open."""
+    """A socket that a process binds: the address that the file gives under `key`, or None if it is left open."""
 
     owner: str
     use: str
@@ -73,7 +73,7 @@ class BoundSocket:
 
 @dataclass
 class WiringKeys:
-    """The wiring keys of one component, as plain addresses."""
+    """Wiring keys of one component, as plain addresses."""
 
     publish: str | None = None
     subscribe: list[str] | None = None
@@ -88,7 +88,7 @@ class WiringKeys:
 
 @dataclass(frozen=True)
 class ProcessSockets:
-    """Every socket of one process; an open address is a `BoundSocket`'s key "owner/use" until it is given one."""
+    """Sockets of one process; an open address is the key "owner/use" of a `BoundSocket` until an address is chosen."""
 
     publish: str | None = None
     subscribe: tuple[str, ...] = ()
@@ -98,11 +98,11 @@ class ProcessSockets:
 
 @dataclass
 class Wiring:
-    """All slots and links of an experiment."""
+    """All bound sockets and connections of an experiment."""
 
     slots: dict[str, BoundSocket] = field(default_factory=dict)
     links: dict[str, ProcessSockets] = field(default_factory=dict)
 
     def addresses(self, take: Callable[[], str]) -> dict[str, str]:
-        """Return every slot's key with the address bound there, open ones filled by `take()`."""
+        """Return the address of every bound socket by its key; open ones are filled by `take()`."""
         return {key: slot.address or take() for key, slot in self.slots.items()}
