@@ -1,4 +1,4 @@
-"""The commands. Each module reads arguments, calls one room, and prints; nothing is decided here."""
+"""The commands. Each module reads arguments, calls one room, and prints; no decisions are made here."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import sys
 
 
 def main() -> None:
-    """Entry point. An error of ours is told in its own words; a traceback is kept for what nobody foresaw."""
+    """Run the command line. An `AfspmError` is printed as its message; any other error shows its traceback."""
     from afspm.basics.errors import AfspmError
     from afspm.cli.app import app
 

@@ -1,4 +1,4 @@
-"""All commands. Each module imports what it works with inside its function, so that any command starts fast."""
+"""All commands. Their modules import other rooms inside functions only, so that every command starts fast."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class DeclaredCommands(TyperGroup):
-    """The commands of the core and of packages, which are loaded for the help and where they are called."""
+    """Commands of the core and of packages; those of packages are loaded for the help and when called."""
 
     def list_commands(self, ctx: object) -> list[str]:
         declared = entry_points.names(entry_points.COMMANDS)

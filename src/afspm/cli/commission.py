@@ -1,4 +1,4 @@
-"""`afspm commission`: a new controller, step by step, in the terminal."""
+"""`afspm commission`: commissioning of a new controller, step by step in the terminal."""
 
 from __future__ import annotations
 
@@ -70,13 +70,13 @@ def _before(file: Path) -> InstrumentReport | None:
 
 
 class Terminal:
-    """The person at this terminal. Without an answer, nothing is confirmed."""
+    """Questions to the person at this terminal. No answer means no confirmation."""
 
     def __init__(self) -> None:
         self._console = plain_console()
 
     def show(self, text: str) -> None:
-        """Show a text; of one that begins with an empty line, the first line is a title."""
+        """Print a text; if it begins with an empty line, its first line is printed as a title."""
         title, _, rest = text.removeprefix("\n").partition("\n") if text.startswith("\n") else ("", "", text)
         if title:
             self._console.print(f"\n{title}", style="bold")
@@ -84,18 +84,16 @@ class Terminal:
             self._console.print(rest, style=_STYLES.get(rest[:1]))
 
     def confirm(self, question: str) -> bool:
-        """Ask yes or no."""
         return self._line(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
     def text(self, question: str) -> str:
-        """Ask for a line."""
         return self._line(f"{question}: ")
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
-        """Ask for one of the options, by its number or its word; an empty answer is the default, if there is one.
+        """Ask for one of the options, by number or word; an empty answer means the default, if there is one.
 
         Raises:
-            KeyboardInterrupt: none was chosen, however often it was asked.
+            KeyboardInterrupt: no valid answer after several attempts.
         """
         numbered = ", ".join(f"{number} {option}" for number, option in enumerate(options, 1))
         if default:

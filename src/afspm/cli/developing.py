@@ -90,7 +90,7 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
         begun.append(report)
         show_beginning(report, console)
 
-    # whoever ends it has everything put back first
+    # SIGTERM, like Ctrl-C, first restores all settings
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         report = run(options, begin, done=lambda result: show_result(result, console))
@@ -119,10 +119,10 @@ def check_client(
     runs: Runs = RUNS,
     listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
 ) -> None:
-    """Judge a client in another language by what it does in experiments on the simulated microscope.
+    """Test a client in another language by its behaviour in experiments on the simulated microscope.
 
-    Starts the client's conformance program again and again, with real and with scripted schedulers, and gives it
-    steps. Ends with 0 if nothing was wrong.
+    Starts the client's conformance program again and again, with real and with scripted schedulers, and sends it steps.
+    Ends with 0 if nothing was wrong.
     """
     import sys
 
@@ -176,9 +176,9 @@ def emulate(
 ) -> None:
     """Emulate a vendor's controller: its own protocol, simulated physics behind it.
 
-    Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
-    to the vendor's usual port may expect a real controller there. A replay ends with 1 if something else was asked
-    than what was recorded.
+    Runs until Ctrl-C. Listens on this computer only, and at a free port unless you give one: a client that connects to
+    the vendor's usual port may expect a real controller there. A replay ends with 1 if a request differs from the
+    recorded one.
     """
     from afspm.simulation.emulation.registry import emulator, names
 

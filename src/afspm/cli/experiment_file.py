@@ -1,4 +1,4 @@
-"""`afspm check`, `graph`, `keys` and `notify`: what is done with an experiment file before anything starts."""
+"""`afspm check`, `graph`, `keys` and `notify`: work on an experiment file before a run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def check(
 ) -> None:
     """Find every error of an experiment file, before anything starts.
 
-    Says file, line, what is wrong and what would be right. Ends with 1 if there are errors; warnings are only told.
+    Shows file, line, error and remedy. Ends with 1 if there are errors; warnings alone end with 0.
     """
     from rich.console import Console
 
@@ -60,7 +60,7 @@ def _explain(experiment: Experiment, console: Console) -> None:
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:
-    """Print findings, one a paragraph, coloured where the terminal can."""
+    """Print findings, one a paragraph, with colours on a terminal."""
     from rich.text import Text
 
     for finding in findings:
@@ -72,7 +72,7 @@ def show(findings: Sequence[Finding], console: Console) -> None:
 
 
 def require_no_errors(experiment: Experiment, only: Collection[str] = (), without: Collection[str] = ()) -> None:
-    """Show what is wrong or doubtful, where these are started here. Raises typer.Exit if something is wrong."""
+    """Print errors and warnings for the processes started here. Raises typer.Exit if there are errors."""
     findings = experiment.check(only, without)
     if findings:
         from rich.console import Console
@@ -121,8 +121,8 @@ def keys(
 ) -> None:
     """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
 
-    Keys that are there already are left as they are. Copy public/ to every computer, and of private/ only the keys of
-    what runs there.
+    Existing keys are kept. Copy public/ to every computer, and of private/ only the keys of the processes that run
+    there.
     """
     from afspm.experiment import load
     from afspm.model.events import SUPERVISOR
@@ -142,7 +142,7 @@ def keys(
 def notify(
     files: Files, test: Annotated[bool, typer.Option("--test", help="Send a test message by each of them.")] = False
 ) -> None:
-    """List the calls that the [notify] of an experiment file makes, and try them.
+    """List the notifications of [notify] in an experiment file, and test them.
 
     Ends with 1 if there are none, or if a test message does not arrive.
     """

@@ -1,4 +1,4 @@
-"""`afspm run`, `demo` and `trace`: an experiment, from its file to the folder that it leaves behind."""
+"""`afspm run`, `demo` and `trace`: run an experiment."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ _DRIFT_NIGHT = "A simulated night of eighteen hours on a sample that drifts by m
 
 
 class RunPage(Protocol):
-    """The functions of a module that shows runs in the browser."""
+    """Functions of a module that shows runs in the browser."""
 
     def with_page(self, files: list[Path]) -> Experiment:
-        """Return the experiment of these files, with a page if the files have none."""
+        """Return the experiment of these files, with a page added if they have none."""
 
     def resumed_with_page(self, found: ResumableRun) -> ResumableRun:
-        """Return the run that is to go on, with a page if it has none."""
+        """Return the run to resume, with a page added if it has none."""
 
     def page_of(self, experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
-        """Return name and settings of a page among the processes that were started here; None: there is none."""
+        """Return name and settings of the page among the processes started here; None if there is none."""
 
     def stay(self, folder: Path, name: str, settings: PlainMapping) -> None:
-        """Show a run that has ended until Ctrl-C, on the page of this name and these settings."""
+        """Show an ended run, on the page with this name and these settings, until Ctrl-C."""
 
 
 def run(
@@ -157,7 +157,7 @@ def _told(start: ProcessStart) -> str:
 
 
 def ask_metadata(experiment: Experiment) -> dict[str, str]:
-    """Ask what [metadata] of the file, and the class of the microscope, leave open or may have changed."""
+    """Ask for the entries of [metadata]; offer those of the file and of the microscope's class."""
     known = experiment.resolved.metadata()
     return {name: answer for name, text in _QUESTIONS.items() if (answer := _answer(name, text, known.get(name, "")))}
 
@@ -201,11 +201,11 @@ def trace(
     runs: Runs = RUNS,
     speed: Speed = None,
 ) -> None:
-    """Run an experiment, and record everything that is said to and by the controller.
+    """Run an experiment, and record all traffic with the controller.
 
-    The trace is in the run's folder: one file, with the files that the controller saved and without secrets. Send it
-    with a report of a bug: `afspm emulate --replay` plays it back. As `afspm run` with `trace = true` in the section of
-    the translator.
+    The trace is one file in the run's folder; it includes the files that the controller saved, and no secrets. Attach
+    it to a bug report: `afspm emulate --replay` plays it back. The same as `afspm run` with `trace = true` in the
+    translator's section.
     """
     import sys
 

@@ -1,4 +1,4 @@
-"""`afspm runs`, `report`, `export` and `replay`: list recorded runs, and work with one."""
+"""`afspm runs`, `report`, `export` and `replay`: list recorded runs, and use one."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ _COLUMNS: Final[dict[str, Callable[[RunSummary], str]]] = {
 def report(where: Where = RUNS) -> None:
     """Write report.html, and figures, into the folder of a run, from its record.
 
-    Of a run that goes on, too: it shows what has happened so far. The page needs no other file.
+    Works during a run, too: the report then shows events up to now. The page needs no other file.
     """
     from afspm.client.connect import find_run
     from afspm.record.report import write
@@ -119,9 +119,9 @@ def export(
     out: Annotated[Path | None, opt("Where to write. Default: export in the folder of the run.", metavar="DIR")] = None,
     scans: Annotated[str | None, opt("Only these scans, by their numbers; 7-: from 7 on.", metavar="1-5,8")] = None,
 ) -> None:
-    """Write the scans and spectra of a recorded run in the format of others.
+    """Write the scans and spectra of a recorded run in another format.
 
-    Also of a run that goes on, or was killed. Interrupted scans come, too, as far as they were seen.
+    Works during a run, and for a run that was killed. Interrupted scans are included as far as they were recorded.
     """
     from afspm.record.export import export as exported
     from afspm.record.run import open_run
@@ -151,8 +151,8 @@ def replay(
 ) -> None:
     """Publish a recorded run again, with its timing at any speed, as its scheduler did.
 
-    It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Who
-    comes late gets what was kept. Requests are refused: nobody measures.
+    It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Late
+    joiners get the cached packets. Requests are refused, since nothing is measured.
     """
     from afspm.supervisor import replay as replaying
 

@@ -1,4 +1,4 @@
-"""`afspm status` and `afspm watch`: looking at a running experiment, once or for as long as one likes."""
+"""`afspm status` and `afspm watch`: the state of a running experiment, once or continuously."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def status(
 ) -> None:
     """Show the state of a running experiment: control, microscope, problems, notes and the time left.
 
-    Ends with 3 where nothing runs.
+    Ends with 3 if no experiment runs.
     """
     with looking(where) as follower:
         text = _text(follower)
@@ -40,9 +40,9 @@ def status(
 
 
 def watch(where: Where = RUNS) -> None:
-    """Watch a running experiment until it ends, or Ctrl-C; the experiment does not notice.
+    """Watch a running experiment until it ends, or Ctrl-C. Does not disturb the experiment.
 
-    Where the output is no terminal, a line is written whenever something changes. Ends with 3 if the run is cut off.
+    If the output is no terminal, a line is written at each change. Ends with 3 if the run is cut off.
     """
     console = plain_console()
     with looking(where, lines=True) as follower, contextlib.suppress(KeyboardInterrupt):

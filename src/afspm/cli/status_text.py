@@ -1,4 +1,4 @@
-"""A running experiment in words, for a terminal of any width, and as JSON. What is told comes from an `Overview`."""
+"""Text on a running experiment, for a terminal of any width, and as JSON. The data come from an `Overview`."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _PROCESS = ("name", "role", "step_age_s", "starts", "pid", "last_exit")
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """Facts of a run besides what it publishes.
+    """Facts about a run that are not in its packets.
 
     Attributes:
-        replay_of: the folder of the run that is published again; empty: it is no replay.
-        began_ns: experiment time at its start; None if it is not known.
+        replay_of: folder of the run that is replayed; empty: it is no replay.
+        began_ns: experiment time at its start; None if unknown.
         speed: experiment seconds in a real second.
-        fancy: True if the terminal can show block characters.
+        fancy: whether the terminal can show block characters.
     """
 
     name: str
@@ -44,19 +44,19 @@ class RunDescription:
 
 
 def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
-    """Return a part of a whole (0 to 1) as a bar."""
+    """Return a fraction (0 to 1) as a bar."""
     full = min(width, max(0, round(part * width)))
     return ("█" * full + "░" * (width - full)) if fancy else "[" + "#" * full + "." * (width - full) + "]"
 
 
 def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
-    """Yield (number, name, since when and by whom) of each problem that is flagged."""
+    """Yield number, name, and start and source of the flag of each flagged problem."""
     for number in seen.control.problems if seen.control else ():
         yield number, seen.problems.name(number), seen.problem_timelines[number].now
 
 
 def log_line(line: LogLine) -> Text:
-    """Return what a process said, coloured by how bad it is."""
+    """Return a line of the log, coloured by its level."""
     from rich.text import Text
 
     text = Text.assemble((f"{time_of_day(line.time_ns)} ", "dim"), (f"{line.name} ", "cyan"))
@@ -64,7 +64,7 @@ def log_line(line: LogLine) -> Text:
 
 
 class StatusText:
-    """The words on a run at a moment, in experiment time."""
+    """Text on a run at one moment, in experiment time."""
 
     def __init__(self, seen: Overview, run: RunDescription, now_ns: int) -> None:
         self._seen = seen
@@ -72,7 +72,7 @@ class StatusText:
         self._now_ns = now_ns
 
     def screen(self, *, silent_s: float = 0.0, log_lines: int = 8) -> Group:
-        """Return all that there is to see."""
+        """Return the whole status."""
         from rich.console import Group
         from rich.text import Text
 
@@ -90,7 +90,7 @@ class StatusText:
         return Group(*lines)
 
     def summary(self) -> str:
-        """Return the most important in one line."""
+        """Return control, problems and microscope in one line."""
         return "; ".join(
             " ".join(line.plain.split()) for line in (self._control(), *self._problems(), self._microscope())
         )
@@ -213,7 +213,7 @@ class StatusText:
             yield _label("note").append(f"{time_of_day(note.time_ns)} {note.who}{on}: {note.text}")
 
     def as_json(self) -> dict[str, object]:
-        """Return the same for programs. Times as ISO 8601 in UTC, durations in experiment seconds."""
+        """Return the status for programs. Times are ISO 8601 in UTC, durations are in experiment seconds."""
         seen, run = self._seen, self._run
         control, running = seen.control, seen.scan_progress(self._now_ns)
         return {

@@ -1,4 +1,4 @@
-"""`FeedbackTuner`: looks for a better integral gain when somebody flagged that the feedback does not follow."""
+"""`FeedbackTuner`: searches a better integral gain when `feedback-non-optimal` is flagged."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ BACK_WITHIN_S = 60.0
 
 
 class FeedbackTuner(FeedbackObserver):
-    """Solves `feedback-non-optimal`: scans the region set, raises the integral gain while the feedback is too slow and
-    lowers it while it oscillates, until it follows well, or as well as it can.
+    """Solves `feedback-non-optimal`: scans the current region, and searches a good integral gain.
 
-    Where no gain is good it sets the one that was there, says so in the log, and removes the flag, so that the
-    experiment goes on as it was. The gain that was there is also set again after control was lost, or a kill.
+    It raises the gain while the feedback is too slow, and lowers it while it oscillates. If no gain is good, it
+    restores the original gain, logs that, and clears the flag, so that the experiment continues as before. The original
+    gain is also restored after control was lost, or after a kill.
 
     Args:
-        lowest_gain, highest_gain: of the integral gain; never left.
+        lowest_gain, highest_gain: bounds of the integral gain.
         factor: of one step.
         most_tries: test scans of one search.
     """

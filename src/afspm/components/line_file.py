@@ -1,4 +1,4 @@
-"""Files that grow line by line and survive a kill: a line is there as a whole or not at all."""
+"""Files that grow line by line and survive a kill: a line is in the file completely or not at all."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _log = logging.getLogger("afspm.records")
 
 
 class LineFile:
-    """Appends lines to a text file. A last line that a kill cut in two is taken away before the next is written.
+    """Appends lines to a text file. An incomplete last line, left by a kill, is removed before the next is written.
 
     Args:
-        path: made when the first line is written.
-        header: the first line of a new file.
+        path: created with the first line.
+        header: first line of a new file.
     """
 
     def __init__(self, path: Path, header: str = "") -> None:
@@ -32,10 +32,10 @@ class LineFile:
         self._told = OutageLog("lines wait to be written", _log)
 
     def lines(self) -> list[str]:
-        """Return the lines that are there, without the header and a last line that is not whole.
+        """Return the complete lines, without the header.
 
         Raises:
-            FileError: it can't be read.
+            FileError: the file can't be read.
         """
         try:
             text = self.path.read_bytes().decode("utf-8", errors="replace")
@@ -47,10 +47,10 @@ class LineFile:
         return whole[1:] if self._header else whole
 
     def append(self, lines: Iterable[str]) -> None:
-        """Write lines at the end, the header first if the file is new.
+        """Append lines, after the header if the file is new.
 
-        Where that can't be, on a full disk or while somebody has the file open in a program that locks it, it is said,
-        and they wait until more come.
+        If the file can't be written (the disk is full, or a program such as a spreadsheet locks the file), this is
+        logged, and the lines wait for the next call.
         """
         self._waiting += "".join(f"{line}\n" for line in lines)
         with self._told.trying():
@@ -81,7 +81,7 @@ class LineFile:
 
 
 def csv_line(row: Iterable[str]) -> str:
-    """A row of a table as one line."""
+    """Return a row of a table as one line."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(row)
     return line.getvalue().replace("\n", " ")

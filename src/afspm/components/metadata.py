@@ -1,4 +1,4 @@
-"""`Metadata`: a table of what was measured, with what the files of the microscope don't say: who was in control."""
+"""`Metadata`: a table of all measurements, with facts that the microscope's files lack, such as the holder of control."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 class Metadata(Component):
     """Writes `metadata.csv` in the run folder: a row for each channel of each scan, each spectrum and each note.
 
-    Columns: the time it was finished (UTC), `scan`, `spectrum` or `note`, the file, the channel (or kind), its place in
-    metres, pixels, units, and as it was when the measurement began: who was in control, the mode, the problems flagged
-    and the microscope's state; of a note, its author and text. A note on a scan has the time of that scan. What is not
-    known is left empty: a scan that began while this component was not running.
+    Columns: end time (UTC); `scan`, `spectrum` or `note`; file; channel (or kind); place in metres; pixels; units; and,
+    as they were when the measurement began, holder of control, mode, flagged problems and the microscope's state; for a
+    note its author and text. A note on a scan has the time of that scan. Unknown values are empty, such as those of a
+    scan that began while this component was not running.
 
-    Whatever is killed, there is one header and no row is there twice or missing.
+    The file has one header, and each row exactly once, even if processes are killed.
 
     Args:
         file: its name in the run folder.
@@ -101,7 +101,7 @@ class Metadata(Component):
         self._under_way = None  # should it scan on without another state between them, that is the next one
         time_ns = measured.time_ns
         if time_ns is None and self.packet is not None:
-            time_ns = self.packet.time_ns  # rows are told apart by it
+            time_ns = self.packet.time_ns  # distinguishes rows
         row = {
             "time": iso_utc(time_ns),
             "measurement": what,

@@ -1,4 +1,4 @@
-"""`NightPicture`: the night on one page: the scans, who was in control when, and which problems were flagged."""
+"""`NightPicture`: the night on one page: scans, control and problems over time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from afspm.record.night_record import NightRecord, control_entry, mark_entry, sc
 class NightPicture(Component):
     """Draws `night.png` when the experiment ends: the scans in a row, control and problems over time.
 
-    Where the microscope is simulated, the picture says so. It listens to everything, and keeps what it needs on disk as
-    it goes: killed and started again, it draws the same.
+    A simulated microscope is marked in the picture. The component subscribes to all packets, and saves as it goes:
+    killed and restarted, it draws the same picture.
 
     Args:
         channel: shown of each scan.

@@ -1,4 +1,4 @@
-"""Scans by plan: one region repeatedly, a list of regions, or a grid of them. Each is taken exactly once."""
+"""Scans by plan: one region repeatedly, a list of regions, or a grid. Each scan is taken exactly once."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ _MISSED: dict[Missed, str] = {
 class PlannedScans(Component):
     """Takes the scans of a plan. Derive from it for a plan of your own, and set `plan` (and `beat_s`) in `__init__`.
 
-    Each scan has a key, so that whatever process is killed, and whenever, no scan is left out or taken twice. While
-    control is lost (to the repair of a tip, to a person) the scan waits; what was interrupted is said in the log.
+    Each scan has a key, so no scan is left out or taken twice, even if processes are killed. While control is lost (to
+    the repair of a tip, to a person) the scan waits; an interruption is logged.
 
     Args:
-        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
+        keep_control: whether to keep control between scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
-        missed: what becomes of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
+        missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never.
 
     Attributes:
-        plan: the regions, and how often.
-        beat_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
-        ends_on_time: whether rounds that are left out since one takes longer than the period count as taken, so that
-            the plan ends when it should. Those while nothing ran, before a restart, don't.
+        plan: the regions, and the number of rounds.
+        beat_s: between the starts of two rounds, experiment time; 0: no pause.
+        ends_on_time: whether rounds that are left out because a round takes longer than the period count as taken, so
+            that the plan ends on time. Rounds missed while no process ran, before a restart, don't count.
     """
 
     needs_actions = (names.START_SCAN,)
@@ -169,18 +169,18 @@ class PlannedScans(Component):
 
 
 class ScanSeries(PlannedScans):
-    """The same region every so often, for as long or as many scans as wanted.
+    """The same region again and again, with a period, for a number of scans or a duration.
 
-    With neither `scans` nor `duration` it goes on until another component or a person ends the experiment.
+    With neither `scans` nor `duration` it continues until another component or a person ends the experiment.
 
     Args:
         size: (width, height) of the region, e.g. ["2 um", "2 um"].
         center: (x, y) of its middle.
         angle: counter-clockwise.
         pixels: (columns, rows).
-        every: from the beginning of one scan to that of the next, experiment time; 0 for no pause.
-        scans: how many.
-        duration: for how long scans are begun (instead of `scans`).
+        every: from the start of one scan to the start of the next, experiment time; 0 for no pause.
+        scans: number of scans.
+        duration: time within which scans are started (instead of `scans`).
     """
 
     def __init__(
@@ -219,13 +219,13 @@ class ListedRegion:
 
 
 class ScanList(PlannedScans):
-    """Regions of a list, in its order, in one round or several.
+    """Regions of a list, in order, in one or more rounds.
 
     Args:
         regions: each with center, size and angle.
         pixels: (columns, rows) of each.
-        rounds: how often the list is gone through.
-        every: from the beginning of one round to that of the next, experiment time.
+        rounds: number of rounds.
+        every: from the start of one round to the start of the next, experiment time.
     """
 
     def __init__(
@@ -243,7 +243,7 @@ class ScanList(PlannedScans):
 
 
 class RegionGrid(PlannedScans):
-    """A region about each point of a grid, there and back row after row: a map larger than one scan, or samples of one.
+    """A region at each point of a grid, back and forth row by row: a map larger than one scan, or samples of it.
 
     Args:
         size: (width, height) of each region.
@@ -252,8 +252,8 @@ class RegionGrid(PlannedScans):
         center: (x, y) of the middle of the grid.
         angle: of grid and regions, counter-clockwise.
         pixels: (columns, rows) of each scan.
-        rounds: how often the grid is gone through.
-        every: from the beginning of one round to that of the next, experiment time.
+        rounds: number of rounds.
+        every: from the start of one round to the start of the next, experiment time.
     """
 
     def __init__(
@@ -275,14 +275,14 @@ class RegionGrid(PlannedScans):
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Return two numbers as a tuple: from JSON they come as a list."""
+    """Return two numbers, which JSON delivers as a list, as a tuple."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])
 
 
 def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> dict[str, str | float]:
-    """Return the values to set before a scan. Raises ConfigError: one of them has no meaning."""
+    """Return the parameters to set before a scan. Raises ConfigError if one is invalid."""
     parameters = dict(given or {})
     for name, quantity in parameters.items():
         try:
@@ -295,14 +295,14 @@ def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> d
 
 
 def period(every_s: float, where: str = "every") -> float:
-    """Return the time from one round to the next. Raises ConfigError: no such time."""
+    """Return the time from one round to the next. Raises ConfigError if it is negative or infinite."""
     if not 0.0 <= every_s < math.inf:
         raise ConfigError(f"a period of {every_s:g} s", where=where, hint='above zero, for example "15 min"')
     return every_s
 
 
 def shape_of(pixels: Sequence[int], where: str = "pixels") -> tuple[int, int]:
-    """Return (columns, rows) as (rows, columns). Raises ConfigError: a scan of no pixels."""
+    """Return (columns, rows) as (rows, columns). Raises ConfigError for fewer than 1 x 1 pixels."""
     if len(pixels) != 2 or min(pixels) < 1:
         hint = "columns and rows, each at least 1, for example [128, 128]"
         raise ConfigError(f"{list(pixels)} is no number of pixels", where=where, hint=hint)

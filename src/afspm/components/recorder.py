@@ -1,4 +1,4 @@
-"""`Recorder`: keeps the record of a run. It is part of every experiment, unless [record] of its file says otherwise."""
+"""`Recorder`: keeps the record of a run. Part of every experiment, unless [record] of its file says otherwise."""
 
 from __future__ import annotations
 
@@ -32,13 +32,12 @@ SIGNS_OF_LIFE = ("ControlState",)
 class Recorder(Component):
     """Writes `journal.sqlite`, and every scan and spectrum as an HDF5 file, into the folder of the run.
 
-    It follows the scheduler's packet log, and lets all others have the processor first. Whatever is killed, also
-    everything at once, nothing that was published is missing in the record of a run that is resumed, and nothing is
-    there twice. A disk that is full is logged; the experiment goes on, and what was missed is recorded once there is
-    room, as far as it is still kept then.
+    It follows the scheduler's packet log at low processor priority. Even if all processes are killed at once, the
+    record of a resumed run has each published packet exactly once. A full disk is logged; the experiment goes on, and
+    missed packets are recorded once there is room, as far as the log still has them.
 
     Args:
-        scans: whether scans and spectra are kept; else only the journal is.
+        scans: whether to keep scans and spectra; otherwise only the journal.
     """
 
     listens: ClassVar = ("",)

@@ -1,4 +1,4 @@
-"""Spectra on a grid or a list of positions, each exactly once."""
+"""Spectra on a grid or a list of positions, each taken exactly once."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ MOST_LINES = 20
 
 
 class SpectroscopyGrid(Component):
-    """A spectrum at each point of a grid, or of a list; points are gone to there and back, row after row.
+    """A spectrum at each point of a grid, back and forth row by row, or at each position of a list.
 
-    Whatever process is killed, and whenever, no spectrum is left out or taken twice.
+    No spectrum is left out or taken twice, even if processes are killed.
 
     Args:
         counts: (columns, rows) of the grid.
         spacing: (x, y) from one point to the next.
-        center: (x, y) of the middle of the grid; (0, 0) if not told.
-        angle: of the grid, counter-clockwise; 0 if not told.
+        center: (x, y) of the middle of the grid; by default (0, 0).
+        angle: of the grid, counter-clockwise; by default 0.
         positions: a list of (x, y) instead of a grid.
-        kind: what is measured, where the microscope can choose, e.g. "IV" or "force".
-        repeats: how many spectra at each point.
+        kind: of the spectrum, if the microscope has several, e.g. "IV" or "force".
+        repeats: number of spectra at each point.
         end_when_done: whether to end the whole experiment after the last.
     """
 

@@ -1,4 +1,4 @@
-"""`TipClassifier`: sees in the scans that the tip has changed, and that it is good again."""
+"""`TipClassifier`: detects in the scans that the tip has changed, and that it is good again."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion
 
 
 class TipClassifier(Component):
-    """Flags `tip-shape-changed` when scans say that the tip is blunt, double or carries debris, and clears it again.
+    """Flags `tip-shape-changed` when scans show that the tip is blunt, double or carries debris, and clears it again.
 
-    It learns what a good tip shows from the first scans of each size and number of pixels, so the tip has to be good
-    then; it learns nothing while a problem is flagged or the last scan judged was not good. It judges best a place that
-    it has seen before; elsewhere it sees only large changes. What it thinks of each scan it publishes as a
+    It learns the reference from the first scans of each size and number of pixels, so the tip must be good then; it
+    learns nothing while a problem is flagged or after a scan that was not good. It judges best at places that it has
+    seen before; elsewhere it detects only large changes. The verdict on each scan is published as a
     `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
 
     Args:
         channel: of the heights.
-        retrace_channel: their retrace; empty where it is not recorded (then debris is not seen).
-        reference_scans: how many scans of each kind it learns from.
+        retrace_channel: their retrace; empty if not recorded (then debris is not detected).
+        reference_scans: number of scans of each kind for the reference.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
         detail: share of the fine detail at a known place below which the tip is blunt.
         ghost: correlation of a ghost image at a known place above which the tip is double.
         unrest: factor on the disagreement of trace and retrace above which it carries debris.
-        worn: share of the first scans' fine detail below which it is worn, wherever that is seen.
+        worn: share of the first scans' fine detail below which the tip is worn, at any place.
         sigmas: standard deviations of the reference beyond which a scan must lie to be bad.
-        problem: what it flags.
+        problem: the problem to flag.
     """
 
     flags: ClassVar = ("tip-shape-changed",)

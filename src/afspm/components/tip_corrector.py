@@ -1,4 +1,4 @@
-"""`TipCorrector`: repairs a tip that was flagged, within what it is allowed to do."""
+"""`TipCorrector`: repairs a tip that was flagged, with the treatments that it is allowed."""
 
 from __future__ import annotations
 
@@ -26,37 +26,38 @@ VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that lo
 
 
 class TipCorrector(Component):
-    """Solves `tip-shape-changed`: pulses of the bias, one after the other, then controlled crashes, deeper and deeper.
+    """Solves `tip-shape-changed` by pulses of the bias, one after the other, then by ever deeper controlled crashes.
 
-    After each it takes a test scan: of the region, with the pixels, of the scan last judged bad, since the fault was
-    seen there; without such a verdict, of the region set last. A component that judges scans (the `TipClassifier`)
+    After each treatment it takes a test scan, with the region and pixels of the scan last judged bad, since the fault
+    was seen there; without such a verdict, of the current region. A component that judges scans (the `TipClassifier`)
     clears the flag when the tip is good, which takes control from the corrector: the experiment goes on. The lists
-    below are all that one repair may do, over restarts too; what a limit of the experiment file or the microscope
-    refuses is logged and left out. When nothing is left it flags `device-malfunction` and waits for a person: the
-    experiment stops measuring rather than measuring with a bad tip. Once that flag is removed it may try again.
+    below are all that one repair may do, also over restarts; a treatment that a limit of the experiment file or the
+    microscope refuses is logged and left out. After the last treatment it flags `device-malfunction` and waits for a
+    person: the experiment stops measuring rather than measure with a bad tip. Once that flag is cleared it may try
+    again.
 
-    What it does to the sample it does at fresh places about `workshop_center`, and never within `keep_away` of the
-    experiment's region or of the test scan. Where control is lost on the way to one of them, to a person who moves the
-    probe, say, it begins again with another place when control is back. It does nothing where the probe is not
-    published to stand there, nor what it can't write down, on a full disk: a restart would do it again. It publishes
-    each action done as an `ActionMsg`.
+    Treatments are made at fresh places about `workshop_center`, never within `keep_away` of the experiment's region or
+    of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), it continues with
+    another place when it has control again. It makes no treatment unless the probe's published position is the place,
+    nor one that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as an
+    `ActionMsg`.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
-        test_center: (x, y) of a first test scan, so that a tip that is worse stays off the experiment's region.
-            Whether it is good is seen best where the fault was seen; there it is tested next, or at once if no place
-            is given here.
-        pulse_voltages: those of one repair, in order.
+        test_center: (x, y) of a first test scan, so that a worse tip stays off the experiment's region. The next test
+            scan is where the fault was seen, which shows best whether the tip is good; without `test_center` it is the
+            first.
+        pulse_voltages: of one repair, in order.
         pulse_duration: of each pulse.
-        crash_depths: those of one repair, in order, after the pulses.
+        crash_depths: of one repair, in order, after the pulses.
         crash_speed: of each crash.
         place_spacing: between the places of two treatments.
         keep_away: least distance of a treatment from the experiment's region and the test scans.
-        judge: "classifier" waits for whoever judges scans to clear the flag; "self" judges the test scans by the first
-            scans of the experiment, and clears it.
+        judge: "classifier" waits until the component that judges scans clears the flag; "self" compares the test scans
+            with the first scans of the experiment, and clears it.
         channel, retrace_channel: of the heights, for judge = "self".
         reference_scans: for judge = "self".
-        problem: what it solves.
+        problem: the problem to solve.
     """
 
     solves: ClassVar = ("tip-shape-changed",)
@@ -261,4 +262,4 @@ def _unpacked(frame: Frame) -> tuple[Region, tuple[int, int] | None]:
 
 
 class _Blind(AfspmError):
-    """Nobody can tell what the tip is like."""
+    """The state of the tip can't be determined."""

@@ -1,16 +1,16 @@
-"""Metrics of the tip from the scans that it took, in numbers that depend little on where it was taken.
+"""Metrics of the tip from its scans, chosen to depend little on the place.
 
-Whatever the tip touches it blunts, doubles or shakes in the same way, so that three properties of a scan tell of the
-tip rather than of the place:
+A changed tip blunts, doubles or shakes all features in the same way, so three properties of a scan characterise the tip
+rather than the place:
 
 - `detail`: the power of the slopes at short wavelengths against that at long ones. Every edge of the sample has both;
-  a blunt tip loses the short ones. (Heights of terraces, or how many particles there are, scale both.) The power is
-  the cross spectrum of trace and retrace, to which noise does not add up.
-- `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats everything at one distance.
-- `unrest`: how far trace and retrace disagree over stretches of flat ground, which loose debris causes and feedback
+  a blunt tip loses the short ones. (Heights of terraces, or the number of particles, scale both.) The power is the
+  cross spectrum of trace and retrace, in which noise averages out.
+- `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats every feature at one distance.
+- `unrest`: the disagreement of trace and retrace over stretches of flat ground, which loose debris causes and feedback
   does not.
 
-(Villarrubia 1997 for what a tip does to an image; the rest is standard signal analysis.)
+(Villarrubia 1997 for the effect of a tip on an image; the rest is standard signal analysis.)
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class TipMetrics:
 
 @dataclass(frozen=True)
 class Slopes:
-    """The slopes of a scan along its lines, ready to be analysed.
+    """Slopes of a scan along its lines.
 
     Attributes:
         trace, retrace: (rows, columns - 1).
@@ -65,13 +65,13 @@ class Slopes:
 
 
 def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
-    """Take what does not tell of the tip out of a scan: offsets and tilt of its lines, missing pixels.
+    """Return the slopes of a scan, without offsets and tilt of its lines, missing pixels filled.
 
     Args:
-        trace, retrace: heights in m, [y, x], retrace turned round as scans are; NaN where nothing was measured.
+        trace, retrace: heights in m, [y, x], retrace reversed as in scans; NaN where not measured.
 
     Raises:
-        InvalidValue: too small, too many holes, or two pictures of different shape.
+        InvalidValue: too few pixels, too many holes, or different shapes.
     """
     if min(trace.shape) < FEWEST_PIXELS:
         raise InvalidValue(f"a scan of {trace.shape} pixels is too small to tell", hint=f"{FEWEST_PIXELS} at least")
@@ -85,7 +85,7 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
 
 
 def autocorrelation(of: Slopes, reach_px: int) -> Array:
-    """Return how much the slopes look like themselves elsewhere, 1 at no distance.
+    """Return the autocorrelation of the slopes, 1 at zero lag.
 
     Returns:
         Lags of 0 … reach rows by -reach … reach columns; the other half is the same by symmetry.
@@ -114,7 +114,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
     Args:
         correlation: its `autocorrelation`.
-        expected: that of a good tip on this sample, which may be periodic; None: nothing is expected.
+        expected: autocorrelation with a good tip on this sample, which may be periodic; None: zero.
     """
     short, long, noise = _band_powers(of)
     return TipMetrics(
@@ -126,7 +126,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
 
 def ghost(correlation: Array, expected: Array | None = None) -> float:
-    """Return the largest correlation beside the centre, less what was expected there."""
+    """Return the largest correlation beside the centre, less the expected one."""
     beyond = _smoothed(correlation if expected is None else correlation - expected)
     reach = correlation.shape[0] - 1
     rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]

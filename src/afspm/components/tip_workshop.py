@@ -1,4 +1,4 @@
-"""The workshop: fresh places on the sample, where treatments of the tip are done."""
+"""The workshop: fresh places on the sample for treatments of the tip."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ DONE_ACTION = "ActionMsg"
 
 
 class TipWorkshop:
-    """Treats the tip for a component, which has control around every call.
+    """Treats the tip for a component, which must hold control around every call.
 
     Args:
-        center: about which the places are.
+        center: about which the places lie.
         spacing: between the places of two treatments, in m.
-        keep_away: least distance of a treatment from what is scanned, in m.
+        keep_away: least distance of a treatment from scanned regions, in m.
     """
 
     def __init__(self, component: Component, problem: str, center: XY, spacing: float, keep_away: float) -> None:
@@ -36,7 +36,7 @@ class TipWorkshop:
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         """Do the `number`-th treatment at a fresh place, in one tenure of control with the move there.
 
-        Returns whether it was done. Raises FileError: it can't be written down.
+        Return whether it was done. Raises FileError if the state can't be saved.
         """
         while True:
             place = self._fresh_place(number)
