@@ -11,10 +11,10 @@ def main() -> None:
     from afspm.basics.errors import AfspmError
     from afspm.cli.app import app
 
-    for stream in (sys.stdout, sys.stderr):  # a terminal that lacks a character must not cost the line
+    for stream in (sys.stdout, sys.stderr):  # a character that the terminal lacks must not lose the line
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-            if sys.platform == "win32" and not stream.isatty():  # else it is in the code page of that computer
+            if sys.platform == "win32" and not stream.isatty():  # otherwise output is in the computer's code page
                 stream.reconfigure(encoding="utf-8")
     try:
         app()

@@ -43,7 +43,7 @@ app = typer.Typer(
     cls=DeclaredCommands,
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="markdown",  # paragraphs are filled; [security] is text
+    rich_markup_mode="markdown",  # paragraphs are wrapped, and [security] stays text
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -96,7 +96,7 @@ app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
 def _declared(name: str) -> Command | None:
     try:
         found = entry_points.load(entry_points.COMMANDS, name)
-    except ConfigError as error:  # raised again where the command is called: the help of all others has to show
+    except ConfigError as error:  # raised when the command is called: the help must list all others
         found = _unloadable(error)
     if found is None:
         return None
@@ -105,7 +105,7 @@ def _declared(name: str) -> Command | None:
         found.command()(function)
     command = typer.main.get_command(found)
     command.name = name
-    if isinstance(command, TyperCommand | TyperGroup):  # typer leaves the panel to add_typer
+    if isinstance(command, TyperCommand | TyperGroup):  # typer sets the panel only in add_typer
         command.rich_help_panel = found.rich_help_panel if isinstance(found.rich_help_panel, str) else PLUGINS
     return command
 

@@ -12,7 +12,7 @@ _WHERE = "The folder of a run, a folder of runs (its newest is meant), or the ex
 RUNS = Path("runs")
 BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
 MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
-"""The panels of `afspm --help`."""
+"""Panels of `afspm --help`."""
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
 OptionalFiles = Annotated[list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
@@ -31,7 +31,7 @@ def opt(help_text: str, *flags: str, **more: Any) -> object:
 _SPEED = "Experiment seconds in a real second; simulated microscopes only."
 Speed = Annotated[float | None, opt(_SPEED, min=1e-6)]
 CheckSpeed = Annotated[float, typer.Option(min=1e-6, help=_SPEED)]
-"""Of commands that check a microscope, which have a speed of their own for simulated ones."""
+"""For commands that check a microscope; their default speed differs from a run's."""
 WithinFrame = Annotated[
     str,
     opt(

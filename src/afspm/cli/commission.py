@@ -108,7 +108,7 @@ class Terminal:
         raise KeyboardInterrupt
 
     def _line(self, question: str) -> str:
-        # The end of input counts as Ctrl-C: without a terminal there is no answer to wait for.
+        # the end of input counts as Ctrl-C: without a terminal there is no answer to wait for
         with _interruptible():
             try:
                 return input(question)
@@ -118,7 +118,7 @@ class Terminal:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    # During a question no request is under way, so Ctrl-C need not wait for one.
+    # during a question no request is under way, so Ctrl-C need not wait for one
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield

@@ -222,7 +222,7 @@ def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
         typer.echo(f"SIMULATED {emulator.vendor} controller: {where}")
 
     try:
-        with signals.caught(lambda _: emulator.stop(), -1):  # puts back the descriptor of `listening` as well
+        with signals.caught(lambda _: emulator.stop(), -1):  # also restores the wakeup descriptor set by `listening`
             emulator.run(ExperimentClock.starting_now(speed=speed), folder.resolve(), log, listening)
     except Crashed as crash:
         typer.echo(f"SIMULATED crash: {crash}", err=True)

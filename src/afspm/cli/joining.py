@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from afspm.client.scope import Scope
 
 NOT_RUNNING = 3
-"""The exit code where nothing runs."""
+"""Exit code if no experiment runs."""
 TERMINAL = "terminal"
-_UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
+_UNBROKEN = 10_000  # columns: output to files and pipes is not wrapped
 
 
 def person() -> str:
     """Return "terminal:ada": the terminal, and the user of this computer."""
     try:
         user = getpass.getuser()
-    except (OSError, KeyError, ImportError):  # no such user: a container
+    except (OSError, KeyError, ImportError):  # a container without this user
         user = ""
     return f"{TERMINAL}:{user}" if user else TERMINAL
 

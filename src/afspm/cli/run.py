@@ -190,7 +190,7 @@ def demo(
 
 
 def _sample(name: str) -> Path:
-    # In a wheel samples lie in the package, in a clone in `experiments`.
+    # in a wheel samples lie in the package, in a clone in `experiments`
     package = Path(__file__).parents[1]
     installed = package / "samples" / name
     return installed if installed.is_dir() else package.parents[1] / "experiments" / name

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 REFRESH_S = 0.25
 LOOK_S = 2.0
-"""Interval of checks whether the run still goes on, where nothing is published."""
+"""Interval of checks whether the run still goes on, while no packets arrive."""
 
 
 def status(
@@ -62,7 +62,7 @@ def _text(follower: Follower) -> StatusText:
 
 
 def _goes_on(follower: Follower) -> bool:
-    # The run's lock is tested only after a silence: it may lie on a slow network disk.
+    # the run's lock is tested only after a silence: it may lie on a slow network disk
     from afspm.record.overview import OLD_S
 
     return not (follower.ended or (follower.silent_s() > OLD_S and follower.cut_off()))
@@ -77,7 +77,7 @@ def _live(follower: Follower, console: Console) -> None:
             now_s = follower.clock.monotonic_s()
             if now_s - shown_s >= REFRESH_S:
                 text = _text(follower)
-                # the log gets the lines that are left below all else
+                # the log fills the remaining lines
                 room = console.height - 1 - len(console.render_lines(text.screen(log_lines=0), pad=False))
                 live.update(text.screen(silent_s=follower.silent_s(), log_lines=max(0, room)), refresh=True)
                 shown_s = now_s

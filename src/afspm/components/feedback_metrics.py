@@ -14,10 +14,10 @@ from afspm.basics.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
-_SMALLEST_CURRENT = 0.01  # of the setpoint: what lies below is noise, and has no logarithm
-_SIGNIFICANT = 4.0  # standard deviations above what white noise would show
-_CLOSE = 1.1  # of two gains, between which none is looked for
-_SWING = 0.2  # of the error, that the height has to share for an oscillation
+_SMALLEST_CURRENT = 0.01  # of the setpoint: smaller values are noise, and may have no logarithm
+_SIGNIFICANT = 4.0  # standard deviations of white noise
+_CLOSE = 1.1  # ratio of two gains below which the search ends
+_SWING = 0.2  # least slope of height on error for an oscillation
 
 
 class FeedbackQuality(Enum):
@@ -129,7 +129,7 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
 
 def _smooth_variance(values: Array) -> float:
-    # White noise has no covariance between neighbours, so theirs is the variance of the smooth part.
+    # white noise has no covariance between neighbours, so theirs is the variance of the smooth part
     x = np.linspace(-1.0, 1.0, values.shape[1])
     level = values - values.mean(axis=1, keepdims=True)
     level = level - np.outer(level @ x / (x @ x), x)
@@ -151,7 +151,7 @@ def gain_search(
         lowest, highest: bounds of the gain.
         most_tries: limit on the number of gains.
     """
-    gain, slow, fast = start, 0.0, math.inf  # known as too low and too high
+    gain, slow, fast = start, 0.0, math.inf  # highest gain known too low, lowest known too high
     well = barely = None
     comes_from_above = False
     for _ in range(most_tries):

@@ -75,7 +75,7 @@ class FeedbackTuner(FeedbackObserver):
         self._finish("" if found is not None else "no gain is good")
 
     def _search(self, start: float) -> float | None:
-        # A good gain is saved at once: a kill afterwards must not lose it.
+        # a good gain is saved at once: a kill afterwards must not lose it
         search = gain_search(start, self.factor, self.lowest, self.highest, self.most_tries)
         gain = next(search)
         try:
@@ -115,7 +115,7 @@ class FeedbackTuner(FeedbackObserver):
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
     def _leave_behind(self) -> None:
-        # Control was lost before `_finish`, or this process was killed.
+        # control was lost before `_finish`, or this process was killed
         if "gain" in self.memory:
             with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S):
                 self._set_back()

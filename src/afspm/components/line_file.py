@@ -43,7 +43,7 @@ class LineFile:
             return []
         except OSError as error:
             raise FileError(f"can't be read: {error}", where=str(self.path)) from error
-        whole = text.split("\n")[:-1]  # splitlines would cut names that hold other ends of lines
+        whole = text.split("\n")[:-1]  # splitlines would also split at other line ends, which file names may hold
         return whole[1:] if self._header else whole
 
     def append(self, lines: Iterable[str]) -> None:
@@ -69,7 +69,7 @@ class LineFile:
         self._waiting = ""
 
     def _mended(self) -> str:
-        # A kill leaves half a line at the end, which is cut off; an empty file gets its header.
+        # a kill leaves half a line at the end, which is cut off; an empty file gets its header
         if not self.path.exists():
             return f"{self._header}\n" if self._header else ""
         data = self.path.read_bytes()

@@ -1,4 +1,4 @@
-"""`Metadata`: a table of all measurements, with facts that the microscope's files lack, such as the holder of control."""
+"""`Metadata`: a table of all measurements, with facts that the microscope's files lack: the holder of control."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ class Metadata(Component):
             self._saw_begin = self._saw_begin and status.state is not ScopeState.FREE
             return
         if goes_on:
-            return  # it was paused, or goes on after that: it began before
+            return  # a scan that goes on after a pause began before it
         if now_ns is not None and now_ns <= self.memory.get("began_ns", -1):
-            return  # replayed after a restart: what was noted then is what holds
+            return  # replayed after a restart: the first entry counts
         self._saw_begin = True
         self.memory["began_ns"] = -1 if now_ns is None else now_ns
         self.memory["what"], self.memory["finished_ns"] = what, None
@@ -98,7 +98,7 @@ class Metadata(Component):
         self._append({"time": iso_utc(note.time_ns), "measurement": "note", "note": f"{note.who}: {note.text}"})
 
     def _write(self, what: str, measured: Scan | Spectrum, columns: dict[str, str]) -> None:
-        self._under_way = None  # should it scan on without another state between them, that is the next one
+        self._under_way = None  # if the state stays SCANNING, the next scan begins now
         time_ns = measured.time_ns
         if time_ns is None and self.packet is not None:
             time_ns = self.packet.time_ns  # distinguishes rows
@@ -125,13 +125,13 @@ class Metadata(Component):
             self.memory["finished_ns"] = time_ns
             self.memory.save()
         elif finished_ns != time_ns and not self._saw_begin:
-            return {}  # a later one, that began while we were not running
+            return {}  # a later measurement, which began while this component did not run
         conditions: dict[str, str] = self.memory["conditions"]
         return conditions
 
 
 def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    # No two rows share these cells; rows of older versions have no note.
+    # no two rows share these cells; rows of older versions have no note
     return tuple(
         row.get(column, "").replace("\n", " ") for column in ("time", "measurement", "filename", "channel", "note")
     )

@@ -18,10 +18,10 @@ UNSOLVED: Final = "unsolved-problem"
 GIVEN_UP: Final = "given-up"
 CRITICAL: Final = "critical"
 TEST: Final = "test"
-"""Of a message that only shows that calls arrive."""
+"""Occasion of a test message."""
 OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
 
-TIMEOUT_S = 10.0  # of one try
+TIMEOUT_S = 10.0  # of one attempt
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
 MOST_TRIES = 12  # half an hour
 MOST_WAITING = 50
@@ -162,7 +162,7 @@ def _post(url: str, notice: Notification) -> None:
 
 
 def _short(reason: object) -> str:
-    # The text of the error may hold the address of the webhook, which is a secret.
+    # the text of the error may hold the address of the webhook, which is a secret
     if isinstance(reason, OSError):
         return reason.strerror or type(reason).__name__
     return type(reason).__name__

@@ -27,7 +27,7 @@ from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import experiment_name
 
 MOST_TOLD = 1000
-"""So much is remembered as told; a component that says something else each time must not fill the memory."""
+"""Limit on the delivered notifications to remember: a component that logs ever new texts must not fill the memory."""
 LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
@@ -91,7 +91,7 @@ class Notifier(Component):
                 self._tell(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
 
     def on_log_lines(self, lines: LogLines) -> None:
-        first: dict[str, str] = {}  # of each process: what follows it belongs to it
+        first: dict[str, str] = {}  # first CRITICAL line of each process; later ones belong to it
         for line in lines.lines:
             if line.level == "CRITICAL" and line.name not in (LOGGED_AS, self.name):
                 first.setdefault(line.name, line.text)

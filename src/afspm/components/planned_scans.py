@@ -69,7 +69,7 @@ class PlannedScans(Component):
 
     def run(self) -> None:
         self._began_s = self.clock.now_s()
-        self._round_began_s: float | None = None  # None: it was interrupted, or begun in an earlier life
+        self._round_began_s: float | None = None  # None: the round was interrupted, or begun before a restart
         self.memory.setdefault("start_s", self._began_s)
         rhythm = RoundSchedule(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
@@ -109,12 +109,12 @@ class PlannedScans(Component):
         self._on_missed(left_out - too_slow)
         if self.memory.get("owed"):
             self._add("owed", -1)
-            due_s -= self.beat_s  # begun at once, in place of a round that was missed
+            due_s -= self.beat_s  # begun at once, in place of a missed round
         is_left = self._total is None or step.index < self._total
         if is_left:
             self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
             self.memory["begun"] = step.index
-        # before it is asked for: a scan that a kill interrupts belongs to the beat that it was begun on
+        # saved before the request: a scan interrupted by a kill still belongs to this beat
         self.memory["due_s"] = due_s
         self.memory.save()
         return is_left
@@ -129,7 +129,7 @@ class PlannedScans(Component):
         count = rounds * len(self.plan.regions)
         told = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
         self.log.warning("%s", told)
-        with suppress(RequestError):  # a scheduler of another make may know no notes
+        with suppress(RequestError):  # a scheduler of another make may have no notes
             self.scope.note(told)
 
     def _add(self, counter: str, rounds: int) -> None:
@@ -145,7 +145,7 @@ class PlannedScans(Component):
             round_s = self.clock.now_s() - self._round_began_s
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
-        if self.memory.save():  # else a restart asks for it again
+        if self.memory.save():  # if not saved, a restart requests the same scan
             self.scope.forget(step.key)
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
@@ -155,7 +155,7 @@ class PlannedScans(Component):
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), at)
 
     def _left_s(self, done: int, total: int) -> float:
-        # As fast as so far, but not faster than `every` allows.
+        # as fast as so far, but not faster than `every` allows
         per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
         return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 

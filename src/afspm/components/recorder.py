@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 REST_S = 0.5
-"""Shortest time, real, to stay after the end of the experiment: for what components say on their way out."""
+"""Shortest real time to stay after the end of the experiment, for the last packets of other components."""
 LONGEST_REST_S = 30.0
-"""Longest such time: until then the supervisor asks the recorder to leave, after the other components."""
+"""Longest such time; before, the supervisor asks the recorder to end, after the other components."""
 SIGNS_OF_LIFE = ("ControlState",)
-"""What a recorder hears of a scheduler whose log it follows."""
+"""Subscription to a scheduler whose log is followed: only to notice that it lives."""
 
 
 class Recorder(Component):
@@ -55,7 +55,7 @@ class Recorder(Component):
         launch = context.launch
         run_dir = Path(launch.run_dir or ".")
         context.activity.longest_step_s = self.longest_step_s
-        # one that keeps a log need not send us everything, too
+        # a scheduler with a log need not send all packets, too
         heard = SIGNS_OF_LIFE if len(launch.sockets.subscribe) == 1 else None
         port = context.open_port(heard)
         source = launch.sockets.subscribe[0] if launch.sockets.subscribe else ""
@@ -67,7 +67,7 @@ class Recorder(Component):
             context.clock,
             context.log,
             step=context.activity.step,
-            wake=lambda: port.wake_up(),  # of whichever is open then
+            wake=lambda: port.wake_up(),  # the port may have been replaced by then
         )
         writer.start()
         ended_s, until_s, is_to_ask_again = math.inf, math.inf, False

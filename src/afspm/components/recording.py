@@ -18,11 +18,11 @@ from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import SEGMENT_BYTES, START, LogReader, Position, commit, committed
 
 MOST_BYTES = 256 << 20
-"""So much of other publishers waits at most; beyond it all is dropped, and asked for again once there is room."""
+"""Limit on waiting packets of other publishers; beyond it all are dropped, and asked for again once there is room."""
 FAR_BEHIND_BYTES = 64 << 20
 AT_ONCE_BYTES = 32 << 20
 LOOK_S = 0.1
-"""How often the log is looked at: nothing is recorded while it is still on its way to others."""
+"""Interval of reads of the log: delivery to other processes comes before recording."""
 AGAIN_S = 2.0
 QUIET_S = 1.0
 COMMIT_S = 1.0
@@ -105,7 +105,7 @@ class RecordWriter:
         self._thread.join(within_s + AGAIN_S)
         self.check()
 
-    # --- the thread ---
+    # --- in the writer's thread ---
 
     def _run(self) -> None:
         try:
@@ -140,7 +140,7 @@ class RecordWriter:
                 self._put_aside(error)
 
     def _put_aside(self, error: FileError) -> None:
-        # A damaged journal must not keep the rest of the night from being recorded.
+        # a damaged journal must not keep the rest of the night from being recorded
         number = len(list(self._folder.glob(f"{JOURNAL_FILE}.damaged-*"))) + 1
         for suffix in ("", "-wal", "-shm"):
             file = self._folder / f"{JOURNAL_FILE}{suffix}"
@@ -203,7 +203,7 @@ class RecordWriter:
             return True
 
     def _put_off(self, error: Exception) -> bool:
-        # The disk is full or gone: logged once, then tried again until it has room, or the run ends.
+        # the disk is full or gone: logged once, then tried again until it has room, or the run ends
         if not self._told_full:
             self._told_full = True
             self._logger.critical("nothing can be recorded, the experiment goes on: %s", error)
@@ -221,7 +221,7 @@ class RecordWriter:
             store.settle()
 
     def _commit(self, store: RecordStore) -> None:
-        # The log may be overwritten up to here.
+        # the log may be overwritten up to here
         self._committed_s = self._clock.monotonic_s()
         try:
             with self._step():

@@ -122,7 +122,7 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     points = []
     for row in range(rows):
-        # there and back: the piezo need not fly over the whole grid, and creeps less
+        # back and forth: the piezo makes no long jumps, and creeps less
         order = range(columns) if row % 2 == 0 else reversed(range(columns))
         for column in order:
             u = (column - (columns - 1) / 2) * spacing_m[0]

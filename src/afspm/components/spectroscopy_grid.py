@@ -12,7 +12,7 @@ from afspm.components.scan_plan import grid_centers
 from afspm.model import names
 
 MOST_LINES = 20
-"""In the log, on the progress of a grid; what looks on is told of each spectrum."""
+"""Limit on log lines about the progress of a grid; `scope.progress` reports each spectrum."""
 
 
 class SpectroscopyGrid(Component):
@@ -77,7 +77,7 @@ class SpectroscopyGrid(Component):
             key = f"spectrum-{place}-{repeat}"
             self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
             self.memory["done"] = index + 1
-            if self.memory.save():  # else a restart asks for it again
+            if self.memory.save():  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
             per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
             self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))

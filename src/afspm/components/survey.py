@@ -27,7 +27,7 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: narrower ones are often refused, and below 8 px nothing is tried."""
+"""Least width of a zoom in pixels of the survey: registration often refuses narrower ones, and all below 8 px."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
@@ -68,7 +68,7 @@ class Survey(Component):
     """
 
     drift_doubts: tuple[ConfigError, ...]
-    """What `afspm check` warns of where drift is corrected."""
+    """Warnings of `afspm check` if drift is corrected."""
     requires = ("afspm[features]",)
     needs_actions: tuple[str, ...] = (names.START_SCAN,)
     _outage = OutageLog("the table of targets can't be written", logging.getLogger("afspm.records"))
@@ -178,7 +178,7 @@ class Survey(Component):
                     self.scope.set(name, quantity)
 
     def _targets(self, survey: Scan) -> list[Target]:
-        # saved, so that they are the same in every life: a user's function may be random
+        # saved, so that they are the same after a restart: a user's function may be random
         if "targets" not in self.memory:
             with self.clock.late():
                 found = self.finder.targets(survey)
@@ -212,7 +212,7 @@ class Survey(Component):
     def _position(
         self, visit: Visit, scans: ScanSet, mappings: Events
     ) -> tuple[RegistrationOutcome | None, float | None]:
-        # by the mapping that the scheduler published just before the zoom
+        # the scheduler publishes the mapping just before the zoom
         kept = self.memory.setdefault("positions", {})
         files = {scan.filename for scan in scans.values() if scan.filename}
         for event in mappings:
@@ -223,7 +223,7 @@ class Survey(Component):
         return None if outcome is None else RegistrationOutcome(outcome), sd_m
 
     def _center(self, visit: Visit, zoom: Scan) -> XY:
-        # saved, so that it is the same in every life
+        # saved, so that it is the same after a restart
         centers = self.memory.setdefault("centers", {})
         if str(visit.number) not in centers:
             with self.clock.late():

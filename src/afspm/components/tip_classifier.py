@@ -69,16 +69,16 @@ class TipClassifier(Component):
     def on_control(self, control_state: ControlState) -> None:
         was, self._problems = self._is_flagged, control_state.problems
         if self._is_flagged and not was and self.counter.bad < self.counter.flag_after:
-            self.counter.good = 0  # flagged by another component or person: only later scans can tell that it is over
+            self.counter.good = 0  # flagged by another component or a person: only later scans can clear it
         elif was and not self._is_flagged:
-            self.counter.bad = 0  # repaired, or cleared by a person: only later scans can tell that it is bad again
+            self.counter.bad = 0  # repaired, or cleared by a person: only later scans can flag it
             self.judge.trust()
             self._save()
 
     def on_scan(self, scan: Scan) -> None:
         self.expected.see(scan)
         pair = self.pairing.add(scan)
-        # a replay after a restart brings what was judged already
+        # replayed after a restart: judged already
         if pair is None or (scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1)):
             return
         self._judge(pair)

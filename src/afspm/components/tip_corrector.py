@@ -21,8 +21,8 @@ from afspm.model import Problem, Region, Scan, ScanSet, names
 
 Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns."""
-LAST_FRAMES = 16  # of scans that a verdict may still come for
-VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
+LAST_FRAMES = 16  # scans whose verdict may still arrive
+VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected
 
 
 class TipCorrector(Component):
@@ -84,7 +84,7 @@ class TipCorrector(Component):
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
-        # `afspm check` holds them against the limits
+        # `afspm check` compares them with the limits
         self.positions = tuple(place for place in (self.workshop_center, self.test_center) if place is not None)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
@@ -114,7 +114,7 @@ class TipCorrector(Component):
                 elif event.envelope.startswith(tip_verdict.MESSAGE):
                     self._note(read_verdict(event.message), frames)
                 else:
-                    problems = event.message.problems  # as it was when the scans after it came
+                    problems = event.message.problems  # the flags when the scans after it were taken
                     self._look()
 
     def _note(self, verdict: tuple[int, float] | None, frames: Mapping[int | None, Frame]) -> None:
@@ -243,7 +243,7 @@ class TipCorrector(Component):
         self.memory.save()
 
     def _wait_flag(self, problem: int | str, *, flagged: bool) -> None:
-        # An older ControlState must not be taken for a change.
+        # an older ControlState must not be taken for a change
         self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
     def _begin_anew(self) -> None:

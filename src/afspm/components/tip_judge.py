@@ -36,15 +36,15 @@ from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, auto
 from afspm.model import Region
 from afspm.model.snapshot import from_plain, to_plain
 
-REACH_PX = 32  # how far beside the first the second apex of a double tip is looked for
+REACH_PX = 32  # search range for the second apex of a double tip
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
-SAME_SIZE = 0.02  # relative difference of sizes that are still called the same
-SAME_PLACE = 0.2  # of the size: how far a place may have moved and still be the same
+SAME_SIZE = 0.02  # relative difference within which sizes count as equal
+SAME_PLACE = 0.2  # share of the size within which a centre counts as the same place
 MOST_PLACES = 16
-DECIMALS = 4  # of an autocorrelation, which is kept on disk
-MOST_KINDS = 4  # of scans that are known or learnt from side by side
+DECIMALS = 4  # of an autocorrelation, to limit the saved state
+MOST_KINDS = 4  # of scans with a reference at the same time
 FOLLOW = 0.25  # least weight of a new good scan in the means of its place
-FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # spreads that few scans can't be better than
+FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
 
 
 class Opinion(Enum):
@@ -170,7 +170,7 @@ class TipReference:
         del self.places[:-MOST_PLACES]
 
     def spread(self, name: str) -> float:
-        """Return the standard deviation of a metric over good scans at the same place: relative for detail and unrest."""
+        """Return the standard deviation of a metric of good scans at one place: relative for detail and unrest."""
         floor: float = getattr(FLOORS, name)
         if len(self.deviations) < 2:
             return floor
@@ -266,7 +266,7 @@ class TipJudge:
             for one in self._state.kinds:
                 one.confirmed = True
         elif verdict.opinion is Opinion.BAD:
-            # what was learnt since the last good comparison may be of the bad tip
+            # scans learnt from since the last good comparison may show the bad tip
             self._state.kinds = [one for one in self._state.kinds if one.confirmed or one is kind]
         return verdict
 
@@ -319,7 +319,7 @@ class TipJudge:
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 
     def _clear_suspicion(self, by: TipReference) -> None:
-        # Only a comparison at least as fine as the one that found the fault can clear it.
+        # only a comparison at least as fine as the one that found the fault can clear it
         for kind in self._state.kinds:
             kind.suspect = kind.suspect and by.pixel_m > (1.0 + SAME_SIZE) * kind.pixel_m
 
@@ -328,7 +328,7 @@ class TipJudge:
         now = _relative(seen, usual)
         worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
         faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), worn)]
-        if usual.unrest_m > 0.0:  # else no retrace is recorded
+        if usual.unrest_m > 0.0:  # zero without retrace
             limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
             what = f"{seen.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
             faults.append(((now.unrest_m - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
@@ -377,7 +377,7 @@ def _kind_text(region: Region, shape: tuple[int, int]) -> str:
 
 
 def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
-    # Ghost and contrast are correlations already, and need no usual value.
+    # ghost and contrast are correlations already, and need no usual value
     unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
     return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
 

@@ -28,9 +28,9 @@ FEWEST_PIXELS = 32
 LARGEST_HOLES = 0.2  # share of pixels that may be missing
 SHORT_PX = (3.0, 8.0)  # wavelengths that a blunt tip loses
 LONG_PX = (8.0, 32.0)  # wavelengths that it keeps
-CORE_PX = 6.0  # lags that an edge correlates over by itself
+CORE_PX = 6.0  # lags within which any edge correlates with itself
 STRETCH = 10  # a stretch of a line is a tenth of it
-LEAST_CONTRAST = 0.1  # slopes common to trace and retrace against those of noise
+LEAST_CONTRAST = 0.1  # slopes common to trace and retrace, relative to those of noise
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ def _filled(values: Array) -> Array:
 
 
 def _clipped(slope: Array) -> Array:
-    # Without the limit one large particle would outweigh all other slopes.
+    # without the limit one large particle would outweigh all other slopes
     slope = slope - np.median(slope)
     limit = np.quantile(np.abs(slope), 0.995)
     return np.clip(slope, -limit, limit) if limit > 0 else slope
@@ -165,12 +165,12 @@ def _band_powers(of: Slopes) -> tuple[float, float, float]:
     first = np.fft.rfft(of.trace * window, axis=1)
     frequency = np.fft.rfftfreq(nx)
     if of.retrace is None:
-        # the next line looks at nearly the same place with other noise
+        # the next line shows nearly the same place with other noise
         pairs, alone = first[1:] * first[:-1].conj(), np.abs(first) ** 2
     else:
         second = np.fft.rfft(of.retrace * window, axis=1)
         pairs, alone = first * second.conj(), (np.abs(first) ** 2 + np.abs(second) ** 2) / 2
-    # feedback lags, so that trace and retrace are shifted against each other: a phase, not a loss
+    # lag of the feedback shifts trace and retrace against each other: it changes the phase, not the modulus
     common, total = np.abs(pairs.mean(axis=0)), alone.mean(axis=0)
     noise = np.maximum(total - common, 0.0)
 
@@ -178,7 +178,7 @@ def _band_powers(of: Slopes) -> tuple[float, float, float]:
         chosen = (frequency >= 1 / wavelengths[1]) & (frequency < 1 / wavelengths[0])
         return float(power[chosen].sum())
 
-    bias = 1.0 / np.sqrt(len(pairs))  # what the modulus of a mean of that many random phases keeps
+    bias = 1.0 / np.sqrt(len(pairs))  # expected modulus of the mean of that many random phases
     common = np.maximum(common - bias * noise, 0.0)
     return band(common, SHORT_PX), band(common, LONG_PX), band(noise, (SHORT_PX[0], LONG_PX[1]))
 
@@ -207,7 +207,7 @@ def _flat(slope: Array) -> Array:
 
 
 def _smoothed(correlation: Array) -> Array:
-    # A ghost is as wide as an edge, so the mean of 3 x 3 keeps it and lowers chance maxima.
+    # a ghost is as wide as an edge, so the mean of 3 x 3 keeps it and lowers chance maxima
     padded = np.pad(correlation, 1, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     smooth: Array = windows.mean(axis=(-1, -2))

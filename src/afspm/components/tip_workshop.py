@@ -12,7 +12,7 @@ from afspm.client.component import Component
 from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place
 from afspm.model import Region, ScopeState, names
 
-SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
+SETTLED_WITHIN_S = 2.0  # real time: a microscope that has not reported to be busy by then counts as ready
 DONE_ACTION = "ActionMsg"
 
 
@@ -31,7 +31,7 @@ class TipWorkshop:
         self._problem = problem
         self._center = center
         self._spacing, self._keep_away = spacing, keep_away
-        self._frame: Region | None = None  # of our own, about a place
+        self._frame: Region | None = None  # the frame set about a place
 
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         """Do the `number`-th treatment at a fresh place, in one tenure of control with the move there.
@@ -52,7 +52,7 @@ class TipWorkshop:
                 self._log.warning("%s was interrupted: %s; retrying at a fresh place", treatment, lost.what)
 
     def _fresh_place(self, number: int) -> XY:
-        # Counted before it is done: after a kill a treatment is left out rather than repeated.
+        # counted before it is done: after a kill a treatment is left out rather than repeated
         places = int(self._memory.get("places", 0))
         self._memory["tried"], self._memory["places"] = number, places + 1
         if not self._memory.save():
@@ -88,7 +88,7 @@ class TipWorkshop:
         return True
 
     def _go_to(self, place: XY) -> None:
-        # Some microscopes move the tip only together with the scan frame.
+        # some microscopes move the tip only together with the scan frame
         try:
             self._scope.move_probe(place)
         except Refused as refused:
@@ -110,7 +110,7 @@ class TipWorkshop:
         return "an unknown place" if position is None else f"at {position_text(position.xy_m)}"
 
     def _act(self, action: str) -> None:
-        # A busy microscope refuses the next action, so wait until this one has ended.
+        # a busy microscope refuses the next action, so wait until this one has ended
         with self._scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
             try:
                 self._scope.action(action)

@@ -23,7 +23,7 @@ from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
 _OTHER_MAKE = "is it written for the published implementation? see docs/how-to/from-the-published-implementation.md"
-# By where they come from: a class of the user is recognised by what it is derived from.
+# Roles by the package of a base class: a user's class is recognised by its bases.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
     ("afspm.translator", Role.TRANSLATOR),
@@ -83,7 +83,7 @@ def importing_from(folders: Sequence[Path]) -> Iterator[None]:
 
 
 def _is_from(folder: Path, name: str) -> bool:
-    # A module of an environment (.venv) inside the folder is not the user's file.
+    # a module of an environment (.venv) inside the folder is not the user's file
     file = getattr(sys.modules[name], "__file__", None)
     if not file:
         return False
@@ -147,7 +147,7 @@ def role_of(component: type) -> Role | None:
 
 
 def _attribute(module: ModuleType, name: str) -> Any:
-    # Packages may import a name lazily, by a module-level `__getattr__`.
+    # packages may import a name lazily, by a module-level `__getattr__`
     try:
         return getattr(module, name)
     except AttributeError:

@@ -104,7 +104,7 @@ def _parse(text: str, file: Path, findings: Findings) -> Settings | None:
         return None
 
 
-# what was complained of, how the line looks, and what would be right: habits from Python, YAML, JSON and Windows
+# the parser's complaint, the form of the line, and the remedy: habits from Python, YAML, JSON and Windows
 _HABITS = (
     ("Cannot overwrite", r"", "this key is there already"),
     ("Illegal character '\\n'", r"", "the quote that ends the text is missing"),
@@ -137,5 +137,5 @@ def _merge(
             _merge(below[key], value, here, places)
             continue
         for old in [p for p in places if p[: len(here)] == here]:
-            del places[old]  # what stood there is replaced as a whole
+            del places[old]  # the value there is replaced as a whole
         below[key] = copy.deepcopy(value)

@@ -112,7 +112,7 @@ class _Drawing:
         width = self.bar_width + 2 * MARGIN
         return self.svg.document(width, bottom + 66, self.name, (ENVELOPES, CONTROL, VENDOR))
 
-    # --- what there is ------------------------------------------------------------------------------------------
+    # --- contents ------------------------------------------------------------------------------------------
 
     def _box(self, part: ExperimentPart) -> ProcessBox:
         said = self.resolved.processes[part.name].declared
@@ -148,10 +148,10 @@ class _Drawing:
             )
             label = ", ".join(self.resolved.processes[box.part.name].declared.publishes) or "messages of its own"
             lanes.append(PublisherLane(box, listeners, f"{label} {_at(slot.address)}"))
-        # short ways near the boxes, long ways above them: fewer crossings
+        # short lanes near the boxes, long ones above them: fewer crossings
         return sorted(lanes, key=lambda lane: len(lane.listeners))
 
-    # --- where it goes --------------------------------------------------------------------------------------------
+    # --- layout --------------------------------------------------------------------------------------------
 
     def _top(self) -> float:
         return MARGIN + 34 + LANE * len(self.lanes)
@@ -168,7 +168,7 @@ class _Drawing:
         labels = max((len(box.labels) for box in self.components), default=0)
         self.bar_y = self._top() + height + max(64.0, LINE * labels + 34.0)
 
-    # --- drawn ----------------------------------------------------------------------------------------------------
+    # --- drawing ----------------------------------------------------------------------------------------------------
 
     def _process(self, box: ProcessBox) -> None:
         fill, stroke = FILLS[self.resolved.processes[box.part.name].role]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 RECORDER, NOTIFIER = "recorder", "notifier"
 RECORDS, NOTIFIES = "records", "notifies"
-"""Attributes by which a class says that it does what the recorder or the notifier does."""
+"""Class attributes that mark a recorder or a notifier."""
 
 
 def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:

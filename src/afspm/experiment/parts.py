@@ -16,14 +16,14 @@ SECTIONS: Final = (
     "clock", "control", "limits", "problems", "cache", "security", "restart", "record", "metadata", "notify",
 )  # fmt: skip
 
-# Keys of a component's table that are for us; everything else is a setting of its class or command.
+# Keys of a component's table that are afspm's; all others are settings of its class or command.
 OWN_KEYS: Final = frozenset(
     {"component", "class", "command", "envelopes", "listens_to", "role", "heartbeats", *WIRE_KEYS}
 )
 SIMULATED = "simulated"
-"""For a translator that is a command: whether its microscope is simulated, as a class says by an attribute."""
+"""Marks a simulated microscope: an attribute of its class, or a key in the table of a command."""
 EMULATED = "emulated"
-"""An attribute by which a class says that it is the controller, emulated: the translator then talks to it."""
+"""Class attribute that marks an emulated controller; the translator talks to it."""
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
 
 
@@ -57,9 +57,9 @@ class ExperimentParts:
     intermediaries: dict[str, Settings] = field(default_factory=dict)
     components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
-    """What became of each line of another form (`forms`)."""
+    """Equivalent of each line of a file of another form (`forms`)."""
     instead: dict[str, Settings] = field(default_factory=dict)
-    """Tables of components that have no counterpart, by their names, as they are in the file."""
+    """Tables of components without equivalent, by name, unchanged."""
 
     def free_name(self, wanted: str) -> str:
         """Return a name for a component that is not in the file: `wanted`, with a number if that is taken."""
@@ -204,7 +204,7 @@ class VariableReferences:
         return self._expand(self._variables[value], (value,), (*through, value))
 
     def _report_cycle(self, around: tuple[str, ...]) -> None:
-        # the same ring is met from each of its keys: begin it at its smallest name, so that it is reported once
+        # a cycle is found from each of its keys: begin it at its smallest name, so that it is reported once
         ring = around[:-1]
         start = ring.index(min(ring))
         ring = ring[start:] + ring[:start]

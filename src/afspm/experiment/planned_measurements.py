@@ -79,7 +79,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         return None
     made = component(**settings)
     if callable(check := getattr(made, "check", None)):
-        check()  # what takes longer than `__init__` may
+        check()  # checks that would be too slow in `__init__`
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
@@ -99,7 +99,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
 
 
 _PARAMETERS = ("parameters", "zoom_parameters", "initial")
-"""Attributes with values that a component sets, as its settings are called."""
+"""Attributes of components with parameters to set, named as the settings."""
 
 
 def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
@@ -119,7 +119,7 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
             found.setdefault(refused.reason, Refusal(refused.reason, where, hint))
 
     for setting, parameters in planned.parameters.items():
-        if setting == "initial":  # set by the microscope itself; a frame comes in parts
+        if setting == "initial":  # values of the microscope itself; its frame is checked in parts
             guard = LimitChecker(replace(_for_all(_without_changes(limits)), region=None))
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))
@@ -158,9 +158,9 @@ def _nearest_text(region: Region, allowed: Region | None) -> str:
     return f"the nearest that fits: center = {center}, size = {size}"
 
 
-_REACH = 1e-9  # as of the limits: what lies on the border, to the precision of the arithmetic, is inside
+_REACH = 1e-9  # the tolerance of the limits: a point on the border counts as inside despite rounding
 _MARGIN = 1e-3
-"""Relative: by so much a cure stays within the region where its rounded numbers would not."""
+"""Relative distance of a suggested region from the border, used if its rounded numbers would exceed it."""
 
 
 def nearest_region(region: Region, allowed: Region) -> Region:
@@ -173,7 +173,7 @@ def nearest_region(region: Region, allowed: Region) -> Region:
 
 
 def _rounded(region: Region) -> Region:
-    # The digits of `lengths_text`; a centre of 1e-22 m from rounding is shown as zero.
+    # the digits of `lengths_text`; a centre of 1e-22 m from rounding is shown as zero
     width, height = (float(f"{size_m:.5g}") for size_m in region.size_m)
     x, y = (float(f"{place_m:.5g}") if abs(place_m) > 1e-6 * width else 0.0 for place_m in region.center_m)
     return replace(region, center_m=(x, y), size_m=(width, height))
@@ -232,7 +232,7 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
 
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
     """Return the actions whose settings the limits would always refuse, with the reasons."""
-    # where the tip is is not known yet
+    # the tip's position is unknown before the start
     guard = LimitChecker(replace(_for_all(_without_changes(limits)), actions={}, region=None))
     found = []
     for action in limits.sets:

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 
 DASHBOARD = "dashboard"
-"""The name under which `afspm dashboard` joins a run."""
+"""Name under which `afspm dashboard` joins a run."""
 DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
-"""The environment variable that only dashboards get."""
+"""Environment variable that only dashboards get."""
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
 
 
@@ -194,7 +194,7 @@ def _start(
         retracts=role is Role.TRANSLATOR and _retracts(resolved),
         adjustable=control.adjustable if role is Role.TRANSLATOR else (),
     )
-    if command[:1] == ("python",):  # the one that runs us, wherever that is
+    if command[:1] == ("python",):  # the running interpreter
         command = (sys.executable, *command[1:])
     folders = resolved.document.folders
     beats = process.part.own.get("heartbeats") is not False
@@ -204,7 +204,7 @@ def _start(
 
 
 def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
-    # Environment variables with secrets of other processes.
+    # environment variables with secrets of other processes
     every = {DASHBOARD_PASSWORD, *_variable(resolved.sections.notify.webhook)}
     every.update(*map(_secrets, resolved.processes.values()))
     return tuple(sorted(every - _secrets(process)))
@@ -247,7 +247,7 @@ def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mappin
     owners = {connectable(addresses[key]): slot.owner for key, slot in slots if key in addresses}
     keys = {"folder": str(resolved.keys_folder)}
     for scheduler in resolved.with_role(Role.SCHEDULER)[:1]:
-        keys["scheduler"] = scheduler.name  # whom alone a translator obeys
+        keys["scheduler"] = scheduler.name  # a translator obeys this scheduler alone
     for key in (links.control, *links.subscribe):
         if key is None:
             continue
@@ -269,7 +269,7 @@ def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str
 
 
 def _retracts(resolved: ResolvedExperiment) -> bool:
-    # A tip without feedback drifts into the sample: it is retracted once no component is in control.
+    # a tip without feedback drifts into the sample: it is retracted once no component is in control
     watchdog = resolved.sections.control.watchdog()
     return watchdog.retract is not None and FEEDBACK_OFF in watchdog.dangerous
 

@@ -31,7 +31,7 @@ from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
-"""Arguments of a scheduler's constructor that come from sections of these names."""
+"""Arguments of a scheduler's constructor, filled from the sections of these names."""
 _EXAMPLE_HEADERS = (
     PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
     PacketHeader("Spec1d", kind="IV"),
@@ -41,9 +41,9 @@ _EXAMPLE_HEADERS = (
         if one.kind is wire.MessageKind.STATE and one.source is Role.TRANSLATOR
     ),
 )
-"""Headers with which a mapping is tried."""
+"""Headers for a trial of the user's mapping."""
 DRIFT = "DriftMapping"
-"""Published by a scheduler that corrects drift."""
+"""Envelope that a scheduler publishes if it corrects drift."""
 
 
 def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
@@ -100,7 +100,7 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
 
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
-    # A setting `problem` replaces its default value in what the class solves and flags.
+    # a setting `problem` replaces its default value in what the class solves and flags
     said = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
@@ -160,7 +160,7 @@ def _check_cache_mapping(name: str, document: Document) -> None:
     if not callable(function):
         document.error(f"[cache] mapping: {name} is not a function", "cache", "mapping")
         return
-    for header in _EXAMPLE_HEADERS:  # else its packets would be missing, in the middle of the night
+    for header in _EXAMPLE_HEADERS:  # a failure at run time would lose packets
         try:
             Envelopes(mapping=function).of(header)
         except AfspmError as error:
@@ -198,7 +198,7 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
 def _resolve_plan(
     process: ResolvedProcess, component: type, resolved: ResolvedExperiment, has: MicroscopeCapabilities | None
 ) -> None:
-    # The component is made once, since its constructor checks best whether settings fit together.
+    # the component is made once, since its constructor checks best whether settings fit together
     name = process.name
     try:
         plan = planned_measurements.plan_of(component, process.settings)
@@ -231,7 +231,7 @@ def _resolve_plan(
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
-    # A command has no class to derive from: the key `role` decides, else wiring keys that only one role has.
+    # a command has no class to derive from: the key `role` decides, else wiring keys that only one role has
     written = part.own.get("role")
     if written is not None:
         if written in [role.value for role in Role]:

@@ -23,7 +23,7 @@ _ORCID: Final = re.compile(r"(?:https://orcid\.org/)?(\d{4}-\d{4}-\d{4}-\d{3}[\d
 
 
 def _checked_orcid(text: str) -> str:
-    # The last digit is a check digit after ISO 7064 (MOD 11-2).
+    # the last digit is a check digit after ISO 7064 (MOD 11-2)
     found = _ORCID.fullmatch(text)
     if found is None:
         raise ValueError("an ORCID iD looks like 0000-0002-1825-0097")
@@ -61,7 +61,7 @@ class SecuritySection(Section):
     """Programs without keys may join through a bridge, which opens plain sockets; all other sockets stay private."""
     insecure: StrictBool = False
     tcp: StrictBool = False
-    """Unix sockets are not used: for programs whose library has none. Every socket has keys then."""
+    """Use no unix sockets, for programs whose library has none. Every socket then has keys."""
 
     @property
     def are_sockets_private(self) -> bool:
@@ -96,15 +96,15 @@ class MetadataSection(Section):
     """[metadata]: entries written into every file of the run; None: unknown."""
 
     technique: Literal["STM", "STS", "AFM"] | None = None
-    """STM, STS or AFM; of a microscope that is always the same, its class knows it."""
+    """STM, STS or AFM; filled in by the class of a microscope that has only one."""
     sample: str | None = None
     person: str | None = None
     orcid: Orcid | None = None
     project: str | None = None
     microscope: str | None = None
-    """The model, such as "Cypher S"."""
+    """Model, such as "Cypher S"."""
     vendor: str | None = None
-    """Of the microscope; if it is not given, that of the controller."""
+    """Vendor of the microscope; by default the controller's."""
 
 
 class NotifySection(Section):

@@ -72,7 +72,7 @@ def check(
 
 
 def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
-    # A later file that changes the class alone leaves behind settings that only the earlier class had.
+    # a later file that changes the class alone leaves behind settings that only the earlier class had
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
@@ -111,7 +111,7 @@ def jsonable(value: Any, folder: Path) -> Any:
     if isinstance(value, datetime | date):
         return value.isoformat()
     if isinstance(value, str) and value.startswith(("./", "../")):
-        return str((folder / value).resolve())  # within tables of any content only this says that it is a file
+        return str((folder / value).resolve())  # a path within a table without types is recognised only here
     return value
 
 
@@ -122,7 +122,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
     if isinstance(value, list) and any(map(_is_object, value)):
         return [_value(Any, item, path, document) for item in value]
     if annotation is bool:
-        annotation = pydantic.StrictBool  # pydantic reads "yes" and 1 as true, TOML has true
+        annotation = pydantic.StrictBool  # pydantic would accept "yes" and 1 as true
     try:
         adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
     except pydantic.PydanticUndefinedAnnotation:
@@ -135,7 +135,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
 
 
 def _object(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
-    # An intermediary class of the user's is checked here, and made in its process.
+    # an intermediary class of the user's is checked here, and made in its process
     settings = {key: item for key, item in value.items() if key != "class"}
     try:
         wanted = class_loader.load(value["class"])
@@ -194,7 +194,7 @@ def _constructors(component: type) -> Sequence[Callable[..., object]]:
 
 @cache
 def _annotations(component: type) -> Table:
-    # Annotations imported under TYPE_CHECKING only can't be resolved, and are left out.
+    # annotations imported under TYPE_CHECKING only can't be resolved, and are left out
     kinds: Settings = {}
     for init in reversed(_constructors(component)):
         try:
@@ -215,5 +215,5 @@ def _report_missing(
         if parameter.default is not inspect.Parameter.empty or name in settings:
             continue
         if closest(name, unknown, 0.7):
-            continue  # the misspelt key has been reported with this name as the hint
+            continue  # missing because misspelt: reported already
         document.error(f"[{'.'.join(path)}] needs the setting {name!r}", *path)

@@ -23,9 +23,9 @@ from afspm.transport.network import is_local
 from afspm.wire.messages import SCAN_LINES
 
 OPENS_PLAIN: Final = "opens_plain"
-"""An attribute by which a class says that programs without keys can send requests by it."""
+"""Class attribute that marks a component through which programs without keys can send requests."""
 ADDRESS: Final = "address"
-"""By convention the setting of a translator that says where its controller is."""
+"""Usual name of a translator's setting for the address of its controller."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
 _HANDLER_CUTOFF = 0.8
 _CALLED_METHODS = ("run", *(name for name in vars(Component) if name.startswith("on_")))
@@ -60,7 +60,7 @@ def check_roles(resolved: ResolvedExperiment) -> None:
         having = resolved.with_role(role)
         if not having and (name := _not_a_component(resolved, role)):
             resolved.document.error(f"there is no {role.value}", name, hint=f"[{name}] needs `component = true`")
-        elif not having and _all_loaded(resolved):  # else it may be what can't be loaded
+        elif not having and _all_loaded(resolved):  # a class that can't be loaded may be the missing one
             resolved.document.error(f"there is no {role.value}", hint=hint)
         for extra in having[1:]:
             what = f"[{extra.name}] is a second {role.value} beside [{having[0].name}]"
@@ -242,7 +242,7 @@ def _may_publish_lines(translator: ResolvedProcess) -> bool:
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
-    # Names of scans, spectra, and rules of the cache with {fields} go on after their beginning.
+    # names of scans, spectra, and rules of the cache with {fields} go on after their beginning
     continued = [*(f"{one.name}_" for one in wire.declared() if one.named), *filter(None, made)]
     return any(name.startswith(prefix) for name in published) or prefix.startswith(tuple(continued))
 
@@ -302,7 +302,7 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
 
 
 def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
-    # A role for a person who has no password at this page would be open to anyone who types the name.
+    # a role for a person who has no password at this page would be open to anyone who types the name
     name, _, person = member.partition(PERSON)
     process = resolved.processes.get(name)
     if not person or process is None or not process.declares("has_people"):

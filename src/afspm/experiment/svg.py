@@ -58,7 +58,7 @@ class Svg:
         """Write one line of text on the baseline y; a halo keeps it legible over lines."""
         weight = ' font-weight="600"' if bold else ""
         shape = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}"{weight}'
-        if halo:  # a text of its own beneath: not every viewer knows paint-order
+        if halo:  # drawn as a second text beneath: not every viewer supports paint-order
             self._texts.append(
                 f'<text {shape} fill="#ffffff" stroke="#ffffff" stroke-width="5" stroke-linejoin="round" '
                 f'aria-hidden="true">{escape(text)}</text>'

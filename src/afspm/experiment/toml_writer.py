@@ -13,7 +13,7 @@ from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
 
 SECRET = "webhook"
-"""The name of settings and keys whose value is a secret, where it is not the "$NAME" of an environment variable."""
+"""Name of settings and keys whose value is a secret, unless it is the "$NAME" of an environment variable."""
 _NAMED_INSTEAD = "$AFSPM_WEBHOOK"
 
 
@@ -44,7 +44,7 @@ def _secrets_in(value: object) -> list[str]:
 
 
 def _without(secrets: list[str], value: object) -> Any:
-    # A variable may hold the same secret, so values are compared, not keys.
+    # a variable may hold the same secret, so values are compared, not keys
     if isinstance(value, Mapping):
         return {key: _without(secrets, one) for key, one in value.items()}
     if isinstance(value, list | tuple):

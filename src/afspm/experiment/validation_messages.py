@@ -38,7 +38,7 @@ _WANTED: Final = {
     "less_than": "below {lt:g}",
     "less_than_equal": "at most {le:g}",
 }
-"""What was wanted, by pydantic's types of errors."""
+"""Expected values, by pydantic's types of errors."""
 
 
 def report(
@@ -58,7 +58,7 @@ def report(
         by_place.setdefault(_place(one, given), []).append(one)
     for place, errors in by_place.items():
         if any(other[: len(place)] == place != other for other in by_place):
-            continue  # another alternative of the type fits better: it is only wrong further inside
+            continue  # another member of the union fits better: its error lies deeper
         full = (*path, *place)
         what, hint = _sentence(errors, name_of(full), known(place))
         document.error(what, *full, hint=hint)
@@ -86,7 +86,7 @@ def _place(one: ErrorDetails, given: Any) -> SettingPath:
 
 def _sentence(errors: Sequence[ErrorDetails], shown: str, known: Iterable[str]) -> tuple[str, str]:
     given = errors[0].get("input")
-    if len(errors) > 1 and isinstance(given, list | Mapping):  # alternatives: it is not meant as a quantity
+    if len(errors) > 1 and isinstance(given, list | Mapping):  # a union: the value is not meant as a quantity
         errors = [one for one in errors if _cause(one) is None] or errors
     last = errors[-1]
     kind, context = last["type"], last.get("ctx", {})

@@ -152,5 +152,5 @@ def _sources(
 
 
 def _overlap(published: Collection[str], prefixes: Collection[str] | None) -> bool:
-    # No prefixes: all envelopes are wanted.
+    # no prefixes: all envelopes are wanted
     return prefixes is None or any(e.startswith(p) or p.startswith(e) for e in published for p in prefixes)

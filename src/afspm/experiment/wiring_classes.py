@@ -39,7 +39,7 @@ WIRE_SETTINGS: Final[dict[WiringClass, frozenset[str]]] = {
     WiringClass.ROUTER: frozenset({"server_url", "router_url", *_REQUESTS}),
     WiringClass.CLIENT: frozenset({"url", *_REQUESTS}),
 }
-"""The settings that each kind understands."""
+"""Settings of each kind."""
 
 # Keys of a component that name its intermediaries, and the kinds that fit.
 WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
@@ -68,7 +68,7 @@ class BoundSocket:
     key: str
     place: SourceLocation
     keyed: bool = True
-    """Whether it is open to nobody without a key, where the experiment has keys."""
+    """Whether peers need a key, if the experiment has keys."""
 
 
 @dataclass

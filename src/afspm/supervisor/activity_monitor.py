@@ -16,10 +16,10 @@ from typing import Any
 import psutil
 
 LEAST_SHARE = 0.05
-"""Of a processor's time, to count as work. Threads that wait for Python's lock look for it 200 times a second, which
-takes some thousandths each, and those of a socket library live on while all else hangs."""
+"""Share of a processor above which a process works. A hanging process uses less: each thread that waits for Python's
+lock polls it 200 times a second, which takes some thousandths, and threads of a socket library run on."""
 LOOKS = 10
-"""So many looks are made in the time that is judged by, at most: a wait for a disk is seen only while it lasts."""
+"""Samples in the judged time span: frequent, since a wait for the disk shows only while it lasts."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,13 +12,13 @@ from afspm.basics.clock import ExperimentClock
 
 AT_ONCE = 500_000
 BYTES_PER_S = 5_000
-"""For as long as it likes: 0.2 GB in a night of ten hours."""
+"""Permanent rate: 0.2 GB in a night of ten hours."""
 PAUSE_S = 10.0
-"""So long lines are left out at a time."""
+"""Duration of one pause."""
 LAST_BYTES = 10_000
-"""Of what was held back the last goes on after all: what matters most, a traceback, comes at the end."""
+"""Size of the last lines that are kept after a pause: a traceback, the most important part, comes last."""
 STAMP_BYTES = 100
-"""What a line costs besides its text: stamp and name in the file, and its place in memory."""
+"""Size of a line besides its text: time and name in the file, overhead in memory."""
 
 Stream = Literal["stdout", "stderr"]
 

@@ -165,12 +165,12 @@ class _Connections:
         return {connectable(address): one for address, (_, one) in reached.items()}
 
     def _launch(self) -> Launch | None:
-        # A run that goes on here is joined as a guest: keys made for a run are in its folder, not in the file.
+        # a run that goes on here is joined as a guest: keys made for a run are in its folder, not in the file
         experiment = self._experiment
         asking = experiment.asking([part.name for part in experiment.resolved.with_role(Role.COMPONENT)])
         publish = experiment.resolved.net.slots.get(f"{self._scheduler}/publish")
         written = None if publish is None or publish.address is None else connectable(publish.address)
-        guest = None if experiment.keys_folder else self._guest()  # keys that are made for a run are in its folder
+        guest = None if experiment.keys_folder else self._guest()
         if guest is not None or asking is None or written is None:
             return guest
         told = None if asking.keys is None else {**asking.keys, written: self._scheduler}
@@ -235,7 +235,7 @@ class _Connections:
         self._into.found.append(told)
 
     def _compare(self, told: Plain, asked_s: float, answered_s: float) -> None:
-        if not told.get("waits"):  # a simulated time that slows down does not tell real time
+        if not told.get("waits"):  # simulated time that waits for late processes does not show real time
             now_s, start_s, origin_s, speed = (float(told[name]) for name in ("now_ns", "start_s", "origin_s", "speed"))
             real_s = origin_s + (now_s / NS_PER_S - start_s) / speed
             ahead_s, uncertain_s = (asked_s + answered_s) / 2 - real_s, (answered_s - asked_s) / 2

@@ -16,7 +16,7 @@ import threading
 from afspm.basics.exit_codes import ExitCode
 from afspm.transport.process.parent import end_within, leave_interrupts_to_parent, take_standard_input
 
-ASK_S = 0.6  # to end by itself once its standard input is closed
+ASK_S = 0.6  # from the end of standard input to SIGTERM
 TERMINATE_S = 0.4  # from SIGTERM to SIGKILL
 _CHUNK = 1 << 16
 
@@ -28,7 +28,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("ERROR foreign: no command given\n")
         return ExitCode.CONFIG
     leave_interrupts_to_parent()
-    # a terminal's or a supervisor's wish to end us must not leave the command behind, however early it comes
+    # a signal that arrives before the command has started must still end it
     wished = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: wished.set())
     try:
@@ -68,7 +68,7 @@ class _ForeignProgram:
         assert self._child.stdin is not None
         with contextlib.suppress(OSError, ValueError):
             while chunk := os.read(self._pipe, _CHUNK):
-                with contextlib.suppress(BrokenPipeError):  # it doesn't read: it may run all the same
+                with contextlib.suppress(BrokenPipeError):  # a command that does not read its input may still run
                     self._child.stdin.write(chunk)
                     self._child.stdin.flush()
         self._end()

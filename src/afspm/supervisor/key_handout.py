@@ -69,14 +69,14 @@ def _scheduler(experiment: Experiment) -> str:
 
 
 def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
-    # A translator obeys the scheduler of this name alone.
+    # a translator obeys the scheduler of this name alone
     if own is None:
         return start
     return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
 
 
 def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
-    # A Python process that binds nothing needs the public keys of its servers alone.
+    # a Python process that binds nothing needs the public keys of its servers alone
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
     if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
@@ -103,12 +103,12 @@ def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[s
             found[connectable(start.launch.sockets.serve)] = start.launch.name
     guarding = set(found.values())
     if not guarding.issuperset(start.launch.name for start in schedulers):
-        return found  # the scheduler's subscribers are started elsewhere, and know nothing of these keys
+        return found  # the scheduler's subscribers are started elsewhere, and don't get these keys
     bound = [start.launch.sockets.publish for start in starts] + [start.launch.sockets.serve for start in starts]
     all_ports = not any(keys.is_private(address) for address in bound if address is not None)
     for start in starts:
         publish, name = start.launch.sockets.publish, start.launch.name
-        # a program in another language knows all or nothing; its translators know nothing, unless the file has keys
+        # a program in another language encrypts all its sockets or none; a translator none, unless the file has keys
         can_encrypt = name in guarding or (start.role is Role.COMPONENT and (all_ports or not start.command))
         if publish is not None and not keys.is_private(publish) and can_encrypt:
             found[connectable(publish)] = name
@@ -141,6 +141,6 @@ def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], schedule
         for start in starts
     ]
     asked = tuple(address for address, owner in encrypted.items() if owner == scheduler)
-    guest = Sockets(subscribe=asked)  # connects to all of them
+    guest = Sockets(subscribe=asked)  # connects to all publishers
     outside = [None if (one := of(name, guest)) is None else one.as_launch() for name in (GUEST, SUPERVISOR)]
     return KeyHandout(handed, *outside)

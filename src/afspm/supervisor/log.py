@@ -43,7 +43,7 @@ class LineReader:
     def __init__(self) -> None:
         self._level: int = logging.WARNING
         self.last_error = ""
-        """The first line of the last error."""
+        """First line of the last error."""
 
     def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
         """Return the level (as in `logging`) and the text of a line."""
@@ -101,7 +101,7 @@ class RunLog:
             self._shown.add(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
 
     def _experiment_time(self) -> str:
-        # Empty where the experiment's time is the wall clock's.
+        # empty where the experiment's time is the wall clock's
         now_ns = self._clock.now_ns()
         if abs(now_ns - self._wall.now_ns()) < NS_PER_S:
             return ""
@@ -152,7 +152,7 @@ class _Shown:
             with contextlib.suppress(OSError, ValueError):
                 self._show(*line)
             self._busy_since_s = None
-        with contextlib.suppress(OSError):  # what waits for room on a full disk is lost with us
+        with contextlib.suppress(OSError):  # lines that wait for room on a full disk are lost at exit
             self._finish()
 
     def hangs(self, longer_than_s: float) -> bool:
@@ -174,7 +174,7 @@ def _into(path: Path) -> tuple[Show, Callable[[], None]]:
     def show(stamp: str, name: str, level: int, text: str) -> None:
         file.write(f"{stamp} {logging.getLevelName(level):8} {name} {text}\n")
         file.flush()
-        SYNCER.soon(file.fileno())  # a power cut leaves what was before the last moment
+        SYNCER.soon(file.fileno())  # after a power cut only the last moment is missing
 
     return show, file.close
 

@@ -25,18 +25,18 @@ from afspm.basics.errors import ConfigError
 from afspm.transport.network import HAS_PRIVATE_SOCKETS
 
 # Below the range from which systems take the ports of outgoing connections (Linux from 32768, Windows and macOS from
-# 49152). From within it a port would be no choice: while its process is being restarted, a peer that tries again and
-# again may be given that very port by its own system, connect to itself, and keep the process from ever binding it.
+# 49152). A port within that range could be lost: while its process restarts, a peer that reconnects may get that very
+# port as its own outgoing port, connect to itself, and keep the process from binding it.
 LOWEST, HIGHEST = 20_000, 32_000
 TRIES = 200
 CAN_HOLD = sys.platform == "linux"
-"""Elsewhere a port that one process has bound, without listening, can't be bound by another."""
+"""Other systems let no second process bind a port that one process has bound without listening."""
 LONGEST_FOLDER = 90
-"""Bytes of the path of a folder of sockets. macOS allows the least for a socket: 103."""
+"""Limit on the path of a folder of sockets, in bytes. macOS has the lowest limit for a socket's path: 103."""
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")
 
-_held: deque[int] = deque()  # files of sockets, for as long as this process lasts
+_held: deque[int] = deque()  # descriptors, open as long as this process lives
 
 
 class FreePorts:
@@ -144,13 +144,13 @@ def require_free(bound: Mapping[str, str]) -> None:
 
 
 def _can_be_bound(host: str, port: int) -> bool:
-    # False for a port in use or reserved; the process that binds the address reports any other error better.
+    # false for a port in use or reserved; the process that binds the address reports any other error better
     host = {"*": "0.0.0.0", "localhost": LOOPBACK}.get(host, host)
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
             if sys.platform == "win32":
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
-            else:  # connections of an experiment before this one may linger
+            else:  # connections of an earlier experiment may linger in TIME_WAIT
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
             if CAN_HOLD:
@@ -161,7 +161,7 @@ def _can_be_bound(host: str, port: int) -> bool:
 
 
 def _is_free(host: str, port: int) -> bool:
-    # Where possible the port stays bound from here on, so that no other program takes it before our process binds it.
+    # where possible the port stays bound from here on, so that no other program takes it before our process binds it
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         try:
             probe.bind((host, port))

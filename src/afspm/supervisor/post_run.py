@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 REPORT_WITHIN_S = 120.0
 TOLD_WITHIN_S = 30.0
 COUNTED_WITHIN_S = 20.0
-TABLE = "metadata.csv"  # of the component Metadata
+TABLE = "metadata.csv"  # written by the component Metadata
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def _recorded(folder: Path) -> list[str]:
 
 
 def _tabled(table: Path) -> list[str]:
-    # The table has a row a channel; the channels of one scan count as one scan.
+    # the table has a row a channel; the channels of one scan count as one scan
     try:
         with table.open(encoding="utf-8", newline="") as file:
             rows = {(row.get("measurement"), row.get("time")) for row in csv.DictReader(file)}
@@ -125,7 +125,7 @@ def _times(count: int) -> str:
 def report(folder: Path, log: RunLog) -> None:
     """Write the report of a recorded run, in a process of its own that can neither harm nor delay the run."""
     if not (folder / JOURNAL_FILE).is_file():
-        return  # nothing was recorded
+        return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
     command = [*python_command("afspm.record.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}

@@ -22,9 +22,9 @@ from afspm.model import Role
 from afspm.supervisor.child_output import ChildOutput, OutputDropped, OutputLine, Stream
 from afspm.supervisor.supervision.supervisor_events import Exited
 
-LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
+LONGEST_LINE = 1 << 16  # a child that prints no line ends must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
-LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
+LAST_WORDS_S = 3.0  # limit on reading its output after its exit: a detached grandchild can keep the pipe open
 
 _EXTENDED_LIMITS = 9  # JobObjectExtendedLimitInformation
 _KILL_ON_CLOSE = 0x2000  # JOB_OBJECT_LIMIT_KILL_ON_JOB_CLOSE
@@ -71,7 +71,7 @@ class Task:
 
 def from_start(start: ProcessStart) -> Task:
     """Return the task of a process: Python classes run in `host`, other languages under `foreign`."""
-    # modules are those beside the experiment file, and never what happens to lie where the run was started
+    # modules come from beside the experiment file, never from the directory where the run was started
     ours = (*python_command(GUARD), "--", *start.command) if start.command else python_command(HOST)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
     return Task(
@@ -150,12 +150,12 @@ class ChildProcess:
         assert self._popen.stdin is not None
         if self._may_begin is not None:
             self._may_begin.wait()
-        with contextlib.suppress(OSError, ValueError):  # gone already: its exit says so
+        with contextlib.suppress(OSError, ValueError):  # it has exited already, which is reported below
             self._popen.stdin.write(first_line.encode() + b"\n")
             self._popen.stdin.flush()
         self._fed.set()
         code = self._popen.wait()
-        self.kill()  # what the child started and left behind must not live on beside its successor
+        self.kill()  # processes that the child left behind must not run beside its successor
         self._job.close()
         for reader in readers:
             reader.join(LAST_WORDS_S)
@@ -185,7 +185,7 @@ def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path 
         cwd=folder,
         env={"PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
         start_new_session=sys.platform != "win32",
-        # on Windows what ends the console (Ctrl-Break, or closing its window) must not reach what sees to a tip
+        # on Windows Ctrl-Break or closing the console must not kill a child that retracts a tip
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0) | getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
 

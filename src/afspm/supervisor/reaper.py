@@ -13,11 +13,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-if __name__ != "__main__":  # else it is run by itself, without the packages that would have to be loaded first
+if __name__ != "__main__":  # as a script it starts without site packages, to be ready fast
     from afspm.transport.process.parent import END_WITHIN_S, TIP_WITHIN_S
 
 GRACE_S = 1.0
-"""Beyond the time that a process has to end by itself."""
+"""Added to the time that a process has to end by itself."""
 
 
 CLOSED_WITHIN_S = 1.0
@@ -42,7 +42,7 @@ class Reaper:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # what ends the whole terminal must not end this first
+                start_new_session=True,  # closing the terminal must not end the reaper first
             )
 
     def watch(self, pid: int, *, has_tip: bool) -> None:
@@ -58,7 +58,7 @@ class Reaper:
         if self._popen is not None and self._popen.stdin is not None:
             with contextlib.suppress(OSError):
                 self._popen.stdin.close()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # something can't be killed
+            with contextlib.suppress(subprocess.TimeoutExpired):  # a process can't be killed
                 self._popen.wait(CLOSED_WITHIN_S)
 
     def _tell(self, line: str) -> None:

@@ -29,7 +29,7 @@ from afspm.transport.process import signals
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0
-"""Real: those who join at once find the beginning still to come."""
+"""Real time before the first packet, so that programs that join at once miss none."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
         left_out: set[str] = set()
 
         def leave_out(why: str) -> None:
-            if why not in left_out:  # once, not with each channel
+            if why not in left_out:  # log each reason once, not for each channel
                 tell(f"left out: {why}")
             left_out.add(why)
 

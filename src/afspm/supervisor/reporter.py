@@ -56,7 +56,7 @@ LINES_PERIOD_S = 0.2
 RESEND_AFTER_S = 5.0
 """Real time after which a report without an answer is sent again."""
 MOST_LINES = 5000
-"""Lines that wait for a scheduler that is not there; of more the oldest are dropped."""
+"""Limit on lines that wait for a missing scheduler; the oldest are dropped."""
 LONGEST_LINE = 2000
 """Characters."""
 _BATCH_BYTES = LONGEST_ANNOUNCEMENT // 4
@@ -161,7 +161,7 @@ class Reporter:
         self._failures: set[str] = set()
         self._asked: deque[int] = deque()
 
-    # --- of the supervisor, any thread ---
+    # --- called by the supervisor, from any thread ---
 
     def start(self) -> None:
         self._thread.start()
@@ -193,14 +193,14 @@ class Reporter:
         if (port := self._port) is not None:
             port.wake_up()
 
-    # --- of its own thread ---
+    # --- in the reporter's thread ---
 
     def _run(self) -> None:
         try:
             port = open_port(self._launch, ExperimentClock.real())
         except AfspmError as error:
             self._fail(str(error))
-            self.post(SchedulerAnswered())  # or not: there is no asking
+            self.post(SchedulerAnswered())  # components must not wait for a scheduler that can't be asked
             return
         try:
             self._port = port
@@ -234,7 +234,7 @@ class Reporter:
     def _receive(self, incoming: Incoming) -> None:
         request = self._request
         if isinstance(incoming, ControlConnected):
-            request.connected, request.sent_s = True, -math.inf  # what was sent may be lost
+            request.connected, request.sent_s = True, -math.inf  # the request may be lost with the old connection
         elif isinstance(incoming, ControlDisconnected):
             request.connected = False
         elif isinstance(incoming, ReplyReceived) and request.sent and incoming.response.id == request.sent.id:
@@ -286,7 +286,7 @@ class _OpenRequest:
 
 
 def _in_use(response: Response) -> str | None:
-    # Empty: not in use; None: an older scheduler, which has no such answer.
+    # empty: not in use; None: an older scheduler, which has no such answer
     try:
         told = json.loads(response.payload) if response.ok else {}
         return str(told["in_use"])
@@ -314,7 +314,7 @@ def reporter_of(
     if scheduler is None:
         launch = experiment.asking([start.launch.name for start in starts])
         launch = launch and replace(launch, run=run)
-        here = f"{here}-{os.getpid()}"  # there may be several parts on one computer
+        here = f"{here}-{os.getpid()}"  # several parts may run on one computer
     else:
         launch = _local(scheduler)
     if launch is None:

@@ -33,10 +33,10 @@ from afspm.supervisor.supervision.run_end import EndReason
 _OVER = {reason.name.lower() for reason in EndReason if reason.is_final}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
 ZMTP = b"\xff"
-"""What a socket of ZeroMQ says first."""
+"""First byte that a ZeroMQ socket sends."""
 GONE_WITHIN_S = 10.0
 STEP_NS = 1_000_000
-"""By so much the time goes on between two lives of a run, so that nothing new happens at a time that has been."""
+"""Simulated time between two lives of a run, so that no new packet has the time of an old one."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class ResumableRun:
 
     def options(self, options: RunOptions) -> RunOptions:
         """Return the options restricted to the processes that ran on this computer, and those added now."""
-        names = self.experiment.component_names  # without what was added in an earlier life
+        names = self.experiment.component_names  # without components added by an overlay at an earlier resume
         only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
         return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
 
@@ -147,7 +147,7 @@ def last_seen_ns(folder: Path) -> int:
         for values in (kept, translator):
             if isinstance(values, dict):
                 seen += [values[name] for name in ("last_ns", "seen_ns") if isinstance(values.get(name), int)]
-    with suppress(FileError, sqlite3.DatabaseError):  # damaged: the recorder puts it aside, and the others know as well
+    with suppress(FileError, sqlite3.DatabaseError):  # damaged: the recorder moves it aside
         journal = open_to_read(folder)
         with closing(journal):
             newest = journal.execute("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ''")
@@ -156,7 +156,7 @@ def last_seen_ns(folder: Path) -> int:
 
 
 def _wait_until_gone(facts: Plain, folder: Path) -> None:
-    # Processes that lost their parent end by themselves, within seconds; two of one name must not share a folder.
+    # processes that lost their parent end by themselves, within seconds; two of one name must not share a folder
     until_s = ExperimentClock.real().monotonic_s() + GONE_WITHIN_S
     ports = {
         int(match[2]): name
@@ -174,7 +174,7 @@ def _wait_until_gone(facts: Plain, folder: Path) -> None:
 
 
 def _is_gone(port: int, until_s: float) -> bool:
-    # A listener that ends closes the connection, which is noticed at once.
+    # a listener that ends closes the connection, which is noticed at once
     clock = ExperimentClock.real()
     while (left_s := until_s - clock.monotonic_s()) > 0.0:
         try:
@@ -212,7 +212,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
 
 
 def _whole(experiment: Experiment) -> dict[str, object]:
-    # Both files expanded, so that a default written out by hand counts as no difference.
+    # both files expanded, so that a default written out by hand counts as no difference
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))
 

@@ -37,7 +37,7 @@ from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.transport.heartbeat import HeartbeatListener
 
 TAKES_WHO_COMES = ""
-"""The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
+"""Identity of a run of a real microscope's translator alone: it obeys whichever scheduler connects."""
 RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
 
 WRITTEN_WITHIN_S = 5.0
@@ -140,14 +140,14 @@ def go(
             outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
-            if not before or REAL_S in facts:  # else a part was cut off, for an unknown time
+            if not before or REAL_S in facts:  # without REAL_S an earlier part was cut off at an unknown time
                 so_far_s = before.get(REAL_S, 0.0)
                 ending[REAL_S] = round(so_far_s + outcome.duration_s, 1)
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
         except OSError as error:  # a full disk must not prevent the notification of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
         if outcome.why.is_final:
-            with suppress(OSError):  # what stays is only space
+            with suppress(OSError):  # leftover files only take space
                 run_bounded(lambda: discard_if_recorded(log_folder(folder / STATE_DIR)), WRITTEN_WITHIN_S)
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
@@ -213,7 +213,7 @@ def _example_of_a_guest(starts: Sequence[ProcessStart]) -> Launch | None:
         return component if component and component.sockets.subscribe and component.sockets.control else None
     sockets = Sockets(subscribe=(connectable(scheduler.sockets.publish),), control=connectable(scheduler.sockets.serve))
     keys = scheduler.keys
-    if keys is not None and "folder" in keys:  # the scheduler itself need not know whose key to expect there: its own
+    if keys is not None and "folder" in keys:  # the scheduler's own key is expected there
         keys = {**keys, **dict.fromkeys((*sockets.subscribe, str(sockets.control)), scheduler.name)}
     return replace(scheduler, sockets=sockets, keys=keys)
 

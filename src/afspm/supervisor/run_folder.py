@@ -52,7 +52,7 @@ def write_experiment(folder: Path, text: str) -> None:
 
 
 def _new_folder(runs: Path, stamp: str) -> Path:
-    for number in range(1, MOST_RUNS_A_SECOND):  # several may start in the same second
+    for number in range(1, MOST_RUNS_A_SECOND):  # several runs may start in the same second
         folder = runs / (stamp if number == 1 else f"{stamp}-{number}")
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
@@ -65,7 +65,7 @@ def _point_to(runs: Path, name: str) -> None:
     try:
         aside.symlink_to(name, target_is_directory=True)
         aside.replace(runs / LATEST_LINK)
-    except OSError:  # Windows lets only some users make links
+    except OSError:  # on Windows only some users may create links
         aside.unlink(missing_ok=True)
         _replace(runs / LATEST_FILE, name + "\n")
 

@@ -18,8 +18,8 @@ from afspm.transport.zmq_port import open_port
 
 AGAIN_S = 1.0
 REFUSED_S = 10.0
-"""Real time for which a refusal may pass: the scheduler still holds the connection of a host that lost its power."""
-_SAME_S = 1e-3  # two processes of one computer agree on real time to that
+"""Real time for which a refusal may be temporary: the scheduler still has the connection of a host that lost power."""
+_SAME_S = 1e-3  # clocks of two processes of one computer differ by less
 
 
 @dataclass(frozen=True)
@@ -94,5 +94,5 @@ def _read(response: Response, asked_s: float, answered_s: float, where: str) -> 
     real_s = (asked_s + answered_s) / 2
     shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed
     if abs(now_s - shown_s) <= ((answered_s - asked_s) / 2 + _SAME_S) * clock.speed:
-        return RunIdentity(clock, run, simulated)  # the same clock on the wall: exactly the same time
+        return RunIdentity(clock, run, simulated)  # same wall clock: take the scheduler's clock unchanged
     return RunIdentity(ExperimentClock(real_s, now_s, clock.speed), run, simulated)

@@ -59,7 +59,7 @@ from afspm.transport.process import signals
 from afspm.transport.process.fault_file import take_fault
 
 REPORT_PERIOD_S = 0.1
-"""Real time between two looks at the states of processes, for the reporter."""
+"""Real time between two updates of the reporter's process states."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Supervisor:
                     self._look()
                     self._step(TimePassed())
                     self._report()
-        finally:  # also when an error of ours ends it: nothing may be left behind
+        finally:  # also after an error in this loop: no process may be left behind
             for process in self._processes.values():
                 process.kill()
             if self._reporter is not None:

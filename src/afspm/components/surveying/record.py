@@ -20,7 +20,7 @@ class Outcome(Enum):
 
     MEASURED = "measured"
     REFUSED = "refused"
-    """All of it or a part: the reason says why."""
+    """Zoom or curves were refused, for the reason in the table."""
     INCOMPLETE = "incomplete"
     """The survey ended before the last curve."""
     NOT_REACHED = "not-reached"

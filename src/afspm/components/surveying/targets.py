@@ -21,11 +21,11 @@ from afspm.model.levelling import levelled
 Floats = NDArray[np.float64]
 
 _MAD: Final = 1.4826
-"""From the median of absolute deviations to a standard deviation."""
+"""Factor from the median of absolute deviations to a standard deviation."""
 _SIGMAS: Final = 6.0
-"""Least height above the noise, where none is given: of 128 x 128 pixels of noise none is so high."""
+"""Default least height in units of the noise: in 128 x 128 pixels of noise none is that high."""
 _WIDEST: Final = 0.2
-"""Of the scan's shorter side, where no width is given: what is wider is ground."""
+"""Default width above which features count as ground, as a share of the scan's shorter side."""
 _LEAST_BLUR_PX: Final = 0.6
 _SCAR_PX: Final = 4
 _DIRECTIONS: Final = 72

@@ -22,9 +22,9 @@ class ChildPolicy:
     beats: bool = True
     """Whether it sends heartbeats."""
     final_codes: Collection[int] = frozenset({ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED})
-    """Exit codes after which it is not started again. Who was asked to stop, and not by us, is needed as before."""
+    """Exit codes after which it is not restarted. Not ORPHAN: a child stopped by another program is still needed."""
     quiet_codes: Collection[int] = frozenset({ExitCode.CONFIG, ExitCode.ENDED})
-    """Those of them that others tell: who gives it up for its settings, the scheduler that the experiment has ended."""
+    """Final codes that need no log line: refused settings are logged when it is given up, the end by the scheduler."""
 
 
 class HeartbeatReport(Protocol):
@@ -45,13 +45,13 @@ class ChildPhase(Enum):
     """Not started yet."""
     RUNNING = auto()
     KILLING = auto()
-    """It did not live any more as it should; its end is awaited."""
+    """It was killed as dead or frozen; its exit is awaited."""
     WAITING = auto()
-    """It crashed and is started again when its delay is over."""
+    """It crashed; it is restarted after the delay."""
     STOPPING = auto()
-    """We asked it to end."""
+    """It was asked to end."""
     DONE = auto()
-    """It ended, on purpose or by our wish."""
+    """It has ended, on purpose or because it was asked to."""
     GIVEN_UP = auto()
 
 
@@ -101,7 +101,7 @@ class ChildWatch:
         self._liveness: Liveness | None = None
         self._began_s = 0.0
         self._again_s = 0.0
-        self._is_ordered = False  # its end is, and that it is started again at once
+        self._is_ordered = False  # whether a restart was ordered: its exit is expected
         self._fault: OwnFault | None = None  # that ended the previous life
         self.phase = ChildPhase.IDLE
 

@@ -10,7 +10,7 @@ from afspm.supervisor.supervision.child import ChildPhase
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import SupervisedChild
 
-IDLE_AFTER_S = 10.0  # real time; a component that ends the experiment at its last scan, or repairs the tip, comes first
+IDLE_AFTER_S = 10.0  # real time; for a component to end the experiment after its last scan, or to begin a repair
 ASK_AGAIN_S = 5.0
 
 
@@ -42,7 +42,7 @@ class IdleWatch:
         if not acting or not all(child.is_over for child in acting):
             self.since_s, self.is_logged, self.is_postponed, self.is_ending = None, False, False, False
             return False
-        if self.is_ending:  # components are at work on what they finish
+        if self.is_ending:  # components are finishing
             return True
         if self.starts != starts_before or any(_is_at_work(child, now_s, liveness) for child in children):
             self.since_s = None

@@ -15,15 +15,15 @@ class ProcessHealth(Enum):
     STARTING = auto()
     ALIVE = auto()
     SLOW_START = auto()
-    """It has not sent a first beat within the time that a start may take."""
+    """No first heartbeat within the limit for a start."""
     BUSY = auto()
-    """Its beats have stopped, but it is seen to work, and for no longer than it declared that a step may take."""
+    """Heartbeats have stopped, but it is seen to work, within the limit for one step."""
     SILENT = auto()
-    """Its beats have stopped: the whole process hangs."""
+    """Heartbeats have stopped: the whole process hangs."""
     FROZEN = auto()
-    """It beats, or works, but its current step has taken longer than it declared that one may."""
+    """Its current step exceeds the limit for one step."""
     NOT_CLOSING = auto()
-    """It said that it is closing and is still there."""
+    """It announced that it closes, but still runs."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Liveness:
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = ProcessHealth.ALIVE
         self._frozen = step_age_s > longest_s
-        self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # where it had no step, one may begin now
+        self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # an idle process may begin a step now
         self._deadline_s = now_s + self._policy.silence_s
 
     def waits(self, now_s: float) -> None:
@@ -96,7 +96,8 @@ class Liveness:
         """
         asleep_s = now_s - self._checked_s - self._policy.beat_period_s
         self._checked_s = now_s
-        if asleep_s > self._policy.beat_period_s:  # a suspended computer: its beats wait to be read, or it slept too
+        # this computer was suspended: heartbeats wait to be read, or the process slept, too
+        if asleep_s > self._policy.beat_period_s:
             self._deadline_s += asleep_s
             self._step_began_s += asleep_s
         if self._frozen and self._vital is ProcessHealth.ALIVE:
@@ -116,7 +117,7 @@ class Liveness:
     def next_check_s(self) -> float:
         """Return when to call `check` at the latest."""
         next_s = self._checked_s + self._policy.beat_period_s
-        # a deadline that has passed was seen: it works on without beating
+        # a deadline that has passed was handled: the process works on without heartbeats
         is_due = not self._has_no_deadline and self._deadline_s > self._checked_s
         return min(self._deadline_s, next_s) if is_due else next_s
 

@@ -10,7 +10,7 @@ from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import ChildLife, SupervisedChild
 
 SILENT_PERIODS = 2.5
-"""Beat periods without a beat after which a process counts as silent; a little later it is killed."""
+"""Beat periods without a heartbeat after which a process is shown as silent; a little later it is killed."""
 
 _WITHOUT_PROCESS = {
     ChildPhase.IDLE: ProcessCondition.STARTING,
@@ -53,7 +53,7 @@ class ProcessStatus:
         return tuple(found), changed
 
     def _alive_since_ns(self, name: str, pid: int, now_ns: int) -> int:
-        # A process at work on a step, or late with a beat, counts as alive.
+        # a process at work on a step, or late with a beat, counts as alive
         if self._alive.get(name, (0, 0))[0] != pid:
             self._alive[name] = (pid, now_ns)
         return self._alive[name][1]

@@ -13,9 +13,9 @@ from afspm.supervisor.supervision.supervised_child import SupervisedChild
 
 OWN_PACE_S = 1.5  # after the announcement of the end, for a component to finish a file
 AGAIN_S = 0.25  # a process is busy within its limit: look again
-FAREWELL_S = 60.0  # but not for ever
-KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
-TIP_S = 15.0  # after being asked: a process that retracts the tip, or works on its end, ends by itself before
+FAREWELL_S = 60.0  # limit on waiting for busy processes before they are asked
+KILL_AFTER_S = 1.5  # after being asked, or after finishing
+TIP_S = 15.0  # after being asked, for a process that retracts the tip, or is seen to work on its end
 LEAVE_AFTER_S = 3.0  # after being killed
 
 
@@ -26,11 +26,11 @@ class EndReason(Enum):
     ALL_DONE = auto()
     STOPPED = auto()
     LOST = auto()
-    """A process that the experiment can't do without was given up, or all were."""
+    """An essential process was given up, or all processes were."""
     PLANS_DONE = auto()
-    """All components that act are done, and none of them ended the experiment."""
+    """All components with plans are done, and none ended the experiment."""
     PLANS_LOST = auto()
-    """Nothing that acts is left, as a component that does was given up."""
+    """The last component with a plan was given up."""
 
     @property
     def is_announced(self) -> bool:
@@ -62,10 +62,10 @@ class EndStep(Enum):
     """Next step with processes that still run."""
 
     ASK = auto()
-    """Close their stdin: they end cleanly."""
+    """Close their standard input, so that they end cleanly."""
     KILL = auto()
     LEAVE = auto()
-    """Not even killing ends them (a driver hangs in the system): say so, and go."""
+    """Killing does not end them (a driver hangs in the kernel): log it, and leave them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ def unfinished(
 ) -> list[str]:
     """Return the processes that have something to finish; for a translator also after it was asked: the tip."""
     is_asked, has_ended = ending.last is not None, ending.why.is_announced
-    # a scheduler on another computer may be there
+    # a scheduler on another computer counts as alive
     can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)
     found = []
     for name, child in children.items():

@@ -9,10 +9,10 @@ from afspm.supervisor.supervision.child import ChildWatch, HeartbeatReport
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 
 LATE_START_S = 15.0
-"""Time that a process started at the end has to come up, while it is not seen to work; and then to hear what it
-missed."""
+"""Real time for a process that restarts during the end: to send its first heartbeat unless it is seen to work, and
+then to receive the packets that it missed."""
 CLOSES_WITHIN_S = 1.5
-"""Processor time that a process has for its end, after it was asked to."""
+"""Processor time that a process may use for its end, after it was asked to end."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +132,10 @@ class SupervisedChild:
         if life.beat is None:
             return bool(life.works) or now_s - life.started_s < LATE_START_S
         given_up = self.rescued and life.is_silent(now_s, liveness)
-        # between two steps of its start it looks as if it had nothing to do
-        begins_anew = can_hear and self.starts > 1 and now_s - life.first_beat_s < LATE_START_S
+        # between two steps of its start it looks idle
+        is_restarting = can_hear and self.starts > 1 and now_s - life.first_beat_s < LATE_START_S
         is_late = now_s - life.beat_s > 1.5 * liveness.beat_period_s
-        return not life.is_closing and not given_up and (begins_anew or is_late)
+        return not life.is_closing and not given_up and (is_restarting or is_late)
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ from afspm.supervisor.supervision.supervisor_events import (
 )
 
 SCHEDULER_ANSWERS_WITHIN_S = 15.0
-"""Time after which components no longer wait for the scheduler to answer."""
+"""Time after which components start although the scheduler has not answered."""
 
 
 class SupervisorCore:
@@ -201,8 +201,7 @@ class SupervisorCore:
             else:
                 self._log(child.spec.name, "DEBUG", child.last_exit)
         elif code == ExitCode.DONE and child.spec.role is Role.TRANSLATOR and not life.is_closing:
-            # a program of another language that has caught an error of its own ends like that; one that closes on
-            # purpose says so
+            # a program in another language ends like this after an error that it caught; a regular end is announced
             told = f"{how} before the end of the experiment, without announcing it"
             self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
         else:
@@ -267,7 +266,7 @@ class SupervisorCore:
             self._look_whether_idle()
 
     def _await_scheduler(self) -> None:
-        # A scheduler that beats but does not answer us (for want of a key, perhaps) may still answer the components.
+        # a scheduler that beats but does not answer us (for want of a key, perhaps) may still answer the components
         if not self._awaits_scheduler:
             return
         for child in self._with_role(Role.COMPONENT):
@@ -327,7 +326,7 @@ class SupervisorCore:
     # --- the end ---
 
     def _may_be_rescued(self, child: SupervisedChild) -> bool:
-        # A component that dies after the end of the experiment had not finished: it gets one more start to do so.
+        # a component that dies after the end of the experiment had not finished: it gets one more start to do so
         return self._has_just_ended and child.spec.beats and child.spec.role is Role.COMPONENT and not child.rescued
 
     @property

@@ -128,9 +128,9 @@ class ProcessAction(Enum):
     START = auto()
     """`ProcessStarted` or `StartFailed` follows."""
     KILL = auto()
-    """End it, and all that it has started, now."""
+    """Kill it, and the processes that it has started."""
     CLOSE_INPUT = auto()
-    """Ask it to end by closing its standard input."""
+    """Ask it to end, by closing its standard input."""
     ABANDON = auto()
     """Wait for it no longer: it can't be killed."""
 
@@ -189,7 +189,7 @@ _WINDOWS_REASONS = {
     0xC0000374: "damaged heap",
     0xC0000409: "aborted",
 }
-"""Of the system's own exit codes, those that are met: what a signal is elsewhere."""
+"""Exit codes of Windows itself that occur in practice; they correspond to signals elsewhere."""
 
 
 def describe_exit(code: int) -> str:
