@@ -44,7 +44,6 @@ class RunDescription:
 
 
 def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
-    """Return a fraction (0 to 1) as a bar."""
     full = min(width, max(0, round(part * width)))
     return ("█" * full + "░" * (width - full)) if fancy else "[" + "#" * full + "." * (width - full) + "]"
 
@@ -56,7 +55,6 @@ def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
 
 
 def log_line(line: LogLine) -> Text:
-    """Return a line of the log, coloured by its level."""
     from rich.text import Text
 
     text = Text.assemble((f"{time_of_day(line.time_ns)} ", "dim"), (f"{line.name} ", "cyan"))
@@ -72,7 +70,6 @@ class StatusText:
         self._now_ns = now_ns
 
     def screen(self, *, silent_s: float = 0.0, log_lines: int = 8) -> Group:
-        """Return the whole status."""
         from rich.console import Group
         from rich.text import Text
 

@@ -72,7 +72,6 @@ class MissingChannels:
         self._log = log
 
     def see(self, scan: Scan) -> None:
-        """Note a channel that arrived."""
         self._missing.discard(scan.channel)
         if not self._missing:
             return

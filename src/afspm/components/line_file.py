@@ -81,7 +81,6 @@ class LineFile:
 
 
 def csv_line(row: Iterable[str]) -> str:
-    """Return a row of a table as one line."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(row)
     return line.getvalue().replace("\n", " ")

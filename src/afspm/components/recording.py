@@ -272,7 +272,6 @@ class RecordInbox:
             return None if self._ending is None else self._until_s
 
     def want_replay(self) -> None:
-        """Have publishers asked for their cached packets."""
         with self._changed:
             self._wants_replay = True
 
@@ -305,7 +304,6 @@ class LogProgress:
         self._waiting: dict[tuple[int | None, str], Position] = {}
 
     def begin_again(self) -> None:
-        """Read the whole log again."""
         self._reader = LogReader(self._log)
         self._waiting.clear()
 

@@ -350,7 +350,6 @@ class TargetFinder:
     refines: bool
 
     def check(self) -> None:
-        """Raise ConfigError if the function does not exist."""
         if self.function is not None:
             self._function(self.function)
 

@@ -147,7 +147,6 @@ class TipReference:
         return max(size / pixels for size, pixels in zip(self.size_m, reversed(self.shape), strict=True))
 
     def fits(self, region: Region, shape: tuple[int, int]) -> bool:
-        """Return whether a scan can be compared with this reference."""
         sizes = zip(region.size_m, self.size_m, strict=True)
         same_size = all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
         turned_rad = math.remainder(region.angle_rad - self.angle_rad, math.tau)
@@ -226,7 +225,6 @@ class TipJudge:
         return plain
 
     def restore(self, state: Plain) -> None:
-        """Restore the state that `state` returned."""
         self._state = from_plain(JudgeState, state)
 
     def trust(self) -> None:

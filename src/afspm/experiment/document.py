@@ -33,11 +33,9 @@ class Document:
     findings: Findings = field(default_factory=Findings)
 
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Add an error at the line where `path` is set."""
         self.findings.error(what, self.place(*path), hint)
 
     def warning(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Add a warning at the line where `path` is set."""
         self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:

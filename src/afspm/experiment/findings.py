@@ -62,7 +62,6 @@ class Findings:
 
     @property
     def errors(self) -> int:
-        """Number of errors so far."""
         return sum(finding.is_error for finding in self.found)
 
     def ordered(self) -> list[Finding]:

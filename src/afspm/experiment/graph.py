@@ -81,7 +81,6 @@ class PublisherLane:
 
 
 def draw(experiment: Experiment) -> str:
-    """Return the picture as the text of an SVG file."""
     return _Drawing(experiment.resolved, experiment.name).document()
 
 

@@ -106,11 +106,9 @@ class ResolvedExperiment:
         return (_metadata_of_class(translators[0]) if translators else {}) | given
 
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Add an error at the line where `path` is set."""
         self.document.error(what, *path, hint=hint)
 
     def warning(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Add a warning at the line where `path` is set."""
         self.document.warning(what, *path, hint=hint)
 
     def with_role(self, role: Role) -> list[ResolvedProcess]:
@@ -153,7 +151,6 @@ class ResolvedExperiment:
 
     @property
     def emulators(self) -> list[str]:
-        """Names of the emulated controllers."""
         return self.declaring(EMULATED)
 
 

@@ -36,7 +36,6 @@ class Svg:
         dashed: bool = False,
         corner: float = 7,
     ) -> None:
-        """Draw a rectangle with round corners; (x, y) is its top left."""
         dash = ' stroke-dasharray="5 4"' if dashed else ""
         self._boxes.append(
             f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="{corner:g}" '

@@ -130,7 +130,6 @@ class ReportQueue:
         return tuple(batch)
 
     def due_s(self) -> float:
-        """Return the real monotonic time of the next report."""
         if self._has_changed:
             return -math.inf
         states_s = self._states_s if self._states else self._clock.monotonic_s()

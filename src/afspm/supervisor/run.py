@@ -155,7 +155,6 @@ def go(
 
 
 def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Return the addresses bound here, with the names of the processes that bind them."""
     return {
         address: start.launch.name
         for start in starts

@@ -37,7 +37,6 @@ class RunIdentity:
 
 
 def new_identity() -> str:
-    """Return a random identity, different for each run."""
     return os.urandom(8).hex()
 
 

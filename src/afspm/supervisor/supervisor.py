@@ -73,7 +73,6 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """Exit code of `afspm run`."""
         return self.why.exit_code
 
 

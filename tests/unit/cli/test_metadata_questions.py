@@ -24,7 +24,7 @@ class = "Scheduler"
 """
 
 
-def test_what_is_known_is_offered_and_what_is_wrong_asked_again(
+def test_questions_offer_known_values_and_repeat_after_invalid_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "e.toml"

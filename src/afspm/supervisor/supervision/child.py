@@ -115,13 +115,11 @@ class ChildWatch:
         return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
 
     def begin(self, now_s: float) -> list[ChildEffect]:
-        """Start the child, the first time or after its end."""
         if self.phase not in (ChildPhase.IDLE, ChildPhase.DONE, ChildPhase.GIVEN_UP):
             return []
         return self._start(now_s)
 
     def beat(self, beat: HeartbeatReport, now_s: float) -> list[ChildEffect]:
-        """Process a heartbeat."""
         if self._liveness is None:
             return []
         if beat.closing:

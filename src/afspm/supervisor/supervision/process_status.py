@@ -60,7 +60,6 @@ class ProcessStatus:
 
 
 def condition_of(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> ProcessCondition:
-    """Return the condition of a process."""
     life = child.life
     if child.given_up:
         return ProcessCondition.GIVEN_UP

@@ -82,7 +82,6 @@ class SupervisorCore:
 
     @property
     def is_over(self) -> bool:
-        """Whether the run has ended and no process of it is left."""
         return self.ending is not None and not any(child.life for child in self.children.values())
 
     def step(self, event: SupervisorEvent, now_s: float) -> list[SupervisorEffect]:
@@ -159,7 +158,6 @@ class SupervisorCore:
         return overdue, self._liveness.silence_s / 2.0
 
     def reports(self) -> tuple[ProcessReport, ...]:
-        """Return the fate of each process."""
         return tuple(
             ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered)
             for name, child in self.children.items()
