@@ -32,7 +32,7 @@ def commission(
     ] = None,
     runs: Runs = RUNS,
     frame: WithinFrame = "",
-    anew: Annotated[bool, opt("Do all steps again, whatever the report says.", "--anew")] = False,
+    anew: Annotated[bool, opt("Repeat all steps, also those that passed.", "--anew")] = False,
     speed: CheckSpeed = 20.0,
 ) -> None:
     """Take a new controller into use, step by step, with the tip withdrawn first.
@@ -52,7 +52,7 @@ def commission(
     file = report or Path(f"{files[0].stem}-commissioning.toml")
     before = None if anew else _before(file)
     if before is not None:
-        terminal.show(f"going on with {file}: what has passed there is not done again")
+        terminal.show(f"continuing with {file}: steps that passed are not repeated")
     tried_on = "emulator" if simulated else terminal.choose("What is connected?", TRIED_ON[:2])
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     ended = walk(options, terminal, file, tried_on, before)

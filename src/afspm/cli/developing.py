@@ -63,7 +63,7 @@ def check_translator(
             typer.echo(check.listed)
         return
     if not files:
-        raise typer.BadParameter("an experiment file is wanted", param_hint="FILE")
+        raise typer.BadParameter("give an experiment file", param_hint="FILE")
     console = Console(file=sys.stdout, highlight=False)
     options = CheckOptions(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
     if not yes and not _is_simulated(options):
@@ -137,7 +137,7 @@ def check_client(
             typer.echo(check.listed)
         return
     if not command:
-        raise typer.BadParameter("the client's conformance program is wanted", param_hint="-- COMMAND")
+        raise typer.BadParameter("give the client's conformance program", param_hint="-- COMMAND")
     console = Console(file=sys.stdout, highlight=False)
     result = judge(command, runs, only or (), lambda one: show_result(one, console))
     show_client_end(result, console)
@@ -161,11 +161,11 @@ def emulate(
     usual: Annotated[
         bool, typer.Option("--usual", help="Listen where the vendor's own controller does, for clients that expect it.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Everything left to chance follows from it.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     speed: Annotated[float, typer.Option(min=1e-6, help="Experiment seconds in a real second.")] = 1.0,
     fault: Annotated[
         list[str] | None,
-        opt("What goes wrong, and when.", metavar="KIND[@SECONDS][,count=N][,duration=SECONDS]"),
+        opt("A fault, and its time.", metavar="KIND[@SECONDS][,count=N][,duration=SECONDS]"),
     ] = None,
     folder: Annotated[
         Path | None, opt("For its files. Default: emulated-NAME", "--folder", "-o", metavar="DIR")

@@ -22,7 +22,7 @@ def doctor(
     context: typer.Context,
     files: OptionalFiles = None,
     runs: Runs = RUNS,
-    listen: Annotated[float, opt("For how long (s) to listen to what is published.", "--listen", min=0.1)] = 3.0,
+    listen: Annotated[float, opt("Seconds to listen to published packets.", "--listen", min=0.1)] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
     """Find the faults of an experiment, seen from this computer, with remedies.

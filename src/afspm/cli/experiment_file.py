@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 
 def check(
     files: Files,
-    expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file as it is in force.")] = False,
+    expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file, with all defaults.")] = False,
     explain: Annotated[
         bool,
         typer.Option(
             "--explain",
-            help="Print a file of another form, as the published one, in ours; say what each line has become.",
+            help="Convert a file of another form, such as the published one, and explain each line.",
         ),
     ] = False,
 ) -> None:
@@ -115,9 +115,7 @@ def keys(
     folder: Annotated[
         Path | None, opt("Where to put them. Default: [security] keys of the file, else keys/ beside it.", "--folder")
     ] = None,
-    also: Annotated[
-        list[str] | None, opt("A person who is to have a key. Repeatable.", "--also", metavar="NAME")
-    ] = None,
+    also: Annotated[list[str] | None, opt("A person who gets a key. Repeatable.", "--also", metavar="NAME")] = None,
 ) -> None:
     """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
 

@@ -67,14 +67,14 @@ def run(
         bool, opt("Ask for sample, person and project first, for the files of the run ([metadata]).", "--ask")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
+        bool, typer.Option("--dry-run", help="Check, list the processes to start, and start none.")
     ] = False,
     report: Annotated[bool, opt("Write report.html when it has ended.", "--report/--no-report")] = True,
     stay: Annotated[
         bool | None,
         opt("Keep the dashboard when it has ended. Default: in a terminal, until Ctrl-C.", "--stay/--no-stay"),
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details too.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show details, too.")] = False,
 ) -> None:
     """Run an experiment.
 
@@ -102,7 +102,7 @@ def run(
     )
     if resume is not None:
         if files or only or without or speed or dry_run or ask:
-            said = "a run is resumed as it was begun: give nothing else, but --dashboard"
+            said = "a run is resumed as it was started: of other options only --dashboard is possible"
             raise typer.BadParameter(said, param_hint="--resume")
         found = resuming.find(resume)
         if dashboard:
@@ -138,7 +138,7 @@ def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> No
     try:
         page = _page()
     except ConfigError as error:  # the run has ended well: its exit code stays
-        typer.echo(f"the page does not stay: {error}", err=True)
+        typer.echo(f"the page can't be kept open: {error}", err=True)
         return
     if (found := page.page_of(experiment, started)) is not None:
         page.stay(ended.folder, *found)
@@ -217,7 +217,7 @@ def trace(
     require_no_errors(experiment, (), ())
     ended = running.run(experiment, running.RunOptions(runs=runs, speed=speed), terminal=sys.stdout)
     file = ended.folder / FILE
-    typer.echo(f"the trace: {file}" if file.exists() else "nothing was said to the controller: there is no trace")
+    typer.echo(f"the trace: {file}" if file.exists() else "no trace: nothing was sent to the controller")
     raise typer.Exit(ended.outcome.exit_code)
 
 

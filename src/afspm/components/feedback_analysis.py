@@ -34,7 +34,7 @@ class FeedbackAnalysis(FeedbackObserver):
     def __init__(self, flag_after: int = 2, clear_after: int = 1, **observed: Any) -> None:
         super().__init__(**observed)
         if flag_after < 1 or clear_after < 1:
-            raise ConfigError("`flag_after` and `clear_after` must be one at least")
+            raise ConfigError("`flag_after` and `clear_after` must be at least 1")
         self.flag_after, self.clear_after = flag_after, clear_after
         self._pairing = ChannelPairing(self.channel, self.height)
         self._feedback = Feedback()

@@ -60,7 +60,7 @@ class FeedbackSignal:
         except UnitError as wrong:
             raise InvalidValue(f"{height.channel} is not a height: {wrong.what}") from wrong
         if height_m.shape != error.shape:
-            raise InvalidValue(f"{height.channel} has not the pixels of {signal.channel}")
+            raise InvalidValue(f"{height.channel} and {signal.channel} differ in pixels")
         return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))
 
     def _gap_m(self, signal: Scan, setpoint: float | None) -> float:

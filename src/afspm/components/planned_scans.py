@@ -197,7 +197,7 @@ class ScanSeries(PlannedScans):
         super().__init__(**planned)
         self.beat_s = period(every)
         if scans is not None and duration is not None:
-            raise ConfigError("both `scans` and `duration` are given", hint="one of them says when to end")
+            raise ConfigError("both `scans` and `duration` are given", hint="give one of them")
         rounds = scans if duration is None else rounds_within(duration, every)
         if self.end_when_done and rounds is None:
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")

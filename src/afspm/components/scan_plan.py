@@ -48,9 +48,9 @@ class ScanPlan:
 
     def __post_init__(self) -> None:
         if not self.regions:
-            raise InvalidValue("a plan needs a region at least")
+            raise InvalidValue("a plan needs at least one region")
         if self.rounds is not None and self.rounds < 1:
-            raise InvalidValue(f"a plan is gone through once at least, not {self.rounds} times")
+            raise InvalidValue(f"a plan needs at least 1 round, not {self.rounds}")
 
     @property
     def total(self) -> int | None:
@@ -113,7 +113,7 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
     """
     columns, rows = counts
     if columns < 1 or rows < 1:
-        raise InvalidValue(f"a grid of {columns} x {rows} points has none")
+        raise InvalidValue(f"a grid of {columns} x {rows} points is empty")
     for count, step_m in zip(counts, spacing_m, strict=True):
         if count > 1 and not step_m > 0.0:
             raise InvalidValue(

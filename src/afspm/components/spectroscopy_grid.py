@@ -63,7 +63,7 @@ class SpectroscopyGrid(Component):
         if not self.positions:
             raise ConfigError("no position is listed", where="positions")
         if repeats < 1:
-            raise ConfigError(f"{repeats} repeats are none", where="repeats")
+            raise ConfigError(f"{repeats} is not at least 1", where="repeats")
         self.kind = kind
         self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else []))
         self.repeats = repeats

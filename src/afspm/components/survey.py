@@ -112,9 +112,9 @@ class Survey(Component):
         if targets is not None:
             for name, value in {"min_height": min_height, "separation": separation}.items():
                 if value is not None:
-                    raise ConfigError("is of particles, and says nothing of `targets`", where=name)
+                    raise ConfigError("applies to particles only, not to `targets`", where=name)
         if count < 1:
-            raise ConfigError(f"{count} targets are none", where="count")
+            raise ConfigError(f"{count} is not at least 1", where="count")
         for name, value in {"min_height": min_height, "separation": separation}.items():
             if value is not None and value < 0.0:
                 raise ConfigError(f"{lengths_text([value])} is below zero", where=name)

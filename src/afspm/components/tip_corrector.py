@@ -205,7 +205,7 @@ class TipCorrector(Component):
                     self.scope.clear(self.problem)
                     self._wait_flag(self.problem, flagged=False)
                 return tip_verdict.BAD if verdict.opinion is Opinion.BAD else tip_verdict.UNCLEAR
-        self.log.warning("a test scan that can't be judged: it is without the channels")
+        self.log.warning("the test scan can't be judged: it lacks the channels")
         return tip_verdict.UNCLEAR
 
     def _score_of_others(self, scans: ScanSet, answers: Events) -> float:

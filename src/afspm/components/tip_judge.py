@@ -205,7 +205,7 @@ class TipJudge:
 
     def __init__(self, reference_scans: int, tolerance: TipTolerance | None = None) -> None:
         if reference_scans < 2:
-            raise ConfigError(f"{reference_scans} reference scans have no spread", hint="2 at least", where="tip")
+            raise ConfigError(f"{reference_scans} reference scans give no spread", hint="at least 2", where="tip")
         self.reference_scans = reference_scans
         self.tolerance = tolerance or TipTolerance()
         self._state = JudgeState()
@@ -350,7 +350,7 @@ class VerdictCounter:
 
     def __init__(self, flag_after: int, clear_after: int) -> None:
         if flag_after < 1 or clear_after < 1:
-            raise ConfigError("it takes one scan at least to flag or to clear")
+            raise ConfigError("`flag_after` and `clear_after` must be at least 1")
         self.flag_after, self.clear_after = flag_after, clear_after
         self.bad = self.good = 0
 

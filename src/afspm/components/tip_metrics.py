@@ -74,9 +74,11 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
         InvalidValue: too few pixels, too many holes, or different shapes.
     """
     if min(trace.shape) < FEWEST_PIXELS:
-        raise InvalidValue(f"a scan of {trace.shape} pixels is too small to tell", hint=f"{FEWEST_PIXELS} at least")
+        raise InvalidValue(
+            f"a scan of {trace.shape} pixels is too small to judge the tip", hint=f"at least {FEWEST_PIXELS}"
+        )
     if retrace is not None and retrace.shape != trace.shape:
-        raise InvalidValue(f"trace {trace.shape} and retrace {retrace.shape} don't belong together")
+        raise InvalidValue(f"trace {trace.shape} and retrace {retrace.shape} differ in shape")
     level = _levelled(trace)
     if retrace is None:
         return Slopes(_clipped(np.diff(level, axis=1)), None, None)

@@ -49,7 +49,7 @@ def treatments(
         ConfigError: no treatment is listed, or a value is invalid.
     """
     if not pulse_voltages_v and not crash_depths_m:
-        raise ConfigError("nothing is allowed to be done", hint="list `pulse_voltages`, `crash_depths` or both")
+        raise ConfigError("no treatment is allowed", hint="list `pulse_voltages`, `crash_depths` or both")
     if any(v == 0.0 for v in pulse_voltages_v) or (pulse_voltages_v and pulse_duration_s <= 0.0):
         raise ConfigError("a pulse needs a voltage and a duration", where="pulse_voltages")
     if any(depth <= 0.0 for depth in crash_depths_m) or (crash_depths_m and crash_speed_m_per_s <= 0.0):

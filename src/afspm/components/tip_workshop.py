@@ -56,7 +56,7 @@ class TipWorkshop:
         places = int(self._memory.get("places", 0))
         self._memory["tried"], self._memory["places"] = number, places + 1
         if not self._memory.save():
-            raise FileError("the disk is full: after a restart the treatment would be done again")
+            raise FileError("the disk is full: after a restart the treatment would be repeated")
         return fresh_place(self._center, self._spacing, places)
 
     def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:

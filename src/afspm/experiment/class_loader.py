@@ -165,7 +165,9 @@ def _hidden(module: ModuleType) -> str:
         file = Path(folder, f"{module.__name__}.py")
         if file.exists():
             own = getattr(module, "__file__", None)
-            return "" if own and file.samefile(own) else f"another module is called so: give {file.name} another name"
+            return (
+                "" if own and file.samefile(own) else f"Python imported another module of this name: rename {file.name}"
+            )
     return ""
 
 

@@ -209,4 +209,4 @@ class VariableReferences:
         start = ring.index(min(ring))
         ring = ring[start:] + ring[:start]
         what = " -> ".join((*ring, ring[0]))
-        self._document.error(f"the references go in a circle: {what}", ring[0])
+        self._document.error(f"references form a cycle: {what}", ring[0])

@@ -146,7 +146,7 @@ def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
     if shift is None:
         return f"all of it is larger than the region allowed, {lengths_text(allowed.size_m, ' x ')}"
     x, y = (lengths_text([value]) for value in shift)
-    return f"moved by ({x}, {y}) all of it fits"
+    return f"it fits if moved by ({x}, {y})"
 
 
 def _nearest_text(region: Region, allowed: Region | None) -> str:

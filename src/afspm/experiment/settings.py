@@ -53,7 +53,7 @@ def check(
         if name in parameters:
             annotation = kinds.get(name, Any)
             if name not in kinds and _is_quantity(value):
-                what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is"
+                what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument has no annotation with a unit"
                 hint = f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.basics.units"
                 document.warning(what, *path, name, hint=hint)
             errors = document.findings.errors
@@ -76,7 +76,7 @@ def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
-    return f"the class is that of {of_class}: what only another class has belongs into a file laid over for that one"
+    return f"the class is set in {of_class}: move settings of the replaced class into an overlay for that class"
 
 
 def default_of(component: type, name: str) -> Any:

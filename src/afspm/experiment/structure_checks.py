@@ -69,7 +69,7 @@ def check_roles(resolved: ResolvedExperiment) -> None:
     for name in resolved.processes:
         other = seen.setdefault(name.casefold(), name)
         if other != name:
-            what = f"[{name}] and [{other}] are the same name but for upper and lower case"
+            what = f"[{name}] and [{other}] differ only in upper and lower case"
             resolved.document.error(what, name, hint="their files would be the same on some computers")
 
 
@@ -265,7 +265,7 @@ def check_clock(resolved: ResolvedExperiment) -> None:
     if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
         return
     if (speed := resolved.sections.clock.speed) != 1.0:
-        hint = "time can't be made faster there: leave it out, or set it to 1 in the file for this microscope"
+        hint = "a real microscope has real time: remove it, or set it to 1 in the file for this microscope"
         what = f"[clock] speed = {speed:g} on a microscope that is not simulated"
         resolved.document.error(what, "clock", "speed", hint=hint)
     if "start" in resolved.parts.sections.get("clock", {}):
@@ -289,7 +289,7 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
                 hint = f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]"
                 resolved.document.warning(what, *path, hint=hint)
     if any_role and security.insecure:
-        hint = "leave [security] insecure away, or make keys with `afspm keys` and set [security] keys"
+        hint = "remove [security] insecure, or make keys with `afspm keys` and set [security] keys"
         what = "[control.roles] without keys: any program that takes the name has the role"
         resolved.document.warning(what, "control", "roles", hint=hint)
     for name in resolved.declaring(OPENS_PLAIN):
@@ -359,7 +359,7 @@ def check_handlers(resolved: ResolvedExperiment) -> None:
             wanted = _handler_arguments(name)
             if wrong := _wrong_signature(method, wanted):
                 hint = f"write `def {name}({', '.join(wanted)})`"
-                resolved.document.error(f"{shown} can't be called as it will be: {wrong}", *path, hint=hint)
+                resolved.document.error(f"{shown} can't be called with its arguments: {wrong}", *path, hint=hint)
 
 
 def _handlers_of(component: type[Component]) -> Iterator[tuple[str, Callable[..., object]]]:
@@ -377,7 +377,7 @@ def _hint_on_handler(name: str, resolved: ResolvedExperiment) -> str:
     near = closest(name, valid, _HANDLER_CUTOFF)
     if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
         return ""
-    return f"did you mean {near!r}?" if near else "on_scan, on_state, …; of a message of your own after its name"
+    return f"did you mean {near!r}?" if near else "on_scan, on_state, …; for a message of your own, named after it"
 
 
 def _handler_arguments(name: str) -> list[str]:
@@ -387,7 +387,7 @@ def _handler_arguments(name: str) -> list[str]:
 
 def _wrong_signature(method: Callable[..., object], arguments: list[str]) -> str:
     if inspect.iscoroutinefunction(method) or inspect.isgeneratorfunction(method):
-        return "calling it does nothing yet, since it is async or has a yield"
+        return "an async function or a generator does nothing when called"
     try:
         inspect.signature(method).bind(*arguments)
     except TypeError as error:

@@ -86,7 +86,7 @@ def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
         try:
             own = keys.load(folder, name)
             if name in own.peers.values() and own.public not in own.peers:
-                what, hint = "is not the public part of the secret key here", "make both anew, or copy the right one"
+                what, hint = "is not the public part of the secret key here", "make both again, or copy the right one"
                 yield Diagnosis("key-pair", Severity.ERROR, str(folder / "public" / f"{name}.key"), what, hint)
                 wrong = True
         except AfspmError as error:

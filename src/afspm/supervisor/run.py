@@ -244,7 +244,7 @@ def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
     if speed is not None and not experiment.resolved.simulated:
-        raise ConfigError("a real microscope has real time", where="--speed", hint="leave --speed away")
+        raise ConfigError("a real microscope has real time", where="--speed", hint="omit --speed")
     if speed is not None:
         clock = replace(clock, speed=speed)
     return RunIdentity(clock, run_identity.new_identity(), simulated)

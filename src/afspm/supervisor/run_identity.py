@@ -80,7 +80,7 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
 
 def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
     if not response.ok:
-        raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
+        raise ConfigError(f"the scheduler does not answer with its time: {response.reason}", where=where)
     try:
         told = json.loads(response.payload)
         run, simulated = str(told.pop("run", "")), told.pop("simulated", False) is True

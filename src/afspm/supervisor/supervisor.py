@@ -273,6 +273,6 @@ class ClockCheck:
         self._is_done = True
         way = "ahead of" if ahead_s > 0.0 else "behind"
         return (
-            f"the computer's clock is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the "
+            f"the computer's clock is {duration_text(abs(ahead_s))} {way} the run's clock: it was set, or the "
             "computer slept; the record keeps the run's own time"
         )

@@ -138,9 +138,9 @@ def test_user_function_finds_the_targets(ran: Any) -> None:
 
 
 def test_invalid_survey_settings_are_refused() -> None:
-    with pytest.raises(ConfigError, match="0 targets are none"):
+    with pytest.raises(ConfigError, match="0 is not at least 1"):
         survey(count=0)
-    with pytest.raises(ConfigError, match="says nothing of `targets`"):
+    with pytest.raises(ConfigError, match="applies to particles only"):
         survey(targets="my.function", min_height=1e-9)
     with pytest.raises(ConfigError, match="lies outside its zoom"):
         survey(curves={"beside": 300e-9})

@@ -60,4 +60,4 @@ def test_async_or_generator_handler_is_an_error(tmp_path: Path, old: str, new: s
     (tmp_path / "mine.py").write_text(COMPONENT.format(method="on_scan(self, scan)").replace(old, new, 1))
     (tmp_path / "experiment.toml").write_text(FRAME + TABLE)
     (error,) = load(tmp_path / "experiment.toml").check()
-    assert "async or has a yield" in error.what
+    assert "async function or a generator" in error.what

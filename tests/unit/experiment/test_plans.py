@@ -118,7 +118,7 @@ def test_a_tip_is_treated_within_the_limits(write: Write) -> None:
     corrector = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["3 um", "0 um"]\n'
     error = only_error(write(corrector + REGION, frame=SIMULATED))
     assert "[repair] plans what its limits refuse: the probe position" in error.what
-    assert error.hint == "moved by (-1 µm, 0 nm) all of it fits"
+    assert error.hint == "it fits if moved by (-1 µm, 0 nm)"
 
 
 def test_initial_values_are_checked_against_the_limits(write: Write) -> None:
@@ -177,7 +177,7 @@ def test_the_cure_of_a_scan_outside_is_the_nearest_region_that_fits(
 
 def test_the_cure_of_a_grid_outside_is_how_far_it_moves(write: Write) -> None:
     (error,) = {finding.hint for finding in errors(write(GRID + 'center = ["1 um", "0 um"]\n' + REGION))}
-    assert error == "moved by (-500 nm, 0 nm) all of it fits"
+    assert error == "it fits if moved by (-500 nm, 0 nm)"
     (error,) = {finding.hint for finding in errors(write(GRID.replace("[3,", "[5,") + REGION))}
     assert error == "all of it is larger than the region allowed, 4 x 4 µm"
 

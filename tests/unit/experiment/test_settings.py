@@ -168,7 +168,7 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
         ("broken.X", "SyntaxError", ""),
         ("raising.X", "ZeroDivisionError", ""),
         ("needing.X", "needs 'not_there_at_all'", "install"),
-        ("time.X", "time has no 'X'", "give time.py another name"),
+        ("time.X", "time has no 'X'", "rename time.py"),
         ("leaving.X", "SystemExit: 3 (leaving.py:2)", ""),
         ("afspm.components.planned_scans.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
     ],
