@@ -110,7 +110,7 @@ def run(
         as_begun = found.options(options)
         require_no_errors(found.experiment, as_begun.only, as_begun.without)
         ended = resuming.resume(found, options, terminal=sys.stdout)
-        _stay(found.experiment, ended, stay)
+        _keep_page(found.experiment, ended, stay)
         raise typer.Exit(ended.outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
@@ -118,16 +118,16 @@ def run(
     require_no_errors(experiment, options.only, options.without)
     if dry_run:
         for start in running.dry_run(experiment, options):
-            typer.echo(_told(start))
+            typer.echo(_described(start))
         return
     if ask:
         options = replace(options, metadata=ask_metadata(experiment))
     ended = running.run(experiment, options, terminal=sys.stdout)
-    _stay(experiment, ended, stay)
+    _keep_page(experiment, ended, stay)
     raise typer.Exit(ended.outcome.exit_code)
 
 
-def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:
+def _keep_page(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:
     import sys
 
     from afspm.supervisor.supervision.run_end import EndReason
@@ -151,7 +151,7 @@ def _page() -> RunPage:
     return page
 
 
-def _told(start: ProcessStart) -> str:
+def _described(start: ProcessStart) -> str:
     what = " ".join(start.command) or start.launch.class_
     return f"{start.launch.name} ({start.role.value}): {what}"
 

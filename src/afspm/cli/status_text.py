@@ -185,10 +185,12 @@ class StatusText:
                 yield line.append(f" for {gone}: its supervisor is gone, or can't be reached")
             elif state.condition not in WELL:
                 condition = state.condition.name.lower().replace("_", " ")
-                line.append(condition, "bold red" if state.condition in BAD else "yellow").append(self._lately(state))
+                line.append(condition, "bold red" if state.condition in BAD else "yellow").append(
+                    self._changed_since(state)
+                )
                 yield line.append(f" ({state.last_exit})" if state.last_exit else "")
 
-    def _lately(self, state: ProcessState) -> str:
+    def _changed_since(self, state: ProcessState) -> str:
         if state.condition is ProcessCondition.ENDED:
             return f" {duration_text((self._now_ns - state.since_ns) / NS_PER_S)} ago"
         return self._since(state.since_ns)

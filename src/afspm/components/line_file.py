@@ -60,7 +60,7 @@ class LineFile:
         try:
             if not self._is_open:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                header = self._mended()
+                header = self._repair()
                 _append(self.path, header)
                 self._is_open = True
             _append(self.path, self._waiting)
@@ -68,7 +68,7 @@ class LineFile:
             raise FileError(f"can't be written: {error}", where=str(self.path)) from error
         self._waiting = ""
 
-    def _mended(self) -> str:
+    def _repair(self) -> str:
         # a kill leaves half a line at the end, which is cut off; an empty file gets its header
         if not self.path.exists():
             return f"{self._header}\n" if self._header else ""

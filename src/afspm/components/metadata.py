@@ -45,7 +45,7 @@ class Metadata(Component):
 
     def on_start(self) -> None:
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
-        self._written = {_identity(dict(zip(COLUMNS, row, strict=False))) for row in csv.reader(self._table.lines())}
+        self._written = {_row_key(dict(zip(COLUMNS, row, strict=False))) for row in csv.reader(self._table.lines())}
 
     def on_control(self, control_state: ControlState) -> None:
         self._control = control_state
@@ -108,11 +108,11 @@ class Metadata(Component):
             "filename": measured.filename,
             "length_units": "m",
         } | columns
-        if _identity(row) not in self._written:
+        if _row_key(row) not in self._written:
             self._append(row | self._conditions(what, measured.time_ns))
 
     def _append(self, row: dict[str, str]) -> None:
-        if (identity := _identity(row)) in self._written:
+        if (identity := _row_key(row)) in self._written:
             return  # replayed after a restart
         self._table.append([csv_line(row.get(column, "") for column in COLUMNS)])
         self._written.add(identity)
@@ -130,7 +130,7 @@ class Metadata(Component):
         return conditions
 
 
-def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
+def _row_key(row: Mapping[str, str]) -> tuple[str, ...]:
     # no two rows share these cells; rows of older versions have no note
     return tuple(
         row.get(column, "").replace("\n", " ") for column in ("time", "measurement", "filename", "channel", "note")

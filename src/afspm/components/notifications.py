@@ -156,12 +156,12 @@ def _post(url: str, notice: Notification) -> None:
         error.close()
         raise NotDelivered(f"{host} answers {error.code}") from None
     except URLError as error:
-        raise NotDelivered(f"{host} can't be reached: {_short(error.reason)}") from None
+        raise NotDelivered(f"{host} can't be reached: {_reason_without_secret(error.reason)}") from None
     except (OSError, HTTPException, ValueError) as error:
-        raise NotDelivered(f"{host} can't be reached: {_short(error)}") from None
+        raise NotDelivered(f"{host} can't be reached: {_reason_without_secret(error)}") from None
 
 
-def _short(reason: object) -> str:
+def _reason_without_secret(reason: object) -> str:
     # the text of the error may hold the address of the webhook, which is a secret
     if isinstance(reason, OSError):
         return reason.strerror or type(reason).__name__

@@ -88,7 +88,7 @@ class Notifier(Component):
         for state in states.processes:
             if state.condition is ProcessCondition.GIVEN_UP:
                 how = f": {state.last_exit}" if state.last_exit else ""
-                self._tell(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
+                self._queue_once(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
 
     def on_log_lines(self, lines: LogLines) -> None:
         first: dict[str, str] = {}  # first CRITICAL line of each process; later ones belong to it
@@ -96,7 +96,7 @@ class Notifier(Component):
             if line.level == "CRITICAL" and line.name not in (LOGGED_AS, self.name):
                 first.setdefault(line.name, line.text)
         for name, text in first.items():
-            self._tell(CRITICAL, f"{name} {text}", f"{name}: {text}")
+            self._queue_once(CRITICAL, f"{name} {text}", f"{name}: {text}")
 
     def on_tick(self) -> None:
         now_ns = self.clock.now_ns()
@@ -104,14 +104,14 @@ class Notifier(Component):
             if now_ns - since_ns >= self.unsolved_after * 1e9:
                 name, since = self.scope.problems.name(int(number)), duration_text((now_ns - since_ns) * 1e-9)
                 text = f"{name} has been flagged for {since}, and is not solved"
-                self._tell(UNSOLVED, f"{number} {since_ns}", text)
+                self._queue_once(UNSOLVED, f"{number} {since_ns}", text)
         self._deliver_what_is_due()
 
     def on_end(self) -> None:
         for waiting in self.memory["waiting"][-LAST_TRIES:]:
             self._try(waiting)
 
-    def _tell(self, what: str, which: str, text: str) -> None:
+    def _queue_once(self, what: str, which: str, text: str) -> None:
         key = f"{what} {which}"
         if what not in self.on or key in self.memory["told"]:
             return

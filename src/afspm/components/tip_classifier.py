@@ -94,10 +94,10 @@ class TipClassifier(Component):
             self.log.warning("%s is not a height: %s", pair.trace.channel, error)
             return
         self.counter.count(verdict.opinion)
-        self._tell(pair.trace, verdict)
+        self._announce(pair.trace, verdict)
         self._remember(pair.trace)
 
-    def _tell(self, scan: Scan, verdict: Verdict) -> None:
+    def _announce(self, scan: Scan, verdict: Verdict) -> None:
         # A solver needs the verdict to know where the fault is, and must find no flag after a good one:
         # so flag after a bad verdict, clear before a good one.
         self.log.info("%s: %s (%s)", _name(scan), verdict.opinion.value, verdict.why)

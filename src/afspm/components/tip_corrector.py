@@ -103,7 +103,7 @@ class TipCorrector(Component):
             self.judge.restore(self.memory["judge"])
         frames: dict[int | None, Frame] = {}
         with self.scope.events("ControlState", "Scan2d", tip_verdict.MESSAGE) as events:
-            self._look()
+            self._repair_if_flagged()
             problems = self.scope.control_state.problems
             for event in events:
                 if isinstance(event.message, Scan):
@@ -115,7 +115,7 @@ class TipCorrector(Component):
                     self._note(read_verdict(event.message), frames)
                 else:
                     problems = event.message.problems  # the flags when the scans after it were taken
-                    self._look()
+                    self._repair_if_flagged()
 
     def _note(self, verdict: tuple[int, float] | None, frames: Mapping[int | None, Frame]) -> None:
         if verdict is None or verdict[1] == tip_verdict.UNCLEAR or "region" in self.memory:
@@ -123,7 +123,7 @@ class TipCorrector(Component):
         self.memory["judged_bad"] = frames.get(verdict[0]) if verdict[1] == tip_verdict.BAD else None
         self.memory.save()
 
-    def _look(self) -> None:
+    def _repair_if_flagged(self) -> None:
         if self.memory.get("given_up"):
             if self.scope.is_flagged(self.problem) and self.scope.is_flagged(Problem.DEVICE_MALFUNCTION):
                 return

@@ -249,7 +249,7 @@ class TipJudge:
             seen_slopes = slopes(trace, retrace)
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
-        kind = self._kind(region, shape)
+        kind = self._reference_for(region, shape)
         place = kind.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
         seen = metrics(seen_slopes, correlation, place.expected if place else None)
@@ -275,7 +275,7 @@ class TipJudge:
     def _is_known(self, kind: TipReference) -> bool:
         return len(kind.first) >= self.reference_scans
 
-    def _kind(self, region: Region, shape: tuple[int, int]) -> TipReference:
+    def _reference_for(self, region: Region, shape: tuple[int, int]) -> TipReference:
         kinds = self._state.kinds
         kind = next((one for one in kinds if one.fits(region, shape)), None)
         if kind is not None:

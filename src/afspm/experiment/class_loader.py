@@ -123,7 +123,7 @@ def load(path: str) -> Any:
     except ModuleNotFoundError as error:
         raise _no_module(module_name, error) from error
     except (Exception, SystemExit) as error:  # the user's module may do anything when imported, even exit
-        raise Unloadable(f"importing {module_name} fails: {_where(error)}") from error
+        raise Unloadable(f"importing {module_name} fails: {_error_line(error)}") from error
     return _attribute(module, name)
 
 
@@ -151,15 +151,15 @@ def _attribute(module: ModuleType, name: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        hint = _hidden(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
+        hint = _shadowing_hint(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
         raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
     except ModuleNotFoundError as error:
         raise _no_module(f"{module.__name__}.{name}", error) from error
     except (Exception, SystemExit) as error:  # a lazy import may run the user's code, too
-        raise Unloadable(f"importing {name} fails: {_where(error)}") from error
+        raise Unloadable(f"importing {name} fails: {_error_line(error)}") from error
 
 
-def _hidden(module: ModuleType) -> str:
+def _shadowing_hint(module: ModuleType) -> str:
     # Python imported another module of this name instead of the user's file.
     for folder in sys.path:
         file = Path(folder, f"{module.__name__}.py")
@@ -200,7 +200,7 @@ def _search_paths(parent: str) -> list[str]:
     return list(spec.submodule_search_locations or ()) if spec else []
 
 
-def _where(error: BaseException) -> str:
+def _error_line(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     said = str(error)

@@ -98,12 +98,12 @@ def _parse(text: str, file: Path, findings: Findings) -> Settings | None:
             findings.error(f"[{name}] is there twice", SourceLocation(str(file), line), "two components need two names")
         else:
             written = dict(enumerate(text.splitlines(), 1)).get(line, "")
-            findings.error(f"not valid TOML: {what}", SourceLocation(str(file), line), _habit(what, written))
+            findings.error(f"not valid TOML: {what}", SourceLocation(str(file), line), _syntax_hint(what, written))
         return None
 
 
 # the parser's complaint, the form of the line, and the remedy: habits from Python, YAML, JSON and Windows
-_HABITS = (
+_SYNTAX_HINTS = (
     ("Cannot overwrite", r"", "this key is there already"),
     ("Illegal character '\\n'", r"", "the quote that ends the text is missing"),
     ("", r"=\s*(True|False)\b", "true and false are written in lower case"),
@@ -117,8 +117,8 @@ _HABITS = (
 )
 
 
-def _habit(what: str, written: str) -> str:
-    return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
+def _syntax_hint(what: str, written: str) -> str:
+    return next((hint for said, line, hint in _SYNTAX_HINTS if what.startswith(said) and re.search(line, written)), "")
 
 
 def _lay_over(document: Document, data: Settings, where: dict[toml_lines.Path, SourceLocation]) -> None:

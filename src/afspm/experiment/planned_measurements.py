@@ -124,7 +124,7 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))
     guard = LimitChecker(_without_changes(limits))
-    cure = _cure(planned, limits.region)
+    cure = _remedy(planned, limits.region)
     for number, region in enumerate(planned.regions):
         wanted, where = ScanParameters(region, planned.shape), ("regions", number)
         if planned.is_listed:
@@ -136,7 +136,7 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
     return list(found.values())
 
 
-def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
+def _remedy(planned: PlannedMeasurements, allowed: Region | None) -> str:
     points = [point for region in planned.regions for point in region.corners_m()] + list(planned.positions)
     if allowed is None or not points:
         return ""

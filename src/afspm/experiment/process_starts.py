@@ -191,30 +191,33 @@ def _start(
         simulated=resolved.simulated_with(chosen),
         controller=resolved.controller_of(name, chosen) if role is Role.TRANSLATOR else "",
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
-        retracts=role is Role.TRANSLATOR and _retracts(resolved),
+        retracts=role is Role.TRANSLATOR and _retracts_when_released(resolved),
         adjustable=control.adjustable if role is Role.TRANSLATOR else (),
     )
     if command[:1] == ("python",):  # the running interpreter
         command = (sys.executable, *command[1:])
     folders = resolved.document.folders
     beats = process.part.own.get("heartbeats") is not False
-    hidden, is_last = _hidden(resolved, process), process.declares(RECORDS)
+    hidden, is_last = _hidden_variables(resolved, process), process.declares(RECORDS)
     acts = role is Role.COMPONENT and process.acts
     return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, acts, hidden)
 
 
-def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
+def _hidden_variables(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
     # environment variables with secrets of other processes
-    every = {DASHBOARD_PASSWORD, *_variable(resolved.sections.notify.webhook)}
+    every = {DASHBOARD_PASSWORD, *_variable_name(resolved.sections.notify.webhook)}
     every.update(*map(_secrets, resolved.processes.values()))
     return tuple(sorted(every - _secrets(process)))
 
 
 def _secrets(process: ResolvedProcess) -> set[str]:
-    return {*_variable(process.settings.get(SECRET)), *([DASHBOARD_PASSWORD] if process.declares("operates") else [])}
+    return {
+        *_variable_name(process.settings.get(SECRET)),
+        *([DASHBOARD_PASSWORD] if process.declares("operates") else []),
+    }
 
 
-def _variable(secret: object) -> list[str]:
+def _variable_name(secret: object) -> list[str]:
     return [secret[1:]] if isinstance(secret, str) and secret.startswith("$") else []
 
 
@@ -268,7 +271,7 @@ def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str
     return tuple(sorted({problem for process in solvers for problem in process.declared.solves}))
 
 
-def _retracts(resolved: ResolvedExperiment) -> bool:
+def _retracts_when_released(resolved: ResolvedExperiment) -> bool:
     # a tip without feedback drifts into the sample: it is retracted once no component is in control
     watchdog = resolved.sections.control.watchdog()
     return watchdog.retract is not None and FEEDBACK_OFF in watchdog.dangerous

@@ -134,7 +134,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         if process.component is None:
             continue
         if process.wrong is not None:
-            _look_inside(process, process.component, resolved)
+            _report_errors_inside(process, process.component, resolved)
         else:
             _resolve_plan(process, process.component, resolved, has)
     speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
@@ -168,7 +168,7 @@ def _check_cache_mapping(name: str, document: Document) -> None:
             return
 
 
-def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
+def _report_errors_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
     # Some settings are wrong already, so the component can't be made properly; its errors count only within
     # tables that were sound, since settings that contradict each other may agree once the others are corrected.
     sound = process.settings.keys() - (process.wrong or ())

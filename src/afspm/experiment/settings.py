@@ -64,14 +64,14 @@ def check(
             checked[name] = jsonable(value, document.folder_of(*path, name))
         else:
             unknown.append(name)
-            replaced = "" if closest(name, parameters) else _replaced(path, name, document)
+            replaced = "" if closest(name, parameters) else _replaced_class_hint(path, name, document)
             what = f"[{'.'.join(path)}] has no setting {name!r}"
             document.error(what, *path, name, hint=replaced or nearest(name, parameters))
     _report_missing(parameters, settings, unknown, path, document)
     return checked
 
 
-def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
+def _replaced_class_hint(path: tuple[str, ...], name: str, document: Document) -> str:
     # a later file that changes the class alone leaves behind settings that only the earlier class had
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
@@ -118,7 +118,7 @@ def jsonable(value: Any, folder: Path) -> Any:
 def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document) -> object:
     folder = document.folder_of(*path)
     if _is_object(value):
-        return _object(value, path, document)
+        return _user_intermediary(value, path, document)
     if isinstance(value, list) and any(map(_is_object, value)):
         return [_value(Any, item, path, document) for item in value]
     if annotation is bool:
@@ -134,7 +134,7 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         return jsonable(value, folder)
 
 
-def _object(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
+def _user_intermediary(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
     # an intermediary class of the user's is checked here, and made in its process
     settings = {key: item for key, item in value.items() if key != "class"}
     try:

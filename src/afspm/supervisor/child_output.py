@@ -91,7 +91,7 @@ class ChildOutput:
     """
 
     def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[OutputLine | OutputDropped], None]) -> None:
-        self._name, self._pid, self._stream, self._tell = name, pid, stream, tell
+        self._name, self._pid, self._stream, self._report = name, pid, stream, tell
         self._clock = ExperimentClock.real()
         self._thinning = OutputLimit(self._clock.monotonic_s())
         self._lock = threading.Lock()
@@ -118,10 +118,10 @@ class ChildOutput:
         with self._lock:
             left_out, last = self._thinning.go_on()
             if left_out:
-                self._tell(OutputDropped(self._name, left_out))
+                self._report(OutputDropped(self._name, left_out))
             for line in last:
                 self._tell_line(line)
 
     def _tell_line(self, line: bytes) -> None:
         text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-        self._tell(OutputLine(self._name, self._pid, self._stream, text))
+        self._report(OutputLine(self._name, self._pid, self._stream, text))

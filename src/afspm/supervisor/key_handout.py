@@ -58,24 +58,26 @@ def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHand
         ConfigError: a key of the file is missing, or readable for other users.
     """
     if experiment.keys_folder is not None:
-        return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
+        return KeyHandout(
+            [_with_keys(start, _keys_of_file(experiment, start), _scheduler(experiment)) for start in starts]
+        )
     security = experiment.resolved.sections.security
     encrypted = {} if security.insecure else _encrypted(experiment, starts)
-    return _made(starts, encrypted, _scheduler(experiment)) if encrypted else KeyHandout(starts)
+    return _with_new_keys(starts, encrypted, _scheduler(experiment)) if encrypted else KeyHandout(starts)
 
 
 def _scheduler(experiment: Experiment) -> str:
     return next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "")
 
 
-def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
+def _with_keys(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
     # a translator obeys the scheduler of this name alone
     if own is None:
         return start
     return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
 
 
-def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
+def _keys_of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
     # a Python process that binds nothing needs the public keys of its servers alone
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
@@ -115,7 +117,7 @@ def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[s
     return found
 
 
-def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], scheduler: str) -> KeyHandout:
+def _with_new_keys(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], scheduler: str) -> KeyHandout:
     pairs = {name: keys.pair() for name in [*(start.launch.name for start in starts), SUPERVISOR, GUEST]}
     public = {name: pair[0] for name, pair in pairs.items()}
 
@@ -137,7 +139,9 @@ def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], schedule
         return [scheduler, *(launch.name for launch in found)]
 
     handed = [
-        _with(start, of(start.launch.name, start.launch.sockets, start.role, foreign=bool(start.command)), scheduler)
+        _with_keys(
+            start, of(start.launch.name, start.launch.sockets, start.role, foreign=bool(start.command)), scheduler
+        )
         for start in starts
     ]
     asked = tuple(address for address, owner in encrypted.items() if owner == scheduler)

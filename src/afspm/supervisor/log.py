@@ -74,7 +74,7 @@ class RunLog:
         level: int = logging.INFO,
         names: Iterable[str] = (),
     ) -> None:
-        self._file = _Shown(*_into(file))
+        self._file = _Shown(*_writer_to(file))
         self._clock = clock
         self._wall = ExperimentClock.real()
         self._level = level
@@ -167,7 +167,7 @@ class _Shown:
             return self._lines.popleft() if self._lines else None
 
 
-def _into(path: Path) -> tuple[Show, Callable[[], None]]:
+def _writer_to(path: Path) -> tuple[Show, Callable[[], None]]:
     file = path.open("a", encoding="utf-8", errors="replace")
     SYNCER.folder_soon(path.parent)
 

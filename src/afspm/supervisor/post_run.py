@@ -84,7 +84,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:
-        told += run_bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
+        told += run_bounded(lambda: _counts_of_record(folder) or _counts_of_table(folder / TABLE), COUNTED_WITHIN_S)
     except DiskTimeout as error:
         told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
@@ -93,7 +93,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
     return told
 
 
-def _recorded(folder: Path) -> list[str]:
+def _counts_of_record(folder: Path) -> list[str]:
     try:
         with open_run(folder) as run:
             whole = sum(not row.interrupted for row in run.scans)
@@ -103,7 +103,7 @@ def _recorded(folder: Path) -> list[str]:
     return [_measured(whole, spectra) + (f"; {interrupted} interrupted" if interrupted else "")]
 
 
-def _tabled(table: Path) -> list[str]:
+def _counts_of_table(table: Path) -> list[str]:
     # the table has a row a channel; the channels of one scan count as one scan
     try:
         with table.open(encoding="utf-8", newline="") as file:

@@ -112,7 +112,7 @@ class ChildProcess:
     ) -> None:
         self.name = name = task.name
         self._may_begin = may_begin
-        self._tell = tell
+        self._report = tell
         ours = {key: value for key, value in os.environ.items() if key not in task.hidden}
         try:
             self._popen = _start(task.command, {**ours, **task.environment}, task.folder)
@@ -160,7 +160,7 @@ class ChildProcess:
         for reader in readers:
             reader.join(LAST_WORDS_S)
         self.close_stdin()
-        self._tell(Exited(self.name, self.pid, code))
+        self._report(Exited(self.name, self.pid, code))
 
     def _reader(self, stream: Stream, pipe: IO[bytes] | None) -> threading.Thread:
         thread = threading.Thread(target=self._read, args=(stream, pipe), name=f"{self.name}-{stream}", daemon=True)
@@ -169,7 +169,7 @@ class ChildProcess:
 
     def _read(self, stream: Stream, pipe: IO[bytes] | None) -> None:
         assert pipe is not None
-        output = ChildOutput(self.name, self.pid, stream, self._tell)
+        output = ChildOutput(self.name, self.pid, stream, self._report)
         with contextlib.suppress(OSError, ValueError), pipe:
             while line := pipe.readline(LONGEST_LINE):
                 output.take(line)

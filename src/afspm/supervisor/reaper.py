@@ -47,11 +47,11 @@ class Reaper:
 
     def watch(self, pid: int, *, has_tip: bool) -> None:
         """Register a process group to kill after the supervisor's end; later if it may have a tip to retract."""
-        self._tell(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
+        self._send(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
 
     def forget(self, pid: int) -> None:
         """Unregister an ended process group: the system may reuse its number."""
-        self._tell(f"{pid} 0")
+        self._send(f"{pid} 0")
 
     def close(self) -> None:
         """Close the reaper's input: it kills the groups still registered."""
@@ -61,7 +61,7 @@ class Reaper:
             with contextlib.suppress(subprocess.TimeoutExpired):  # a process can't be killed
                 self._popen.wait(CLOSED_WITHIN_S)
 
-    def _tell(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         if self._popen is not None and self._popen.stdin is not None:
             with contextlib.suppress(OSError, ValueError):
                 self._popen.stdin.write(line.encode() + b"\n")

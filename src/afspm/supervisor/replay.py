@@ -106,11 +106,11 @@ def _clock(run: Run, speed: float | None, first_ns: int) -> ExperimentClock:
 
 def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
     ports = FreePorts()
-    said = _said(run)
+    said = _addresses_of_file(run)
     return options.publish or said[0] or ports.address(), options.serve or said[1] or ports.address()
 
 
-def _said(run: Run) -> tuple[str | None, str | None]:
+def _addresses_of_file(run: Run) -> tuple[str | None, str | None]:
     try:
         tables = [table for table in run.experiment.values() if isinstance(table, dict)]
     except (FileError, tomllib.TOMLDecodeError):

@@ -315,7 +315,7 @@ def reporter_of(
         launch = launch and replace(launch, run=run)
         here = f"{here}-{os.getpid()}"  # several parts may run on one computer
     else:
-        launch = _local(scheduler)
+        launch = _local_launch(scheduler)
     if launch is None:
         return None
     return Reporter(replace(launch, name=f"{SUPERVISOR}:{here}", keys=keys or launch.keys), clock, here)
@@ -326,7 +326,7 @@ def computer_name() -> str:
     return re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST_COMPUTER_NAME] or "computer"
 
 
-def _local(scheduler: ProcessStart) -> Launch | None:
+def _local_launch(scheduler: ProcessStart) -> Launch | None:
     launch = scheduler.launch
     if scheduler.command or launch.sockets.serve is None:
         return None

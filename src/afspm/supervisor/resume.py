@@ -104,7 +104,9 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
     with lock_run(folder):
         _wait_until_gone(facts, folder)
         starts = running.dry_run(experiment, options)
-        common = running.common_identity(experiment, starts, _own(experiment, options, found), options, terminal)
+        common = running.common_identity(
+            experiment, starts, _resumed_identity(experiment, options, found), options, terminal
+        )
         if facts.get(RUN) and common.run != facts[RUN]:
             what = "the scheduler has begun another run meanwhile"
             raise ConfigError(what, where=str(folder), hint="begin a new run here, too: `afspm run FILE --only …`")
@@ -113,7 +115,7 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
         return running.go(experiment, options, common, folder, found.name, terminal, names)
 
 
-def _own(experiment: Experiment, options: RunOptions, found: ResumableRun) -> RunIdentity:
+def _resumed_identity(experiment: Experiment, options: RunOptions, found: ResumableRun) -> RunIdentity:
     # Simulated time goes on after the last time in the record. If only some processes are resumed, those on other
     # computers have kept the old clock, so it is kept here.
     facts = found.facts
@@ -200,7 +202,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
     Raises:
         ConfigError: the files now make another experiment.
     """
-    differs = differing(_whole(begun), _whole(load(*files)))
+    differs = differing(_expanded(begun), _expanded(load(*files)))
     if differs:
         named = " ".join(map(quoted, files))
         raise ConfigError(
@@ -211,7 +213,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
         )
 
 
-def _whole(experiment: Experiment) -> dict[str, object]:
+def _expanded(experiment: Experiment) -> dict[str, object]:
     # both files expanded, so that a default written out by hand counts as no difference
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))

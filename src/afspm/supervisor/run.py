@@ -84,7 +84,7 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
         FileError: the run folder can't be made; nothing was started.
     """
     experiment.require_valid(options.only, options.without)
-    own = _own(experiment, options)
+    own = _own_identity(experiment, options)
     # errors are raised before the folder is made
     first = _starts(experiment, options, own, FreePorts().address)
     key_handout.hand_over(experiment, first)
@@ -180,7 +180,7 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
     """Return the processes that `run` would start, and start none. Raises as `run` does."""
     experiment.require_valid(options.only, options.without)
-    return _starts(experiment, options, _own(experiment, options), FreePorts().address)
+    return _starts(experiment, options, _own_identity(experiment, options), FreePorts().address)
 
 
 def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
@@ -240,7 +240,7 @@ def _starts(
     return starts
 
 
-def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
+def _own_identity(experiment: Experiment, options: RunOptions) -> RunIdentity:
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
     if speed is not None and not experiment.resolved.simulated:

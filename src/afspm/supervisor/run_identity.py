@@ -67,7 +67,7 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
                     tell(f"{response.reason}: the experiment goes by real time")
                     return RunIdentity(wall, "", simulated=False)
                 if response.ok or now_s >= refused_s + REFUSED_S:
-                    return _read(response, asked_s, wall.now_s(), str(launch.sockets.control))
+                    return _identity_in(response, asked_s, wall.now_s(), str(launch.sockets.control))
                 if refused_s == math.inf:
                     refused_s = now_s
                     tell(f"the scheduler refuses: {response.reason}; asking again for {REFUSED_S:.0f} s")
@@ -78,7 +78,7 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
         port.close()
 
 
-def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
+def _identity_in(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
     if not response.ok:
         raise ConfigError(f"the scheduler does not answer with its time: {response.reason}", where=where)
     try:

@@ -15,7 +15,7 @@ from afspm.basics.errors import ConfigError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor import run as running
-from afspm.supervisor.resume import ResumableRun, _own, _wait_until_gone
+from afspm.supervisor.resume import ResumableRun, _resumed_identity, _wait_until_gone
 from afspm.supervisor.run import ONLY, RUN, WITHOUT, RunOptions, dry_run, facts_to_resume
 
 PARTS = """
@@ -144,7 +144,7 @@ def test_simulated_time_goes_on_where_other_computers_have_parts_of_the_run(
     before = ExperimentClock(1000.0, 5000.0, 60.0)
     facts = {"simulated": True, RUN: "a", "clock": {**before.as_dict(), "monotonic": "of an earlier boot"}}
     found = ResumableRun(tmp_path, "night", experiment, facts, (tmp_path,))
-    clock = _own(experiment, RunOptions(only=only), found).clock
+    clock = _resumed_identity(experiment, RunOptions(only=only), found).clock
     if only:
         assert clock.now_s() == pytest.approx(before.now_s(), abs=60.0)
     else:  # nothing has happened meanwhile

@@ -217,7 +217,7 @@ class SupervisorCore:
         else:
             self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
 
-    def _look_whether_idle(self) -> None:
+    def _check_idle(self) -> None:
         if not self._idle.look(self.children.values(), self._now_s, self._liveness):
             return
         if not self._idle.is_logged:
@@ -261,7 +261,7 @@ class SupervisorCore:
             else:
                 self._end(EndReason.ALL_DONE, "all components are done")
         if self.ending is None:
-            self._look_whether_idle()
+            self._check_idle()
 
     def _await_scheduler(self) -> None:
         # a scheduler that beats but does not answer us (for want of a key, perhaps) may still answer the components
