@@ -83,7 +83,7 @@ BROKEN = {
     ),
     "a name with a dot": (PEAKS.replace("peaks", "my.peaks", 1), FRAME, "[my.peaks] is within a table"),
     "two of one name": (CORRECTOR + CORRECTOR, FRAME, "[repair] is there twice"),
-    "two of nearly one name": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "differ only in upper and lower"),
+    "names differing in case": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "only in upper and lower"),
     "a name with a slash": (CORRECTOR.replace("repair", '"a/b"'), FRAME, "[a/b] can't be the name"),
     "a name that leads elsewhere": (CORRECTOR.replace("repair", '"../b"'), FRAME, "[../b] can't be the name"),
     "no name": (CORRECTOR.replace("repair", '""'), FRAME, "[] can't be the name"),

@@ -25,7 +25,7 @@ def test_clock_of_the_scheduler_is_taken_unchanged_if_real_time_agrees() -> None
 
 
 def test_experiment_time_is_the_scheduler_s_even_with_a_wrong_wall_clock() -> None:
-    ours = _identity_in(told(11_000.0), 1_309.999, 1_310.001, "").clock  # five minutes ahead of the scheduler's computer
+    ours = _identity_in(told(11_000.0), 1_309.999, 1_310.001, "").clock  # 300 s ahead of the scheduler
     assert ours.speed == 600.0
     assert ours.start_s + (1_310.0 - ours.origin_s) * ours.speed == pytest.approx(11_000.0)
 
