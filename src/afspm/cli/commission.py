@@ -21,6 +21,7 @@ confirm it. The first steps only read (connecting may change how the controller 
 stops the scan, puts the settings back, and withdraws the tip if it is at the sample. The same command goes on later."""
 
 
+# an input that repeats a wrong answer (a pipe) must not loop for ever
 _TRIES = 5
 _STYLES = {"✓": "green", "✗": "bold red", "–": "yellow"}
 

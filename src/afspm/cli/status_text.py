@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 BAR = 24
+# processes in these conditions share one line; all others have a line each
 WELL = (ProcessCondition.ALIVE, ProcessCondition.BUSY)
 BAD = (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
 LEVELS = {"WARNING": "yellow", "ERROR": "bold red", "CRITICAL": "bold red"}

@@ -10,6 +10,7 @@ from afspm.components.feedback_metrics import FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
 from afspm.model import Problem, names
 
+# interval of attempts to restore the gain, while a person or another component holds control
 BACK_WITHIN_S = 60.0
 
 

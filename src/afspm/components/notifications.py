@@ -24,6 +24,7 @@ OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
 TIMEOUT_S = 10.0  # of one attempt
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
 MOST_TRIES = 12  # half an hour
+# a webhook that is down all night must not fill the memory
 MOST_WAITING = 50
 
 Way = Literal["command", "webhook"]

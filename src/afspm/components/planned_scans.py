@@ -20,6 +20,7 @@ from afspm.model import Region, names
 from afspm.model.names import BASE_PARAMETERS
 
 Pixels = tuple[int, int]
+# parameters that every scan with a region needs of the microscope
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 

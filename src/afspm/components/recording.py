@@ -19,13 +19,18 @@ from afspm.storage.packet_log import SEGMENT_BYTES, START, LogReader, Position, 
 
 MOST_BYTES = 256 << 20
 """Limit on waiting packets of other publishers; beyond it all are dropped, and asked for again once there is room."""
+# backlog above which a warning is logged: the log is finite, and its oldest packets are overwritten
 FAR_BEHIND_BYTES = 64 << 20
+# limits the memory for one batch, and the length of one step
 AT_ONCE_BYTES = 32 << 20
 LOOK_S = 0.1
 """Interval of reads of the log: delivery to other processes comes before recording."""
 AGAIN_S = 2.0
+# after a silence incomplete scans are written, too: their last channel may never come
 QUIET_S = 1.0
+# each commit syncs the disk, so not after every packet
 COMMIT_S = 1.0
+# a run that stops may be resumed, and then the log is read on from the last commit: no need to wait long
 LAST_WORDS_S = 30.0
 STOPPING_S = 1.0
 

@@ -40,6 +40,7 @@ REACH_PX = 32  # search range for the second apex of a double tip
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
 SAME_SIZE = 0.02  # relative difference within which sizes count as equal
 SAME_PLACE = 0.2  # share of the size within which a centre counts as the same place
+# limits the saved state: each place keeps an autocorrelation of 33 x 65 values
 MOST_PLACES = 16
 DECIMALS = 4  # of an autocorrelation, to limit the saved state
 MOST_KINDS = 4  # of scans with a reference at the same time

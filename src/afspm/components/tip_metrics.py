@@ -24,6 +24,7 @@ from afspm.basics.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
+# the long band ends at wavelengths of 32 pixels
 FEWEST_PIXELS = 32
 LARGEST_HOLES = 0.2  # share of pixels that may be missing
 SHORT_PX = (3.0, 8.0)  # wavelengths that a blunt tip loses

@@ -24,6 +24,7 @@ SIMULATED = "simulated"
 """Marks a simulated microscope: an attribute of its class, or a key in the table of a command."""
 EMULATED = "emulated"
 """Class attribute that marks an emulated controller; the translator talks to it."""
+# a command declares in its table what a class declares by attributes
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
 
 

@@ -28,6 +28,7 @@ DASHBOARD = "dashboard"
 """Name under which `afspm dashboard` joins a run."""
 DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
 """Environment variable that only dashboards get."""
+# each connects to a socket that the process before it binds
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
 
 

@@ -24,6 +24,7 @@ from afspm.experiment.findings import closest, nearest
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
 
+# units of the annotations in basics.units, tried in this order
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
 _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
 _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)

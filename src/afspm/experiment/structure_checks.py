@@ -27,6 +27,7 @@ OPENS_PLAIN: Final = "opens_plain"
 ADDRESS: Final = "address"
 """Usual name of a translator's setting for the address of its controller."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
+# high, so that an unrelated method named on_… is no typo of a handler
 _HANDLER_CUTOFF = 0.8
 _CALLED_METHODS = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 _MISSING = {

@@ -10,6 +10,7 @@ from typing import Literal
 
 from afspm.basics.clock import ExperimentClock
 
+# bytes: a start with many warnings, or a few tracebacks, pass in full
 AT_ONCE = 500_000
 BYTES_PER_S = 5_000
 """Permanent rate: 0.2 GB in a night of ten hours."""

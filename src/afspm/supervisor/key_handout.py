@@ -20,6 +20,7 @@ from afspm.storage.disk import run_bounded
 from afspm.transport import keys
 from afspm.transport.keys import GUEST, Keys
 
+# a hanging disk must not keep the run from starting or ending
 WRITTEN_WITHIN_S = 5.0
 
 

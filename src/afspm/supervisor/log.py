@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 CLOCK = ExperimentClock.real()
+# lines that wait for a blocked terminal or disk; beyond it the oldest are dropped
 MOST_UNSHOWN = 10_000
 _HANGS = "the disk has not answered for {:.0f} s: log.txt is written once it does, and the run goes on"
 SHOWN_WITHIN_S = 2.0

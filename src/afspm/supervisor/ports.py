@@ -33,6 +33,7 @@ CAN_HOLD = sys.platform == "linux"
 """Other systems let no second process bind a port that one process has bound without listening."""
 LONGEST_FOLDER = 90
 """Limit on the path of a folder of sockets, in bytes. macOS has the lowest limit for a socket's path: 103."""
+# limits the open descriptors of a process that chooses ports for many runs
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")
 

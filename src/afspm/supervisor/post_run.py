@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from afspm.supervisor.log import RunLog
     from afspm.supervisor.supervisor import RunOutcome
 
+# each of these bounds the wait for a hanging disk, network or program: the terminal returns in any case
 REPORT_WITHIN_S = 120.0
 TOLD_WITHIN_S = 30.0
 COUNTED_WITHIN_S = 20.0

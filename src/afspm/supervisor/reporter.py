@@ -61,6 +61,7 @@ LONGEST_LINE = 2000
 """Characters."""
 _BATCH_BYTES = LONGEST_ANNOUNCEMENT // 4
 _CLOSE_WITHIN_S = 1.0
+# each reason is logged once; ever new reasons must not fill the memory
 _MOST_FAILURES = 100
 
 

@@ -34,6 +34,7 @@ _OVER = {reason.name.lower() for reason in EndReason if reason.is_final}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
 ZMTP = b"\xff"
 """First byte that a ZeroMQ socket sends."""
+# orphans end within seconds; the reaper kills the rest
 GONE_WITHIN_S = 10.0
 STEP_NS = 1_000_000
 """Simulated time between two lives of a run, so that no new packet has the time of an old one."""

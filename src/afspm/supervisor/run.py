@@ -40,6 +40,7 @@ TAKES_WHO_COMES = ""
 """Identity of a run of a real microscope's translator alone: it obeys whichever scheduler connects."""
 RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
 
+# a hanging disk must not keep the supervisor from ending
 WRITTEN_WITHIN_S = 5.0
 
 

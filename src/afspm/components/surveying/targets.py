@@ -26,8 +26,11 @@ _SIGMAS: Final = 6.0
 """Default least height in units of the noise: in 128 x 128 pixels of noise none is that high."""
 _WIDEST: Final = 0.2
 """Default width above which features count as ground, as a share of the scan's shorter side."""
+# least standard deviation of the blur
 _LEAST_BLUR_PX: Final = 0.6
+# shortest rise along a line that counts as a scar
 _SCAR_PX: Final = 4
+# every 5 degrees
 _DIRECTIONS: Final = 72
 
 

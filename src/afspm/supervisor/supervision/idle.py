@@ -11,6 +11,7 @@ from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import SupervisedChild
 
 IDLE_AFTER_S = 10.0  # real time; for a component to end the experiment after its last scan, or to begin a repair
+# a person may hold the microscope for hours: ask at this interval
 ASK_AGAIN_S = 5.0
 
 
