@@ -68,6 +68,7 @@ class SurveyRecord:
         self.visits = [Visit(number, target, target.position_m) for number, target in enumerate(targets, start=1)]
 
     def outcome(self, visit: Visit) -> Outcome:
+        """Return the outcome of a visit."""
         if visit.refusals:
             return Outcome.REFUSED
         if visit.zoom is None:
