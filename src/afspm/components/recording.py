@@ -116,7 +116,7 @@ class RecordWriter:
         try:
             while (store := self._opened()) is not None and (damage := self._record_all(store)) is not None:
                 self._put_aside(damage)
-        except BaseException as error:
+        except BaseException as error:  # of any kind: `check` raises it in the thread that can end the process
             self._error = error
             self._wake()
 
