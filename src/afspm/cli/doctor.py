@@ -67,5 +67,5 @@ def _show(examined: Examination) -> None:
             line.append(f"\n        {one.remedy}", "dim")
         console.print(line, soft_wrap=True)
     for heard in examined.heard:
-        told = f"heard   {heard.envelope}: {heard.rate_hz:.2g} a second, {heard.bytes_per_s / 1000:.3g} kB/s"
+        told = f"packets {heard.envelope}: {heard.rate_hz:.2g} a second, {heard.bytes_per_s / 1000:.3g} kB/s"
         console.print(Text(told), soft_wrap=True)
