@@ -1,4 +1,4 @@
-"""The commands. Each module reads arguments, calls one room, and prints; nothing is decided here."""
+"""The commands. Each module reads arguments, calls one room, and prints; no decisions are made here."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import sys
 
 
 def main() -> None:
-    """Entry point. An error of ours is told in its own words; a traceback is kept for what nobody foresaw."""
+    """Run the command line. An `AfspmError` is printed as its message; any other error shows its traceback."""
     from afspm.basics.errors import AfspmError
     from afspm.cli.app import app
 
-    for stream in (sys.stdout, sys.stderr):  # a terminal that lacks a character must not cost the line
+    for stream in (sys.stdout, sys.stderr):  # a character that the terminal lacks must not lose the line
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-            if sys.platform == "win32" and not stream.isatty():  # else it is in the code page of that computer
+            if sys.platform == "win32" and not stream.isatty():  # otherwise output is in the computer's code page
                 stream.reconfigure(encoding="utf-8")
     try:
         app()

@@ -1,4 +1,4 @@
-"""All commands. Each module imports what it works with inside its function, so that any command starts fast."""
+"""All commands. Their modules import other rooms inside functions only, so that every command starts fast."""
 
 from __future__ import annotations
 
@@ -11,21 +11,16 @@ from typer.core import TyperCommand, TyperGroup
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
 from afspm.cli import (
-    clients,
     commission,
-    demo,
+    developing,
     doctor,
-    drivers,
     experiment_file,
     new,
-    notify,
     probes,
-    recorded,
     run,
     runs,
     status,
     steer,
-    trace,
 )
 from afspm.cli.arguments import AFTERWARDS, BEFORE, MEANWHILE, MICROSCOPES, PLUGINS
 
@@ -34,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class DeclaredCommands(TyperGroup):
-    """The commands of the core and of packages, which are loaded for the help and where they are called."""
+    """Commands of the core and of packages; those of packages are loaded for the help and when called."""
 
     def list_commands(self, ctx: object) -> list[str]:
         declared = entry_points.names(entry_points.COMMANDS)
@@ -49,7 +44,7 @@ app = typer.Typer(
     cls=DeclaredCommands,
     no_args_is_help=True,
     add_completion=False,
-    rich_markup_mode="markdown",  # paragraphs are filled; [security] is text
+    rich_markup_mode="markdown",  # paragraphs are wrapped, and [security] stays text
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
@@ -72,14 +67,14 @@ def _afspm(
     """Automate scanning probe microscopes: run experiments of several components that share one microscope."""
 
 
-app.command("demo")(demo.demo)
+app.command("demo")(run.demo)
 app.command("run")(run.run)
 app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
 app.command("doctor", rich_help_panel=BEFORE)(doctor.doctor)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
-app.command("notify", rich_help_panel=BEFORE)(notify.notify)
+app.command("notify", rich_help_panel=BEFORE)(experiment_file.notify)
 app.command("status", rich_help_panel=MEANWHILE)(status.status)
 app.command("watch", rich_help_panel=MEANWHILE)(status.watch)
 app.command("pause", rich_help_panel=MEANWHILE)(steer.pause)
@@ -90,20 +85,20 @@ app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
 app.command("note", rich_help_panel=MEANWHILE)(steer.note)
 app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
 app.command("probes", rich_help_panel=AFTERWARDS)(probes.probes)
-app.command("report", rich_help_panel=AFTERWARDS)(recorded.report)
-app.command("export", rich_help_panel=AFTERWARDS)(recorded.export)
-app.command("replay", rich_help_panel=AFTERWARDS)(recorded.replay)
-app.command("test-client", rich_help_panel=MICROSCOPES)(clients.check_client)
-app.command("test-translator", rich_help_panel=MICROSCOPES)(drivers.check_translator)
+app.command("report", rich_help_panel=AFTERWARDS)(runs.report)
+app.command("export", rich_help_panel=AFTERWARDS)(runs.export)
+app.command("replay", rich_help_panel=AFTERWARDS)(runs.replay)
+app.command("test-client", rich_help_panel=MICROSCOPES)(developing.check_client)
+app.command("test-translator", rich_help_panel=MICROSCOPES)(developing.check_translator)
 app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)
-app.command("trace", rich_help_panel=MICROSCOPES)(trace.trace)
-app.command("emulate", rich_help_panel=MICROSCOPES)(drivers.emulate)
+app.command("trace", rich_help_panel=MICROSCOPES)(run.trace)
+app.command("emulate", rich_help_panel=MICROSCOPES)(developing.emulate)
 
 
 def _declared(name: str) -> Command | None:
     try:
         found = entry_points.load(entry_points.COMMANDS, name)
-    except ConfigError as error:  # raised again where the command is called: the help of all others has to show
+    except ConfigError as error:  # raised when the command is called: the help must list all others
         found = _unloadable(error)
     if found is None:
         return None
@@ -112,7 +107,7 @@ def _declared(name: str) -> Command | None:
         found.command()(function)
     command = typer.main.get_command(found)
     command.name = name
-    if isinstance(command, TyperCommand | TyperGroup):  # typer leaves the panel to add_typer
+    if isinstance(command, TyperCommand | TyperGroup):  # typer sets the panel only in add_typer
         command.rich_help_panel = found.rich_help_panel if isinstance(found.rich_help_panel, str) else PLUGINS
     return command
 

@@ -12,7 +12,7 @@ _WHERE = "The folder of a run, a folder of runs (its newest is meant), or the ex
 RUNS = Path("runs")
 BEFORE, MEANWHILE, AFTERWARDS = "Before", "While it runs", "Afterwards"
 MICROSCOPES, PLUGINS = "Microscopes", "Plug-ins"
-"""The panels of `afspm --help`."""
+"""Panels of `afspm --help`."""
 
 Files = Annotated[list[Path], typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
 OptionalFiles = Annotated[list[Path] | None, typer.Argument(metavar="FILE [OVERLAY…]", help=_FILES, show_default=False)]
@@ -24,14 +24,14 @@ Runs = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make
 
 
 def opt(help_text: str, *flags: str, **more: Any) -> object:
-    """Return an option whose default is said in its help, if at all."""
+    """Return an option; its help text names the default, if that needs saying."""
     return typer.Option(*flags, help=help_text, show_default=False, **more)
 
 
 _SPEED = "Experiment seconds in a real second; simulated microscopes only."
 Speed = Annotated[float | None, opt(_SPEED, min=1e-6)]
 CheckSpeed = Annotated[float, typer.Option(min=1e-6, help=_SPEED)]
-"""Of commands that check a microscope, which have a speed of their own for simulated ones."""
+"""For commands that check a microscope; their default speed differs from a run's."""
 WithinFrame = Annotated[
     str,
     opt(
@@ -46,5 +46,5 @@ SuiteReportFile = Annotated[
 
 
 def names_in(given: list[str] | None) -> tuple[str, ...]:
-    """Return names given by repeating the option, by commas, or both."""
+    """Return names given by repeating the option, separated by commas, or both."""
     return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())

@@ -1,4 +1,4 @@
-"""`afspm commission`: a new controller, step by step, in the terminal."""
+"""`afspm commission`: commissioning of a new controller, step by step in the terminal."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ confirm it. The first steps only read (connecting may change how the controller 
 stops the scan, puts the settings back, and withdraws the tip if it is at the sample. The same command goes on later."""
 
 
+# an input that repeats a wrong answer (a pipe) must not loop for ever
 _TRIES = 5
 _STYLES = {"✓": "green", "✗": "bold red", "–": "yellow"}
 
@@ -32,7 +33,7 @@ def commission(
     ] = None,
     runs: Runs = RUNS,
     frame: WithinFrame = "",
-    anew: Annotated[bool, opt("Do all steps again, whatever the report says.", "--anew")] = False,
+    anew: Annotated[bool, opt("Repeat all steps, also those that passed.", "--anew")] = False,
     speed: CheckSpeed = 20.0,
 ) -> None:
     """Take a new controller into use, step by step, with the tip withdrawn first.
@@ -52,7 +53,7 @@ def commission(
     file = report or Path(f"{files[0].stem}-commissioning.toml")
     before = None if anew else _before(file)
     if before is not None:
-        terminal.show(f"going on with {file}: what has passed there is not done again")
+        terminal.show(f"continuing with {file}: steps that passed are not repeated")
     tried_on = "emulator" if simulated else terminal.choose("What is connected?", TRIED_ON[:2])
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     ended = walk(options, terminal, file, tried_on, before)
@@ -70,13 +71,13 @@ def _before(file: Path) -> InstrumentReport | None:
 
 
 class Terminal:
-    """The person at this terminal. Without an answer, nothing is confirmed."""
+    """Questions to the person at this terminal. No answer means no confirmation."""
 
     def __init__(self) -> None:
         self._console = plain_console()
 
     def show(self, text: str) -> None:
-        """Show a text; of one that begins with an empty line, the first line is a title."""
+        """Print a text; if it begins with an empty line, its first line is printed as a title."""
         title, _, rest = text.removeprefix("\n").partition("\n") if text.startswith("\n") else ("", "", text)
         if title:
             self._console.print(f"\n{title}", style="bold")
@@ -84,18 +85,16 @@ class Terminal:
             self._console.print(rest, style=_STYLES.get(rest[:1]))
 
     def confirm(self, question: str) -> bool:
-        """Ask yes or no."""
         return self._line(f"{question} [y/N] ").strip().lower() in ("y", "yes")
 
     def text(self, question: str) -> str:
-        """Ask for a line."""
         return self._line(f"{question}: ")
 
     def choose(self, question: str, options: Sequence[str], default: str = "") -> str:
-        """Ask for one of the options, by its number or its word; an empty answer is the default, if there is one.
+        """Ask for one of the options, by number or word; an empty answer means the default, if there is one.
 
         Raises:
-            KeyboardInterrupt: none was chosen, however often it was asked.
+            KeyboardInterrupt: no valid answer after several attempts.
         """
         numbered = ", ".join(f"{number} {option}" for number, option in enumerate(options, 1))
         if default:
@@ -110,7 +109,7 @@ class Terminal:
         raise KeyboardInterrupt
 
     def _line(self, question: str) -> str:
-        """Ask; Ctrl-C then interrupts, and the end of the input as well."""
+        # the end of input counts as Ctrl-C: without a terminal there is no answer to wait for
         with _interruptible():
             try:
                 return input(question)
@@ -120,7 +119,7 @@ class Terminal:
 
 @contextmanager
 def _interruptible() -> Iterator[None]:
-    """Let Ctrl-C end a question at once: nothing is being asked of the microscope meanwhile."""
+    # during a question no request is under way, so Ctrl-C need not wait for one
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield

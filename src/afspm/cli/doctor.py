@@ -1,4 +1,4 @@
-"""`afspm doctor`: says what is wrong with an experiment, from any of its computers, and what to do about it."""
+"""`afspm doctor`: find the faults of an experiment from any of its computers, with remedies."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def doctor(
     context: typer.Context,
     files: OptionalFiles = None,
     runs: Runs = RUNS,
-    listen: Annotated[float, opt("For how long (s) to listen to what is published.", "--listen", min=0.1)] = 3.0,
+    listen: Annotated[float, opt("Seconds to listen to published packets.", "--listen", min=0.1)] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    """Say what is wrong with an experiment, seen from this computer, and what to do about it.
+    """Find the faults of an experiment, seen from this computer, with remedies.
 
-    Looks at names, ports, keys, clocks, versions, disk and memory, and at what the scheduler publishes. It works before
-    the experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
-    installed packages, with the reason where one can't be loaded. Without a file it looks at this computer alone. Ends
+    Checks names, ports, keys, clocks, versions, disk and memory, and the packets of the scheduler. Works before the
+    experiment runs, while it runs, and when a part of it does not. Lists the drivers, components, readers … of all
+    installed packages, with the reason where one can't be loaded. Without a file it checks this computer alone. Ends
     with 1 if something keeps the experiment from working.
     """
     from afspm.experiment import load
@@ -67,5 +67,5 @@ def _show(examined: Examination) -> None:
             line.append(f"\n        {one.remedy}", "dim")
         console.print(line, soft_wrap=True)
     for heard in examined.heard:
-        told = f"heard   {heard.envelope}: {heard.rate_hz:.2g} a second, {heard.bytes_per_s / 1000:.3g} kB/s"
+        told = f"packets {heard.envelope}: {heard.rate_hz:.2g} a second, {heard.bytes_per_s / 1000:.3g} kB/s"
         console.print(Text(told), soft_wrap=True)

@@ -1,4 +1,4 @@
-"""`afspm check`, `graph` and `keys`: what is done with an experiment file before anything starts."""
+"""`afspm check`, `graph`, `keys` and `notify`: work on an experiment file before a run."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from afspm.cli.arguments import Files, opt
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from afspm.components.notifications import Notification, Targets, Way
     from afspm.experiment import Experiment, Finding
 
 
 def check(
     files: Files,
-    expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file as it is in force.")] = False,
+    expanded: Annotated[bool, typer.Option("--expanded", help="Print the whole file, with all defaults.")] = False,
     explain: Annotated[
         bool,
         typer.Option(
             "--explain",
-            help="Print a file of another form, as the published one, in ours; say what each line has become.",
+            help="Convert a file of another form, such as the published one, and explain each line.",
         ),
     ] = False,
 ) -> None:
     """Find every error of an experiment file, before anything starts.
 
-    Says file, line, what is wrong and what would be right. Ends with 1 if there are errors; warnings are only told.
+    Shows file, line, error and remedy. Ends with 1 if there are errors; warnings alone end with 0.
     """
     from rich.console import Console
 
@@ -50,7 +51,6 @@ def check(
 
 
 def _explain(experiment: Experiment, console: Console) -> None:
-    """Print the short form, and to the console what has become of each line."""
     from afspm.experiment.forms import all_forms
 
     for form in all_forms():
@@ -60,7 +60,7 @@ def _explain(experiment: Experiment, console: Console) -> None:
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:
-    """Print findings, one a paragraph, coloured where the terminal can."""
+    """Print findings, one a paragraph, with colours on a terminal."""
     from rich.text import Text
 
     for finding in findings:
@@ -72,7 +72,7 @@ def show(findings: Sequence[Finding], console: Console) -> None:
 
 
 def require_no_errors(experiment: Experiment, only: Collection[str] = (), without: Collection[str] = ()) -> None:
-    """Show what is wrong or doubtful, where these are started here. Raises typer.Exit if something is wrong."""
+    """Print errors and warnings for the processes started here. Raises typer.Exit if there are errors."""
     findings = experiment.check(only, without)
     if findings:
         from rich.console import Console
@@ -115,14 +115,12 @@ def keys(
     folder: Annotated[
         Path | None, opt("Where to put them. Default: [security] keys of the file, else keys/ beside it.", "--folder")
     ] = None,
-    also: Annotated[
-        list[str] | None, opt("A person who is to have a key. Repeatable.", "--also", metavar="NAME")
-    ] = None,
+    also: Annotated[list[str] | None, opt("A person who gets a key. Repeatable.", "--also", metavar="NAME")] = None,
 ) -> None:
     """Make a key pair for each process of an experiment, for the supervisors, and for the people named.
 
-    Keys that are there already are left as they are. Copy public/ to every computer, and of private/ only the keys of
-    what runs there.
+    Existing keys are kept. Copy public/ to every computer, and of private/ only the keys of the processes that run
+    there.
     """
     from afspm.experiment import load
     from afspm.model.events import SUPERVISOR
@@ -137,3 +135,48 @@ def keys(
         typer.echo(f"all keys are there already, in {target}")
     if experiment.keys_folder is None:
         typer.echo(f'to use them: [security] keys = "{target.name}"')
+
+
+def notify(
+    files: Files, test: Annotated[bool, typer.Option("--test", help="Send a test message by each of them.")] = False
+) -> None:
+    """List the notifications of [notify] in an experiment file, and test them.
+
+    Ends with 1 if there are none, or if a test message does not arrive.
+    """
+    from afspm.experiment import implied_parts, load
+
+    experiment = load(*files)
+    require_no_errors(experiment)
+    section = experiment.resolved.sections.notify
+    targets = implied_parts.targets(section, experiment.folder)
+    if not targets.ways:
+        typer.echo("afspm: the file has no [notify] with a `command` or a `webhook`", err=True)
+        raise typer.Exit(1)
+    if not test:
+        typer.echo(f"{' and '.join(targets.ways)}, on {', '.join(section.on)}; --test sends a message")
+        return
+    arrived = [_arrives(targets, _message(experiment), way) for way in targets.ways]
+    if not all(arrived):
+        raise typer.Exit(1)
+
+
+def _message(experiment: Experiment) -> Notification:
+    from afspm.basics.clock import ExperimentClock
+    from afspm.components.notifications import TEST, Notification
+
+    now_ns = ExperimentClock.real().now_ns()
+    return Notification(TEST, experiment.name, "", now_ns, "a test message of afspm: calls from this experiment arrive")
+
+
+def _arrives(targets: Targets, message: Notification, way: Way) -> bool:
+    from afspm.basics.errors import ConfigError
+    from afspm.components.notifications import NotDelivered
+
+    try:
+        targets.deliver(message, way)
+    except (ConfigError, NotDelivered) as error:
+        typer.echo(f"the {way} failed: {error}", err=True)
+        return False
+    typer.echo(f"the {way} took the message")
+    return True

@@ -1,4 +1,4 @@
-"""Connections of the terminal's commands to a running experiment, in the name of the user."""
+"""Connections from terminal commands to a running experiment, in the user's name."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ if TYPE_CHECKING:
     from afspm.client.scope import Scope
 
 NOT_RUNNING = 3
-"""The exit code where nothing runs."""
+"""Exit code if no experiment runs."""
 TERMINAL = "terminal"
-_UNBROKEN = 10_000  # columns: what programs and files get has a line for a line
+_UNBROKEN = 10_000  # columns: output to files and pipes is not wrapped
 
 
 def person() -> str:
-    """ "terminal:ada": the terminal, and the user of this computer that it acts for."""
+    """Return "terminal:ada": the terminal, and the user of this computer."""
     try:
         user = getpass.getuser()
-    except (OSError, KeyError, ImportError):  # no such user: a container
+    except (OSError, KeyError, ImportError):  # a container without this user
         user = ""
     return f"{TERMINAL}:{user}" if user else TERMINAL
 
 
 @contextmanager
 def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
-    """Follow the run that is meant; end the command where nothing runs.
+    """Follow the run at `where`; end the command if no run goes on there.
 
     Args:
-        lines: also of scans that are being taken.
+        lines: whether to follow lines of unfinished scans, too.
     """
     from afspm import wire
     from afspm.client.follower import Follower
@@ -57,7 +57,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
 
 @contextmanager
 def acting(where: Path) -> Iterator[Scope]:
-    """Connect to the run that is meant, in the name of the user; end the command where nothing runs."""
+    """Connect to the run at `where` in the user's name; end the command if no run goes on there."""
     from afspm.client.connect import connect
 
     folder = _running(where)
@@ -68,7 +68,7 @@ def acting(where: Path) -> Iterator[Scope]:
 
 
 def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
-    """Return what is known of the run besides what it publishes."""
+    """Return facts about the run that are not in its packets."""
     from afspm.cli.status_text import RunDescription
     from afspm.record.run_json import REPLAY_OF, read_run_json
 
@@ -85,7 +85,7 @@ def describe(follower: Follower, *, fancy: bool = True) -> RunDescription:
 
 
 def can_show_blocks() -> bool:
-    """Return whether what the bars are made of arrives at the terminal."""
+    """Return whether the terminal's encoding has the block characters of bars."""
     try:
         "█░".encode(sys.stdout.encoding or "ascii")
     except (UnicodeEncodeError, LookupError):
@@ -94,20 +94,19 @@ def can_show_blocks() -> bool:
 
 
 def say_nothing_runs(why: str) -> NoReturn:
-    """End the command: raises typer.Exit."""
+    """End the command because no run goes on: raises typer.Exit."""
     typer.echo(f"afspm: nothing runs here: {why}", err=True)
     raise typer.Exit(NOT_RUNNING)
 
 
 def say_unreachable(folder: Path, computer: str) -> NoReturn:
-    """End the command where a run of another computer does not answer: raises typer.Exit."""
+    """End the command because a run on another computer does not answer: raises typer.Exit."""
     what = f"{folder.resolve().name} was started on {computer}, and does not answer to this computer"
     typer.echo(f"afspm: {what} ({platform.node()}): run this command there", err=True)
     raise typer.Exit(NOT_RUNNING)
 
 
 def _running(where: Path) -> Path:
-    """Return the folder of the run that is meant, as far as it is not known to have ended."""
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
     from afspm.record.run_json import ENDED, read_run_json
@@ -144,7 +143,7 @@ def _only_if_running(folder: Path) -> Iterator[None]:
 
 
 def plain_console() -> Console:
-    """Return the terminal to print tables and colours to; what programs and files get has a line for a line."""
+    """Return a console for tables and colours; output to files and pipes is not wrapped."""
     from rich.console import Console
 
     console = Console(highlight=False, markup=False)

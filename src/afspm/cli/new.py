@@ -1,4 +1,4 @@
-"""`afspm new`: an experiment, a component or a driver to begin with."""
+"""`afspm new`: make an experiment, a component or a driver to start from."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def component(name: Name, into: Into = Path()) -> None:
 def driver(name: Name, into: Into = Path()) -> None:
     """Make a package with a driver for a new controller.
 
-    As it is, it drives a controller that only pretends, and passes the checks of what it has.
+    As it is, it drives a controller that only pretends, and passes the checks of the operations that it has.
     """
     what = "replace its PretendController, and look how far it is with"
     _write("driver", name, into, what, "afspm test-translator experiment.toml")

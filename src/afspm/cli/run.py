@@ -1,16 +1,16 @@
-"""`afspm run`: an experiment, from its file to the folder that it leaves behind."""
+"""`afspm run`, `demo` and `trace`: run an experiment."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import TYPE_CHECKING, Annotated, Final, Protocol
 
 import typer
 
 from afspm.basics import entry_points
 from afspm.basics.errors import ConfigError
-from afspm.cli.arguments import RUNS, OptionalFiles, Runs, Speed, names_in, opt
+from afspm.cli.arguments import RUNS, Files, OptionalFiles, Runs, Speed, names_in, opt
 
 if TYPE_CHECKING:
     from afspm.basics.plain_data import PlainMapping
@@ -18,21 +18,31 @@ if TYPE_CHECKING:
     from afspm.supervisor.resume import ResumableRun
     from afspm.supervisor.run import FinishedRun
 
+_QUESTIONS: Final = {
+    "sample": "Sample",
+    "person": "Your name",
+    "orcid": "Your ORCID iD",
+    "project": "Project",
+    "technique": "Technique (STM, STS or AFM)",
+}
+_TIP_REPAIR_NIGHT = "A simulated night of eight hours: the tip changes three times, and is repaired. Two minutes."
+_DRIFT_NIGHT = "A simulated night of eighteen hours on a sample that drifts by micrometres. Three to five minutes."
+
 
 class RunPage(Protocol):
-    """The functions of a module that shows runs in the browser."""
+    """Functions of a module that shows runs in the browser."""
 
     def with_page(self, files: list[Path]) -> Experiment:
-        """Return the experiment of these files, with a page if the files have none."""
+        """Return the experiment of these files, with a page added if they have none."""
 
     def resumed_with_page(self, found: ResumableRun) -> ResumableRun:
-        """Return the run that is to go on, with a page if it has none."""
+        """Return the run to resume, with a page added if it has none."""
 
     def page_of(self, experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
-        """Return name and settings of a page among the processes that were started here; None: there is none."""
+        """Return name and settings of the page among the processes started here; None if there is none."""
 
     def stay(self, folder: Path, name: str, settings: PlainMapping) -> None:
-        """Show a run that has ended until Ctrl-C, on the page of this name and these settings."""
+        """Show an ended run, on the page with this name and these settings, until Ctrl-C."""
 
 
 def run(
@@ -57,14 +67,14 @@ def run(
         bool, opt("Ask for sample, person and project first, for the files of the run ([metadata]).", "--ask")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check, say what would be started, and start nothing.")
+        bool, typer.Option("--dry-run", help="Check, list the processes to start, and start none.")
     ] = False,
     report: Annotated[bool, opt("Write report.html when it has ended.", "--report/--no-report")] = True,
     stay: Annotated[
         bool | None,
         opt("Keep the dashboard when it has ended. Default: in a terminal, until Ctrl-C.", "--stay/--no-stay"),
     ] = None,
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Tell details too.")] = False,
+    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Show details, too.")] = False,
 ) -> None:
     """Run an experiment.
 
@@ -77,7 +87,6 @@ def run(
     import sys
     from dataclasses import replace
 
-    from afspm.cli import metadata_questions
     from afspm.cli.experiment_file import require_no_errors
     from afspm.experiment import load
     from afspm.supervisor import resume as resuming
@@ -93,7 +102,7 @@ def run(
     )
     if resume is not None:
         if files or only or without or speed or dry_run or ask:
-            said = "a run is resumed as it was begun: give nothing else, but --dashboard"
+            said = "a run is resumed as it was started: of other options only --dashboard is possible"
             raise typer.BadParameter(said, param_hint="--resume")
         found = resuming.find(resume)
         if dashboard:
@@ -101,7 +110,7 @@ def run(
         as_begun = found.options(options)
         require_no_errors(found.experiment, as_begun.only, as_begun.without)
         ended = resuming.resume(found, options, terminal=sys.stdout)
-        _stay(found.experiment, ended, stay)
+        _keep_page(found.experiment, ended, stay)
         raise typer.Exit(ended.outcome.exit_code)
     if not files:
         raise typer.BadParameter("name an experiment file, or a run with --resume", param_hint="FILE")
@@ -109,17 +118,16 @@ def run(
     require_no_errors(experiment, options.only, options.without)
     if dry_run:
         for start in running.dry_run(experiment, options):
-            typer.echo(_told(start))
+            typer.echo(_described(start))
         return
     if ask:
-        options = replace(options, metadata=metadata_questions.ask(experiment))
+        options = replace(options, metadata=ask_metadata(experiment))
     ended = running.run(experiment, options, terminal=sys.stdout)
-    _stay(experiment, ended, stay)
+    _keep_page(experiment, ended, stay)
     raise typer.Exit(ended.outcome.exit_code)
 
 
-def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:
-    """Keep the page of a dashboard that was started here, unless a person has stopped the run."""
+def _keep_page(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> None:
     import sys
 
     from afspm.supervisor.supervision.run_end import EndReason
@@ -130,7 +138,7 @@ def _stay(experiment: Experiment, ended: FinishedRun, wanted: bool | None) -> No
     try:
         page = _page()
     except ConfigError as error:  # the run has ended well: its exit code stays
-        typer.echo(f"the page does not stay: {error}", err=True)
+        typer.echo(f"the page can't be kept open: {error}", err=True)
         return
     if (found := page.page_of(experiment, started)) is not None:
         page.stay(ended.folder, *found)
@@ -143,6 +151,85 @@ def _page() -> RunPage:
     return page
 
 
-def _told(start: ProcessStart) -> str:
+def _described(start: ProcessStart) -> str:
     what = " ".join(start.command) or start.launch.class_
     return f"{start.launch.name} ({start.role.value}): {what}"
+
+
+def ask_metadata(experiment: Experiment) -> dict[str, str]:
+    """Ask for the entries of [metadata]; offer those of the file and of the microscope's class."""
+    known = experiment.resolved.metadata()
+    return {name: answer for name, text in _QUESTIONS.items() if (answer := _answer(name, text, known.get(name, "")))}
+
+
+def _answer(name: str, text: str, known: str) -> str:
+    import pydantic
+
+    from afspm.experiment.sections import MetadataSection
+
+    while answer := typer.prompt(text, default=known, show_default=bool(known)).strip():
+        try:
+            return str(getattr(MetadataSection.model_validate({name: answer}), name))
+        except pydantic.ValidationError as error:
+            typer.echo(f"  {error.errors()[0]['msg'].removeprefix('Value error, ')}")
+    return ""
+
+
+def demo(
+    drift: Annotated[bool, typer.Option("--drift", help="The night on a sample that drifts.")] = False,
+    runs: Runs = RUNS,
+    dashboard: Annotated[bool, typer.Option("--dashboard", help="Show it in the browser, too.")] = False,
+) -> None:
+    """Show a simulated night: the tip changes, is seen to have changed, and is repaired.
+
+    Nothing but afspm is needed. The night leaves a folder with its scans, a picture and `report.html`.
+    """
+    typer.echo(_DRIFT_NIGHT if drift else _TIP_REPAIR_NIGHT)
+    typer.echo(f"It leaves a folder in {runs}, with report.html. Ctrl-C ends it early.")
+    run([_sample("drift_night" if drift else "tip_repair") / "experiment.toml"], runs=runs, dashboard=dashboard)
+
+
+def _sample(name: str) -> Path:
+    # in a wheel samples lie in the package, in a clone in `experiments`
+    package = Path(__file__).parents[1]
+    installed = package / "samples" / name
+    return installed if installed.is_dir() else package.parents[1] / "experiments" / name
+
+
+def trace(
+    files: Files,
+    runs: Runs = RUNS,
+    speed: Speed = None,
+) -> None:
+    """Run an experiment, and record all traffic with the controller.
+
+    The trace is one file in the run's folder; it includes the files that the controller saved, and no secrets. Attach
+    it to a bug report: `afspm emulate --replay` plays it back. The same as `afspm run` with `trace = true` in the
+    translator's section.
+    """
+    import sys
+
+    from afspm.cli.experiment_file import require_no_errors
+    from afspm.supervisor import run as running
+    from afspm.translator.trace import FILE
+
+    experiment = _with_trace(files)
+    require_no_errors(experiment, (), ())
+    ended = running.run(experiment, running.RunOptions(runs=runs, speed=speed), terminal=sys.stdout)
+    file = ended.folder / FILE
+    typer.echo(f"the trace: {file}" if file.exists() else "no trace: nothing was sent to the controller")
+    raise typer.Exit(ended.outcome.exit_code)
+
+
+def _with_trace(files: list[Path]) -> Experiment:
+    import tempfile
+
+    from afspm.basics.errors import ConfigError
+    from afspm.experiment import load
+    from afspm.experiment.tracing import trace_overlay
+
+    with tempfile.TemporaryDirectory() as folder:
+        overlay = trace_overlay(load(*files).resolved, Path(folder))
+        if overlay is None:
+            raise ConfigError("no translator here talks to a controller: nothing to trace", where=str(files[0]))
+        return load(*files, overlay)

@@ -1,4 +1,4 @@
-"""`afspm runs`: all runs under a folder, searched and listed."""
+"""`afspm runs`, `report`, `export` and `replay`: list recorded runs, and use one."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import day_and_time, duration_text
-from afspm.cli.arguments import RUNS, opt
+from afspm.basics.formatting import counted, day_and_time, duration_text
+from afspm.cli.arguments import RUNS, RecordedRun, Where, names_in, opt
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -61,7 +61,6 @@ def runs(
 
 
 def _table(found: Sequence[RunSummary]) -> Table:
-    """Return a row for each run, without columns of which nothing is known."""
     from rich import box
     from rich.table import Table
 
@@ -95,3 +94,69 @@ _COLUMNS: Final[dict[str, Callable[[RunSummary], str]]] = {
     "measured": lambda run: run.measured,
     "problems": lambda run: run.damage or ", ".join(run.problems),
 }
+
+
+def report(where: Where = RUNS) -> None:
+    """Write report.html, and figures, into the folder of a run, from its record.
+
+    Works during a run, too: the report then shows events up to now. The page needs no other file.
+    """
+    from afspm.client.connect import find_run
+    from afspm.record.report import write
+
+    typer.echo(write(find_run(where)))
+
+
+def export(
+    run: RecordedRun = RUNS,
+    to: Annotated[
+        str,
+        typer.Option(
+            metavar="FORMAT",
+            help="gwy, h5 (NeXus), nc, png, csv, eln, gif and mp4 (films), documents (Bluesky), or another that "
+            "`afspm doctor` lists.",
+        ),
+    ] = "gwy",
+    out: Annotated[Path | None, opt("Where to write. Default: export in the folder of the run.", metavar="DIR")] = None,
+    scans: Annotated[str | None, opt("Only these scans, by their numbers; 7-: from 7 on.", metavar="1-5,8")] = None,
+) -> None:
+    """Write the scans and spectra of a recorded run in another format.
+
+    Works during a run, and for a run that was killed. Interrupted scans are included as far as they were recorded.
+    """
+    from afspm.record.export import export as exported
+    from afspm.record.run import open_run
+
+    with open_run(run) as record:
+        folder = out or record.folder / "export" / to
+        written = list(exported(record, to, folder, scans, lambda text: typer.echo(f"left out: {text}", err=True)))
+    typer.echo(f"{len(written)} file{'s' if len(written) != 1 else ''} in {folder}")
+
+
+def replay(
+    run: RecordedRun = RUNS,
+    speed: Annotated[
+        float | None, opt("Experiment seconds in a real second. Default: as it was recorded.", min=1e-6)
+    ] = None,
+    only: Annotated[
+        list[str] | None, opt("Publish only these, e.g. Scan2d,ControlState.", "--only", metavar="MESSAGE[,…]")
+    ] = None,
+    publish: Annotated[
+        str | None, opt("Where. Default: as the experiment file says, else a free port.", metavar="ADDRESS")
+    ] = None,
+    serve: Annotated[str | None, opt("Where requests are answered.", metavar="ADDRESS")] = None,
+    stay: Annotated[
+        bool, typer.Option("--stay", help="Serve late joiners when all is published, until Ctrl-C.")
+    ] = False,
+    runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the replay's folder.")] = RUNS,
+) -> None:
+    """Publish a recorded run again, with its timing at any speed, as its scheduler did.
+
+    It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Late
+    joiners get the cached packets. Requests are refused, since nothing is measured.
+    """
+    from afspm.supervisor import replay as replaying
+
+    options = replaying.ReplayOptions(speed, names_in(only), publish, serve, stay=stay, runs=runs)
+    count = replaying.replay(run, options, typer.echo)
+    typer.echo(f"published {counted(count, 'packet')}")

@@ -1,4 +1,4 @@
-"""`afspm status` and `afspm watch`: looking at a running experiment, once or for as long as one likes."""
+"""`afspm status` and `afspm watch`: the state of a running experiment, once or continuously."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 REFRESH_S = 0.25
 LOOK_S = 2.0
-"""Interval of checks whether the run still goes on, where nothing is published."""
+"""Interval of checks whether the run still goes on, while no packets arrive."""
 
 
 def status(
@@ -29,7 +29,7 @@ def status(
 ) -> None:
     """Show the state of a running experiment: control, microscope, problems, notes and the time left.
 
-    Ends with 3 where nothing runs.
+    Ends with 3 if no experiment runs.
     """
     with looking(where) as follower:
         text = _text(follower)
@@ -40,9 +40,9 @@ def status(
 
 
 def watch(where: Where = RUNS) -> None:
-    """Watch a running experiment until it ends, or Ctrl-C; the experiment does not notice.
+    """Watch a running experiment until it ends, or Ctrl-C. Does not disturb the experiment.
 
-    Where the output is no terminal, a line is written whenever something changes. Ends with 3 if the run is cut off.
+    If the output is no terminal, a line is written at each change. Ends with 3 if the run is cut off.
     """
     console = plain_console()
     with looking(where, lines=True) as follower, contextlib.suppress(KeyboardInterrupt):
@@ -62,7 +62,7 @@ def _text(follower: Follower) -> StatusText:
 
 
 def _goes_on(follower: Follower) -> bool:
-    """Return whether there is more to come. The run's lock is looked at only in silence: a disk may be far away."""
+    # the run's lock is tested only after a silence: it may lie on a slow network disk
     from afspm.record.overview import OLD_S
 
     return not (follower.ended or (follower.silent_s() > OLD_S and follower.cut_off()))
@@ -77,7 +77,7 @@ def _live(follower: Follower, console: Console) -> None:
             now_s = follower.clock.monotonic_s()
             if now_s - shown_s >= REFRESH_S:
                 text = _text(follower)
-                # the log gets the lines that are left below all else
+                # the log fills the remaining lines
                 room = console.height - 1 - len(console.render_lines(text.screen(log_lines=0), pad=False))
                 live.update(text.screen(silent_s=follower.silent_s(), log_lines=max(0, room)), refresh=True)
                 shown_s = now_s

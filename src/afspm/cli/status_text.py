@@ -1,4 +1,4 @@
-"""A running experiment in words, for a terminal of any width, and as JSON. What is told comes from an `Overview`."""
+"""Text on a running experiment, for a terminal of any width, and as JSON. The data come from an `Overview`."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 BAR = 24
+# processes in these conditions share one line; all others have a line each
 WELL = (ProcessCondition.ALIVE, ProcessCondition.BUSY)
 BAD = (ProcessCondition.SILENT, ProcessCondition.GIVEN_UP, ProcessCondition.RESTARTING)
 LEVELS = {"WARNING": "yellow", "ERROR": "bold red", "CRITICAL": "bold red"}
@@ -25,13 +26,13 @@ _PROCESS = ("name", "role", "step_age_s", "starts", "pid", "last_exit")
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """Facts of a run besides what it publishes.
+    """Facts about a run that are not in its packets.
 
     Attributes:
-        replay_of: the folder of the run that is published again; empty: it is no replay.
-        began_ns: experiment time at its start; None if it is not known.
+        replay_of: folder of the run that is replayed; empty: it is no replay.
+        began_ns: experiment time at its start; None if unknown.
         speed: experiment seconds in a real second.
-        fancy: True if the terminal can show block characters.
+        fancy: whether the terminal can show block characters.
     """
 
     name: str
@@ -44,19 +45,17 @@ class RunDescription:
 
 
 def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
-    """Return a part of a whole (0 to 1) as a bar."""
     full = min(width, max(0, round(part * width)))
     return ("█" * full + "░" * (width - full)) if fancy else "[" + "#" * full + "." * (width - full) + "]"
 
 
 def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
-    """Yield (number, name, since when and by whom) of each problem that is flagged."""
+    """Yield number, name, and start and source of the flag of each flagged problem."""
     for number in seen.control.problems if seen.control else ():
         yield number, seen.problems.name(number), seen.timelines.problems[number].now
 
 
 def log_line(line: LogLine) -> Text:
-    """Return what a process said, coloured by how bad it is."""
     from rich.text import Text
 
     text = Text.assemble((f"{time_of_day(line.time_ns)} ", "dim"), (f"{line.name} ", "cyan"))
@@ -64,7 +63,7 @@ def log_line(line: LogLine) -> Text:
 
 
 class StatusText:
-    """The words on a run at a moment, in experiment time."""
+    """Text on a run at one moment, in experiment time."""
 
     def __init__(self, seen: Overview, run: RunDescription, now_ns: int) -> None:
         self._seen = seen
@@ -72,7 +71,6 @@ class StatusText:
         self._now_ns = now_ns
 
     def screen(self, *, silent_s: float = 0.0, log_lines: int = 8) -> Group:
-        """Return all that there is to see."""
         from rich.console import Group
         from rich.text import Text
 
@@ -90,7 +88,7 @@ class StatusText:
         return Group(*lines)
 
     def summary(self) -> str:
-        """Return the most important in one line."""
+        """Return control, problems and microscope in one line."""
         return "; ".join(
             " ".join(line.plain.split()) for line in (self._control(), *self._problems(), self._microscope())
         )
@@ -138,7 +136,6 @@ class StatusText:
         return line.append(self._since(now.start_ns if now else None))
 
     def _scanning(self) -> Text:
-        """Return what the microscope does, and how far it is with a scan."""
         line, seen = self._microscope(), self._seen
         if seen.status is None or seen.status.state is not ScopeState.SCANNING:
             return line
@@ -175,7 +172,6 @@ class StatusText:
             yield _label("drift").append(registered)
 
     def _processes(self) -> Iterator[Text]:
-        """Yield those that are well in one line; each of the others in its own."""
         seen, states = self._seen, self._seen.processes.values()
         running = [state.name for state in states if state.condition not in OVER]
         unheard = {name: ns for name in running if (ns := seen.silent_ns(name, self._run.speed)) is not None}
@@ -190,17 +186,17 @@ class StatusText:
                 yield line.append(f" for {gone}: its supervisor is gone, or can't be reached")
             elif state.condition not in WELL:
                 condition = state.condition.name.lower().replace("_", " ")
-                line.append(condition, "bold red" if state.condition in BAD else "yellow").append(self._lately(state))
+                line.append(condition, "bold red" if state.condition in BAD else "yellow").append(
+                    self._changed_since(state)
+                )
                 yield line.append(f" ({state.last_exit})" if state.last_exit else "")
 
-    def _lately(self, state: ProcessState) -> str:
-        """Return since when it is so; of what is over, when that was."""
+    def _changed_since(self, state: ProcessState) -> str:
         if state.condition is ProcessCondition.ENDED:
             return f" {duration_text((self._now_ns - state.since_ns) / NS_PER_S)} ago"
         return self._since(state.since_ns)
 
     def _refusals(self, most: int = 3) -> Iterator[Text]:
-        """Yield the last; what was refused again and again in the same way, once."""
         last: dict[tuple[str, str, str], tuple[int, int]] = {}
         for entry in self._seen.refusals:
             key = (entry.who, entry.what, entry.reason)
@@ -211,14 +207,13 @@ class StatusText:
             yield line.append(f": {reason}" if reason else "", "yellow")
 
     def _notes(self, most: int = 3) -> Iterator[Text]:
-        """Yield the last notes, with the scan that each belongs to."""
         numbers = {scan.time_ns: scan.number for scan in self._seen.scans}
         for note in list(self._seen.notes)[-most:]:
             on = f" on scan {numbers[note.scan_ns]}" if note.scan_ns in numbers else ""
             yield _label("note").append(f"{time_of_day(note.time_ns)} {note.who}{on}: {note.text}")
 
     def as_json(self) -> dict[str, object]:
-        """Return the same for programs. Times as ISO 8601 in UTC, durations in experiment seconds."""
+        """Return the status for programs. Times are ISO 8601 in UTC, durations are in experiment seconds."""
         seen, run = self._seen, self._run
         control, running = seen.control, seen.scan_progress(self._now_ns)
         return {

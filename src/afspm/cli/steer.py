@@ -1,4 +1,4 @@
-"""`afspm pause`, `resume`, `end`, `problems` and `note`: what a person does to a run, by the user's name."""
+"""`afspm pause`, `resume`, `end`, `restart`, `problems` and `note`: a person's actions on a run, in the user's name."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 def pause(where: Where = RUNS) -> None:
     """Pause a running experiment: MANUAL, so that no component commands the microscope.
 
-    What is measured just then is stopped, unless the experiment file says otherwise, and taken again afterwards. The
-    components go on running, and wait. `afspm resume` lets them go on.
+    A measurement under way is stopped, unless the experiment file says otherwise, and repeated afterwards. Components
+    go on running, and wait. `afspm resume` lets them continue.
     """
     from afspm.model import ControlMode
 
@@ -26,9 +26,10 @@ def pause(where: Where = RUNS) -> None:
 
 
 def resume(where: Where = RUNS) -> None:
-    """Let a paused experiment go on: AUTOMATED.
+    """Let a paused experiment continue: AUTOMATED.
 
-    It has to be running. An experiment that was killed, with its computer perhaps, goes on by `afspm run --resume RUN`.
+    The experiment must be running. One that was killed, perhaps with its computer, continues by `afspm run --resume
+    RUN`.
     """
     from afspm.model import ControlMode
 
@@ -51,7 +52,7 @@ def restart(
     process: Annotated[str, typer.Argument(help="The name of the process, such as `series`.", show_default=False)],
     where: Where = RUNS,
 ) -> None:
-    """End a process of a running experiment and start it anew, also one that was given up; what it keeps stays."""
+    """Restart a process of a running experiment, also one that was given up; its saved memory is kept."""
     with acting(where) as scope:
         scope.restart(process)
     typer.echo(f"{process} is restarted")
@@ -67,9 +68,9 @@ def problems(
     ] = None,
     clear_all: Annotated[bool, typer.Option("--clear-all", help="Remove the flags of all problems.")] = False,
 ) -> None:
-    """List the problems that are flagged, by whom and since when; or flag and clear them.
+    """List the flagged problems, with the sources and times of their flags; or flag and clear them.
 
-    Control is taken from whoever has it when a problem is flagged, until who solves it has cleared it.
+    A flagged problem takes control from its holder until a component that solves the problem has cleared the flag.
     """
     if flag or clear or clear_all:
         with acting(where) as scope:
@@ -93,9 +94,9 @@ def note(
         int | None, typer.Option(metavar="N", help="The number of the scan that it belongs to.", show_default=False)
     ] = None,
 ) -> None:
-    """Write a note into the record of a run, by your name: on a scan, or on this moment.
+    """Write a note into the record of a run, in your name: on a scan, or on this moment.
 
-    It needs no control. After the end of a run the note is appended to its record, and the report is written again.
+    Needs no control. After the end of a run the note is appended to its record, and the report is written again.
     """
     from afspm.basics.clock import ExperimentClock
     from afspm.cli.joining import acting, person

@@ -1,4 +1,4 @@
-"""The channels of a scan, which are published one by one: pairs of two, and a warning for those that never come."""
+"""Channels of a scan, which are published one by one: pairs of trace and retrace, and a warning if one is missing."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ ENOUGH_SCANS = 3  # before a channel counts as missing; the channels of one scan
 
 @dataclass(frozen=True)
 class HeightPair:
-    """Trace and, where it is recorded, retrace of one scan."""
+    """Trace and, if recorded, retrace of one scan."""
 
     trace: Scan
     retrace: Scan | None
 
     def judged_by(self, judge: TipJudge, *, learns: bool) -> Verdict:
-        """Return what the pair tells of the tip; `learns` as in `TipJudge.judge`.
+        """Return the judge's verdict on the tip; `learns` as in `TipJudge.judge`.
 
         Raises:
             UnitError: the channels are no heights.
@@ -32,10 +32,10 @@ class HeightPair:
 
 
 class ChannelPairing:
-    """Collects channels until those of one scan are together.
+    """Collects channels until trace and retrace of one scan are there.
 
     Args:
-        channel, retrace_channel: of the heights; the latter empty where it is not recorded.
+        channel, retrace_channel: names of the height channels; the second is empty if retrace is not recorded.
     """
 
     def __init__(self, channel: str, retrace_channel: str) -> None:
@@ -47,7 +47,7 @@ class ChannelPairing:
         return self._channel, self._retrace_channel
 
     def add(self, scan: Scan) -> HeightPair | None:
-        """One more channel; a pair if it completes one."""
+        """Add a channel; return the pair once trace and retrace are there."""
         if scan.channel not in (self._channel, self._retrace_channel) or not scan.values.size:
             return None
         self._seen[scan.channel] = scan
@@ -59,10 +59,10 @@ class ChannelPairing:
 
 
 class MissingChannels:
-    """Says once that scans come, and none has a channel that is wanted.
+    """Warns once if scans arrive but none has a required channel.
 
     Args:
-        channels: their names; an empty one is not wanted.
+        channels: names of the required channels; empty names are ignored.
     """
 
     def __init__(self, channels: Collection[str], log: logging.Logger) -> None:
@@ -72,7 +72,6 @@ class MissingChannels:
         self._log = log
 
     def see(self, scan: Scan) -> None:
-        """One more channel."""
         self._missing.discard(scan.channel)
         if not self._missing:
             return

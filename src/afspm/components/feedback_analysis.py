@@ -1,4 +1,4 @@
-"""`FeedbackAnalysis`: watches how well the feedback follows, and flags it when it does not."""
+"""`FeedbackAnalysis`: judges how well the feedback follows, and flags a problem if it does not."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ MESSAGE = "FeedbackAnalysis"
 
 
 class FeedbackAnalysis(FeedbackObserver):
-    """Publishes after each scan the shares of its pixels whose error is too large, as a `FeedbackAnalysis` message.
+    """Publishes after each scan the shares of pixels with too large an error, as a `FeedbackAnalysis` message.
 
-    Flags `feedback-non-optimal` when several scans in a row leave too much in the error, and removes the flag when
-    scans leave less than half of that, unless a component has control to solve it, which then decides. Where the flag
-    was removed although nothing is better, it is not set again until the feedback has followed in between. Scans with
-    the feedback off are not judged.
+    Flags `feedback-non-optimal` when several scans in a row leave too much in the error, and clears the flag when scans
+    leave less than half of that; while a component has control to solve the problem, that component decides. If the
+    flag was cleared although the feedback is no better, it is not set again until the feedback has followed well in
+    between. Scans with the feedback off are not judged.
 
     Args:
         flag_after: bad scans in a row until the problem is flagged.
@@ -34,7 +34,7 @@ class FeedbackAnalysis(FeedbackObserver):
     def __init__(self, flag_after: int = 2, clear_after: int = 1, **observed: Any) -> None:
         super().__init__(**observed)
         if flag_after < 1 or clear_after < 1:
-            raise ConfigError("`flag_after` and `clear_after` must be one at least")
+            raise ConfigError("`flag_after` and `clear_after` must be at least 1")
         self.flag_after, self.clear_after = flag_after, clear_after
         self._pairing = ChannelPairing(self.channel, self.height)
         self._feedback = Feedback()

@@ -1,4 +1,4 @@
-"""Metrics of how well the z feedback follows, from its error signal and the height, and a search for gains."""
+"""Quality of the z feedback, from its error signal and the height, and a search for the gain."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from afspm.basics.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
-_SMALLEST_CURRENT = 0.01  # of the setpoint: what lies below is noise, and has no logarithm
-_SIGNIFICANT = 4.0  # standard deviations above what white noise would show
-_CLOSE = 1.1  # of two gains, between which none is looked for
-_SWING = 0.2  # of the error, that the height has to share for an oscillation
+_SMALLEST_CURRENT = 0.01  # of the setpoint: smaller values are noise, and may have no logarithm
+_SIGNIFICANT = 4.0  # standard deviations of white noise
+_CLOSE = 1.1  # ratio of two gains below which the search ends
+_SWING = 0.2  # least slope of height on error for an oscillation
 
 
 class FeedbackQuality(Enum):
-    """The quality with which the feedback follows the sample."""
+    """Quality with which the feedback follows the sample."""
 
     WELL = "follows"
     BARELY = "barely follows"
@@ -35,16 +35,16 @@ class FeedbackQuality(Enum):
 
 @dataclass(frozen=True)
 class FeedbackError:
-    """The error signal of one scan.
+    """Error signal of one scan.
 
     Attributes:
-        over: share of the pixels, 0 to 1, where the signal lies above the setpoint by more than the threshold: in
-            tapping, the tip is off the sample.
-        under: the same below it: in tapping, the tip presses too hard.
-        missed: the relief in the error by the relief in the height; above one where the error has more of it, as that
-            of a loop that oscillates, or is far too slow.
-        swing: how the height moves with the error: one or more if the tip swings above the sample by itself, zero or
-            less if it comes late.
+        over: share of the pixels, 0 to 1, where the signal exceeds the setpoint by more than the threshold: in tapping
+            mode the tip is off the sample there.
+        under: the same below the setpoint: in tapping mode the tip presses too hard there.
+        missed: relief in the error divided by relief in the height; above one if the loop oscillates, or is far too
+            slow.
+        swing: slope of the height's changes on the error's, both in m: one or more if the tip oscillates above the
+            sample, zero or less if it lags behind.
     """
 
     over: float
@@ -54,7 +54,7 @@ class FeedbackError:
 
     @property
     def share(self) -> float:
-        """Of the pixels, beyond the threshold."""
+        """Share of the pixels beyond the threshold."""
         return self.over + self.under
 
     def __str__(self) -> str:
@@ -64,13 +64,13 @@ class FeedbackError:
 
 @dataclass(frozen=True)
 class FeedbackLimits:
-    """Limits of a feedback that follows: a share of pixels beyond the threshold, and one of the relief."""
+    """Limits for a good feedback: share of pixels beyond the threshold, and share of the relief in the error."""
 
     pixels: float = 0.1
     relief: float = 0.2
 
     def judge(self, error: FeedbackError) -> FeedbackQuality:
-        """Return what the error of one scan says. Half the limits are left as a margin where it follows well."""
+        """Return the quality of one scan. WELL needs half the limits, as a margin."""
         worst = max(error.share / self.pixels, error.missed / self.relief)
         if worst <= 1.0:
             return FeedbackQuality.WELL if worst <= 0.5 else FeedbackQuality.BARELY
@@ -79,16 +79,16 @@ class FeedbackLimits:
 
 
 def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> Array:
-    """Return by how much of the setpoint the signal is off.
+    """Return the deviation of the signal from the setpoint, divided by the setpoint.
 
     Args:
-        signal: what the feedback holds at the setpoint, the amplitude, say; NaN where nothing was measured.
-        setpoint: in the same unit; None: the signal's median, which it is at unless the feedback is far off.
-        exponential: the signal falls exponentially with the distance, as a tunnelling current does, of either sign: its
-            logarithm is compared.
+        signal: the signal that the feedback holds at the setpoint, such as the amplitude; NaN where not measured.
+        setpoint: in the same unit; None: the signal's median, which equals it unless the feedback is far off.
+        exponential: whether the signal falls exponentially with the distance, as a tunnelling current of either sign
+            does: then its logarithm is compared.
 
     Raises:
-        InvalidValue: nothing was measured, or the setpoint is zero.
+        InvalidValue: no value was measured, or the setpoint is zero.
     """
     there = signal[np.isfinite(signal)]
     if not there.size:
@@ -102,17 +102,17 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
 
 def feedback_error(error: Array, threshold: float, height_m: Array | None = None, gap_m: float = 0.0) -> FeedbackError:
-    """Return what one scan says.
+    """Return the error signal of one scan.
 
-    A loop that comes late leaves of the relief in the error what is missing in the height. Compared in metres that is
-    the same for every sample, speed and noise, since noise that is white says nothing from one pixel to the next. A
-    loop that oscillates moves height and error together; one that comes late moves the height by the error's sum.
+    A loop that lags leaves in the error the relief that is missing in the height. Compared in metres, this ratio is the
+    same for every sample, speed and noise, since white noise has no correlation from pixel to pixel. A loop that
+    oscillates moves height and error together; one that lags moves the height by the sum of the error.
 
     Args:
-        error: as of `relative_error`, [y, x].
-        threshold: of it.
-        height_m: of the same pixels; None: nothing is known of the relief.
-        gap_m: by how much an error of one is too high.
+        error: result of `relative_error`, [y, x].
+        threshold: of the relative error.
+        height_m: of the same pixels; None: the relief is unknown.
+        gap_m: excess height of the tip at a relative error of one.
     """
     there = error[np.isfinite(error)]
     over, under = float(np.mean(there > threshold)), float(np.mean(there < -threshold))
@@ -129,7 +129,7 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
 
 def _smooth_variance(values: Array) -> float:
-    """Return the variance along lines, less tilt and white noise: the covariance of neighbours where significant."""
+    # white noise has no covariance between neighbours, so theirs is the variance of the smooth part
     x = np.linspace(-1.0, 1.0, values.shape[1])
     level = values - values.mean(axis=1, keepdims=True)
     level = level - np.outer(level @ x / (x @ x), x)
@@ -140,18 +140,18 @@ def _smooth_variance(values: Array) -> float:
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
 ) -> Generator[float, FeedbackQuality | None, float | None]:
-    """Look for a gain at which the feedback follows well: higher while it is too slow, lower while it oscillates.
+    """Search a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
 
-    Yields gains to try, the start first, and is sent how the feedback follows; None if the gain was refused. Returns
-    the gain to keep, or None if no gain was good.
+    Yields gains to try, `start` first; send it the quality at each, or None if the gain was refused. Returns the gain
+    to keep, or None if no gain was good.
 
     Args:
         start: within the bounds.
         factor: of one step, above 1. Between a gain that is too low and one that is too high the steps get smaller.
-        lowest, highest: never left.
-        most_tries: how many gains are tried in all.
+        lowest, highest: bounds of the gain.
+        most_tries: limit on the number of gains.
     """
-    gain, slow, fast = start, 0.0, math.inf  # known as too low and too high
+    gain, slow, fast = start, 0.0, math.inf  # highest gain known too low, lowest known too high
     well = barely = None
     comes_from_above = False
     for _ in range(most_tries):

@@ -1,4 +1,4 @@
-"""The error of the feedback in a scan, from the channel that it holds at the setpoint and the height."""
+"""Error of the feedback in a scan, from the height and the channel that the feedback holds at the setpoint."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _CURRENT_DECAY_M = 0.05e-9  # a tenth of the current for 0.1 nm: work functions 
 
 
 class FeedbackSignal:
-    """Compares a channel with the setpoint, which comes without a unit.
+    """Compares a channel with the setpoint, which is published without a unit.
 
-    Whether the channel is of the setpoint's kind is asked once for each unit.
+    Whether the channel's unit fits the setpoint is asked once for each unit.
 
     Args:
-        threshold: of the error, as a share of the setpoint (of a current, of its logarithm); None: 0.1, and 0.5 of a
+        threshold: of the error, as a share of the setpoint (of a current: of its logarithm); None: 0.1, and 0.5 for a
             current.
-        sensitivity: height in m for 1 V of the channel, or, of a current, for a factor e; None: 50 nm, and 0.05 nm.
+        sensitivity: height in m for 1 V of the channel, or, for a current, for a factor e; None: 50 nm, and 0.05 nm.
     """
 
     def __init__(self, threshold: float | None, sensitivity: float | None) -> None:
@@ -42,8 +42,8 @@ class FeedbackSignal:
         """Return the error of one scan.
 
         Raises:
-            InvalidValue: the channel is of another kind than the setpoint: an amplitude in m, say, where that is in V;
-                or nobody answers just now; or it has no value, or the setpoint is zero.
+            InvalidValue: the channel's unit does not fit the setpoint (an amplitude in m where the setpoint is in V),
+                the translator does not answer just now, the channel has no value, or the setpoint is zero.
         """
         if setpoint is not None:
             if signal.unit not in self._reasons:
@@ -60,11 +60,11 @@ class FeedbackSignal:
         except UnitError as wrong:
             raise InvalidValue(f"{height.channel} is not a height: {wrong.what}") from wrong
         if height_m.shape != error.shape:
-            raise InvalidValue(f"{height.channel} has not the pixels of {signal.channel}")
+            raise InvalidValue(f"{height.channel} and {signal.channel} differ in pixels")
         return feedback_error(error, threshold, height_m, self._gap_m(signal, setpoint))
 
     def _gap_m(self, signal: Scan, setpoint: float | None) -> float:
-        """Return by how much the tip is too high where the relative error is one; 0 where that is not known."""
+        # 0 where the gap per relative error is not known.
         if same_kind(signal.unit, "A"):
             return -(self._sensitivity or _CURRENT_DECAY_M)
         unit, metres = ("m", 1.0) if same_kind(signal.unit, "m") else ("V", self._sensitivity or _M_PER_V)
@@ -78,7 +78,7 @@ class FeedbackSignal:
             scope.get(names.ZCTRL_SETPOINT, scan.unit, timeout_s=ASKED_WITHIN_S)
         except UnitError as error:
             return error.what
-        except Refused:  # it can't be asked for, and nobody knows better
+        except Refused:  # the setpoint can't be read, so nothing contradicts the channel's unit
             return ""
         except RequestError as error:
             raise InvalidValue(f"its unit is not known yet: {error.what}") from error
@@ -86,17 +86,17 @@ class FeedbackSignal:
 
 
 class FeedbackObserver(Component):
-    """A component that judges scans by how well the feedback followed.
+    """Base of components that judge scans by how well the feedback followed.
 
     Args:
-        channel: what the feedback holds at the setpoint, in a unit of the same kind.
-        height: the channel of the heights; empty if not recorded: a feedback that is a little slow is not seen then.
-        threshold: of the error, as a share of the setpoint, or, of a current, of its logarithm; by default 0.1, and 0.5
-            of a current.
-        limit: of the pixels that may lie beyond it.
-        relief_limit: of the relief that may be in the error instead of the height.
-        sensitivity: height for 1 V of the channel, or, of a current, for a factor of 2.7; by default 50 nm, and 50 pm.
-            Negative where the signal falls as the tip withdraws, as a deflection does. A channel in metres needs none.
+        channel: the signal that the feedback holds at the setpoint, in a unit that fits the setpoint's.
+        height: the channel of the heights; empty if not recorded: then a slightly slow feedback is not detected.
+        threshold: of the error, as a share of the setpoint (of a current: of its logarithm); by default 0.1, and 0.5
+            for a current.
+        limit: share of the pixels that may lie beyond the threshold.
+        relief_limit: share of the relief that may be in the error instead of the height.
+        sensitivity: height for 1 V of the channel, or, for a current, for a factor of 2.7; by default 50 nm, and 50 pm.
+            Negative if the signal falls as the tip withdraws, as a deflection does. Not needed for a channel in metres.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""`FeedbackTuner`: looks for a better integral gain when somebody flagged that the feedback does not follow."""
+"""`FeedbackTuner`: searches a better integral gain when `feedback-non-optimal` is flagged."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from afspm.components.feedback_metrics import FeedbackQuality, gain_search
 from afspm.components.feedback_signal import FeedbackObserver
 from afspm.model import Problem, names
 
+# interval of attempts to restore the gain, while a person or another component holds control
 BACK_WITHIN_S = 60.0
 
 
 class FeedbackTuner(FeedbackObserver):
-    """Solves `feedback-non-optimal`: scans the region set, raises the integral gain while the feedback is too slow and
-    lowers it while it oscillates, until it follows well, or as well as it can.
+    """Solves `feedback-non-optimal`: scans the current region, and searches a good integral gain.
 
-    Where no gain is good it sets the one that was there, says so in the log, and removes the flag, so that the
-    experiment goes on as it was. The gain that was there is also set again after control was lost, or a kill.
+    It raises the gain while the feedback is too slow, and lowers it while it oscillates. If no gain is good, it
+    restores the original gain, logs that, and clears the flag, so that the experiment continues as before. The original
+    gain is also restored after control was lost, or after a kill.
 
     Args:
-        lowest_gain, highest_gain: of the integral gain; never left.
+        lowest_gain, highest_gain: bounds of the integral gain.
         factor: of one step.
         most_tries: test scans of one search.
     """
@@ -75,7 +76,7 @@ class FeedbackTuner(FeedbackObserver):
         self._finish("" if found is not None else "no gain is good")
 
     def _search(self, start: float) -> float | None:
-        """Return the gain to keep, if there is one. One that is good is noted, whatever happens afterwards."""
+        # a good gain is saved at once: a kill afterwards must not lose it
         search = gain_search(start, self.factor, self.lowest, self.highest, self.most_tries)
         gain = next(search)
         try:
@@ -89,11 +90,6 @@ class FeedbackTuner(FeedbackObserver):
         return found
 
     def _try(self, gain: float) -> FeedbackQuality | None:
-        """Return how the feedback follows with a gain; None if that was refused.
-
-        Raises:
-            InvalidValue: the scan says nothing.
-        """
         try:
             self.scope.set_feedback(integral_gain=gain)
         except Refused as refused:
@@ -110,19 +106,17 @@ class FeedbackTuner(FeedbackObserver):
         return following
 
     def _keep(self, gain: float) -> None:
-        """Note the gain to leave behind, also for one that is started after a kill."""
         self.memory["gain"] = gain
         self.memory.save()
 
     def _finish(self, why: str) -> None:
-        """Set the gain that is to be left behind, and let the experiment go on."""
         self._set_back()
         if why:
             self.log.error("the feedback can't be improved: %s. Its setting is as before; please check it", why)
         self.scope.clear(Problem.FEEDBACK_NON_OPTIMAL)
 
     def _leave_behind(self) -> None:
-        """The same where control was lost before that, or this process killed."""
+        # control was lost before `_finish`, or this process was killed
         if "gain" in self.memory:
             with suppress(ControlLost), self.scope.control(timeout_s=BACK_WITHIN_S):
                 self._set_back()

@@ -1,4 +1,4 @@
-"""Files that grow line by line and survive a kill: a line is there as a whole or not at all."""
+"""Files that grow line by line and survive a kill: a line is in the file completely or not at all."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _log = logging.getLogger("afspm.records")
 
 
 class LineFile:
-    """Appends lines to a text file. A last line that a kill cut in two is taken away before the next is written.
+    """Appends lines to a text file. An incomplete last line, left by a kill, is removed before the next is written.
 
     Args:
-        path: made when the first line is written.
-        header: the first line of a new file.
+        path: created with the first line.
+        header: first line of a new file.
     """
 
     def __init__(self, path: Path, header: str = "") -> None:
@@ -32,10 +32,10 @@ class LineFile:
         self._told = OutageLog("lines wait to be written", _log)
 
     def lines(self) -> list[str]:
-        """Return the lines that are there, without the header and a last line that is not whole.
+        """Return the complete lines, without the header.
 
         Raises:
-            FileError: it can't be read.
+            FileError: the file can't be read.
         """
         try:
             text = self.path.read_bytes().decode("utf-8", errors="replace")
@@ -43,14 +43,14 @@ class LineFile:
             return []
         except OSError as error:
             raise FileError(f"can't be read: {error}", where=str(self.path)) from error
-        whole = text.split("\n")[:-1]  # splitlines would cut names that hold other ends of lines
+        whole = text.split("\n")[:-1]  # splitlines would also split at other line ends, which file names may hold
         return whole[1:] if self._header else whole
 
     def append(self, lines: Iterable[str]) -> None:
-        """Write lines at the end, the header first if the file is new.
+        """Append lines, after the header if the file is new.
 
-        Where that can't be, on a full disk or while somebody has the file open in a program that locks it, it is said,
-        and they wait until more come.
+        If the file can't be written (the disk is full, or a program such as a spreadsheet locks the file), this is
+        logged, and the lines wait for the next call.
         """
         self._waiting += "".join(f"{line}\n" for line in lines)
         with self._told.trying():
@@ -60,7 +60,7 @@ class LineFile:
         try:
             if not self._is_open:
                 self.path.parent.mkdir(parents=True, exist_ok=True)
-                header = self._mended()
+                header = self._repair()
                 _append(self.path, header)
                 self._is_open = True
             _append(self.path, self._waiting)
@@ -68,8 +68,8 @@ class LineFile:
             raise FileError(f"can't be written: {error}", where=str(self.path)) from error
         self._waiting = ""
 
-    def _mended(self) -> str:
-        """Cut off half a line at the end; returns the header that has to come before what is written."""
+    def _repair(self) -> str:
+        # a kill leaves half a line at the end, which is cut off; an empty file gets its header
         if not self.path.exists():
             return f"{self._header}\n" if self._header else ""
         data = self.path.read_bytes()
@@ -81,14 +81,12 @@ class LineFile:
 
 
 def csv_line(row: Iterable[str]) -> str:
-    """A row of a table as one line."""
     line = io.StringIO()
     csv.writer(line, lineterminator="").writerow(row)
     return line.getvalue().replace("\n", " ")
 
 
 def _append(path: Path, text: str) -> None:
-    """All of it or nothing. Raises OSError."""
     size = path.stat().st_size if path.exists() else 0
     try:
         with path.open("ab") as file:

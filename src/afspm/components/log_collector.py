@@ -1,4 +1,4 @@
-"""`LogCollector`: the log lines of all processes, of several computers, in one file."""
+"""`LogCollector`: the log lines of all processes, also on other computers, in one file."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _WRITTEN_NS = "written_ns"
 
 
 class LogCollector(Component):
-    """Writes what every process of the experiment logs to one file, wherever it runs.
+    """Writes the log lines of all processes of an experiment, on all its computers, to one file.
 
-    On one computer `log.txt` in the run folder is that already. On several, each has a `log.txt` of its own processes;
-    their supervisors also have the scheduler publish the lines, from INFO on, and this component writes these.
+    On one computer `log.txt` in the run folder has them already. On several, each computer has a `log.txt` of its own
+    processes; the scheduler also publishes the lines, from INFO on, and this component writes them.
 
     Args:
         file: its name in the run folder.
-        level: the least that is written.
+        level: lowest level that is written.
     """
 
     listens: ClassVar = ("LogLines",)
@@ -46,6 +46,6 @@ class LogCollector(Component):
 
 
 def formatted(line: LogLine) -> str:
-    """Return a line as it is written: time in the experiment, level, process, text."""
+    """Return a line in the file's format: experiment time, level, process, text."""
     text = line.text.replace("\n", "\n    ")
     return f"{iso_utc(line.time_ns)} {line.level:8} {line.name:16} {text}"

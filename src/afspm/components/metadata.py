@@ -1,4 +1,4 @@
-"""`Metadata`: a table of what was measured, with what the files of the microscope don't say: who was in control."""
+"""`Metadata`: a table of all measurements, with facts that the microscope's files lack: the holder of control."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 class Metadata(Component):
     """Writes `metadata.csv` in the run folder: a row for each channel of each scan, each spectrum and each note.
 
-    Columns: the time it was finished (UTC), `scan`, `spectrum` or `note`, the file, the channel (or kind), its place in
-    metres, pixels, units, and as it was when the measurement began: who was in control, the mode, the problems flagged
-    and the microscope's state; of a note, its author and text. A note on a scan has the time of that scan. What is not
-    known is left empty: a scan that began while this component was not running.
+    Columns: end time (UTC); `scan`, `spectrum` or `note`; file; channel (or kind); place in metres; pixels; units; and,
+    as they were when the measurement began, holder of control, mode, flagged problems and the microscope's state; for a
+    note its author and text. A note on a scan has the time of that scan. Unknown values are empty, such as those of a
+    scan that began while this component was not running.
 
-    Whatever is killed, there is one header and no row is there twice or missing.
+    The file has one header, and each row exactly once, even if processes are killed.
 
     Args:
         file: its name in the run folder.
@@ -45,7 +45,7 @@ class Metadata(Component):
 
     def on_start(self) -> None:
         self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
-        self._written = {_identity(dict(zip(COLUMNS, row, strict=False))) for row in csv.reader(self._table.lines())}
+        self._written = {_row_key(dict(zip(COLUMNS, row, strict=False))) for row in csv.reader(self._table.lines())}
 
     def on_control(self, control_state: ControlState) -> None:
         self._control = control_state
@@ -58,9 +58,9 @@ class Metadata(Component):
             self._saw_begin = self._saw_begin and status.state is not ScopeState.FREE
             return
         if goes_on:
-            return  # it was paused, or goes on after that: it began before
+            return  # a scan that goes on after a pause began before it
         if now_ns is not None and now_ns <= self.memory.get("began_ns", -1):
-            return  # replayed after a restart: what was noted then is what holds
+            return  # replayed after a restart: the first entry counts
         self._saw_begin = True
         self.memory["began_ns"] = -1 if now_ns is None else now_ns
         self.memory["what"], self.memory["finished_ns"] = what, None
@@ -98,27 +98,26 @@ class Metadata(Component):
         self._append({"time": iso_utc(note.time_ns), "measurement": "note", "note": f"{note.who}: {note.text}"})
 
     def _write(self, what: str, measured: Scan | Spectrum, columns: dict[str, str]) -> None:
-        self._under_way = None  # should it scan on without another state between them, that is the next one
+        self._under_way = None  # if the state stays SCANNING, the next scan begins now
         time_ns = measured.time_ns
         if time_ns is None and self.packet is not None:
-            time_ns = self.packet.time_ns  # rows are told apart by it
+            time_ns = self.packet.time_ns  # distinguishes rows
         row = {
             "time": iso_utc(time_ns),
             "measurement": what,
             "filename": measured.filename,
             "length_units": "m",
         } | columns
-        if _identity(row) not in self._written:
+        if _row_key(row) not in self._written:
             self._append(row | self._conditions(what, measured.time_ns))
 
     def _append(self, row: dict[str, str]) -> None:
-        if (identity := _identity(row)) in self._written:
+        if (identity := _row_key(row)) in self._written:
             return  # replayed after a restart
         self._table.append([csv_line(row.get(column, "") for column in COLUMNS)])
         self._written.add(identity)
 
     def _conditions(self, what: str, time_ns: int | None) -> dict[str, str]:
-        """Return those noted when it began, if it is the measurement that they were noted for."""
         if self.memory.get("what") != what:
             return {}
         finished_ns = self.memory["finished_ns"]
@@ -126,13 +125,13 @@ class Metadata(Component):
             self.memory["finished_ns"] = time_ns
             self.memory.save()
         elif finished_ns != time_ns and not self._saw_begin:
-            return {}  # a later one, that began while we were not running
+            return {}  # a later measurement, which began while this component did not run
         conditions: dict[str, str] = self.memory["conditions"]
         return conditions
 
 
-def _identity(row: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the cells that no two rows share; a row of an older version has no note."""
+def _row_key(row: Mapping[str, str]) -> tuple[str, ...]:
+    # no two rows share these cells; rows of older versions have no note
     return tuple(
         row.get(column, "").replace("\n", " ") for column in ("time", "measurement", "filename", "channel", "note")
     )

@@ -1,4 +1,4 @@
-"""`NightPicture`: the night on one page: the scans, who was in control when, and which problems were flagged."""
+"""`NightPicture`: the night on one page: scans, control and problems over time."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from afspm.record.night_record import NightRecord, control_entry, mark_entry, sc
 class NightPicture(Component):
     """Draws `night.png` when the experiment ends: the scans in a row, control and problems over time.
 
-    Where the microscope is simulated, the picture says so. It listens to everything, and keeps what it needs on disk as
-    it goes: killed and started again, it draws the same.
+    A simulated microscope is marked in the picture. The component subscribes to all packets, and saves as it goes:
+    killed and restarted, it draws the same picture.
 
     Args:
         channel: shown of each scan.
@@ -37,7 +37,7 @@ class NightPicture(Component):
     def on_start(self) -> None:
         self._file = LineFile(Path(self.run_dir) / "state" / f"{self.name}.night.jsonl")
         self.record = NightRecord.from_lines(self._file.lines())
-        # now, when there is time, as at the end all must be quick; and beside the loop, which must not miss a scan
+        # imported now, since there is little time at the end; in a thread, since the loop must not miss a scan
         self._loading = threading.Thread(target=_load_drawing, name="loading", daemon=True)
         self._loading.start()
 
@@ -47,7 +47,7 @@ class NightPicture(Component):
 
     def on_state(self, status: ScopeStatus) -> None:
         goes_on, self._is_scanning = self._is_scanning, status.state is ScopeState.SCANNING
-        if self._is_scanning and not goes_on:  # else it was paused: it began before
+        if self._is_scanning and not goes_on:  # a scan that goes on after a pause began before it
             self._begin = (self._packet_ns(), self._control.holder if self._control else None)
         elif status.state is ScopeState.INTERRUPTED:
             self._add({"kind": "interrupted", "time_ns": self._packet_ns()})
@@ -57,7 +57,7 @@ class NightPicture(Component):
             start_ns, holder = self._begin
             self._add(scan_entry(scan, scan.time_ns or self._packet_ns(), start_ns, holder))
             self._begin = (None, None)
-            self._is_scanning = False  # should it scan on without another state between them, that is the next one
+            self._is_scanning = False  # if the state stays SCANNING, the next scan begins now
 
     def on_message(self, envelope: str, message: Any) -> None:
         by = envelope.partition("_")[2]

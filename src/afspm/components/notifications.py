@@ -1,4 +1,4 @@
-"""Notifications of people outside of the experiment, by a command or a webhook."""
+"""Notifications of people outside the experiment, by a command or a webhook."""
 
 from __future__ import annotations
 
@@ -18,19 +18,20 @@ UNSOLVED: Final = "unsolved-problem"
 GIVEN_UP: Final = "given-up"
 CRITICAL: Final = "critical"
 TEST: Final = "test"
-"""Of a message that only shows that calls arrive."""
+"""Occasion of a test message."""
 OCCASIONS: Final = (END, UNSOLVED, GIVEN_UP, CRITICAL)
 
-TIMEOUT_S = 10.0  # of one try
+TIMEOUT_S = 10.0  # of one attempt
 FIRST_DELAY_S, LONGEST_DELAY_S = 2.0, 300.0
 MOST_TRIES = 12  # half an hour
+# a webhook that is down all night must not fill the memory
 MOST_WAITING = 50
 
 Way = Literal["command", "webhook"]
 
 
 class NotDelivered(AfspmError):
-    """A notification that could not be delivered, for now."""
+    """A notification could not be delivered; it may be retried."""
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,10 @@ class Notification:
 
     Attributes:
         what: one of OCCASIONS, or TEST.
-        experiment: its name.
-        run: the folder of the run.
+        experiment: name of the experiment.
+        run: folder of the run.
         time_ns: experiment time.
-        text: for people, a sentence.
+        text: a sentence.
     """
 
     what: str
@@ -53,7 +54,7 @@ class Notification:
     simulated: bool = False
 
     def body(self) -> bytes:
-        """As JSON: what, experiment, run, time (ISO 8601, UTC), text, simulated."""
+        """Return the notification as JSON: what, experiment, run, time (ISO 8601, UTC), text, simulated."""
         time = utc_time(self.time_ns).isoformat()
         told = {**asdict(self), "time": time}
         del told["time_ns"]
@@ -62,13 +63,13 @@ class Notification:
 
 @dataclass(frozen=True)
 class Targets:
-    """The targets of notifications.
+    """Targets of notifications.
 
     Attributes:
         command: program and arguments; it gets the JSON on its standard input.
-        webhook: an address that the JSON is posted to, or "$NAME" of the environment variable that holds it. It may
-            be a secret: no log names more of it than the host.
-        folder: where the command is run.
+        webhook: address for a POST of the JSON, or "$NAME" of the environment variable that holds it. It may be a
+            secret: logs name only its host.
+        folder: working directory of the command.
     """
 
     command: Sequence[str] = ()
@@ -77,15 +78,15 @@ class Targets:
 
     @property
     def ways(self) -> tuple[Way, ...]:
-        """Those that there are."""
+        """The ways of delivery that have a target."""
         known: tuple[tuple[Way, object], ...] = (("command", self.command), ("webhook", self.webhook))
         return tuple(way for way, target in known if target)
 
     def deliver(self, notice: Notification, way: Way) -> None:
-        """Tell it, once.
+        """Deliver a notification, in one attempt.
 
         Raises:
-            NotDelivered: it could not be told; a secret is not in the error.
+            NotDelivered: the attempt failed; the error contains no secret.
         """
         if way == "command":
             _run(self.command, notice, self.folder)
@@ -94,10 +95,10 @@ class Targets:
 
 
 def address(webhook: str, environment: Mapping[str, str] = os.environ) -> str:
-    """The address that is meant by a webhook of the experiment file.
+    """Return the address of a webhook, looked up in the environment for "$NAME".
 
     Raises:
-        ConfigError: its environment variable is not set, or it is no address; a secret is not in the error.
+        ConfigError: the environment variable is not set, or holds no address; the error contains no secret.
     """
     from urllib.parse import urlsplit
 
@@ -156,18 +157,18 @@ def _post(url: str, notice: Notification) -> None:
         error.close()
         raise NotDelivered(f"{host} answers {error.code}") from None
     except URLError as error:
-        raise NotDelivered(f"{host} can't be reached: {_short(error.reason)}") from None
+        raise NotDelivered(f"{host} can't be reached: {_reason_without_secret(error.reason)}") from None
     except (OSError, HTTPException, ValueError) as error:
-        raise NotDelivered(f"{host} can't be reached: {_short(error)}") from None
+        raise NotDelivered(f"{host} can't be reached: {_reason_without_secret(error)}") from None
 
 
-def _short(reason: object) -> str:
-    """Why, without what was asked for."""
+def _reason_without_secret(reason: object) -> str:
+    # the text of the error may hold the address of the webhook, which is a secret
     if isinstance(reason, OSError):
         return reason.strerror or type(reason).__name__
     return type(reason).__name__
 
 
 def delay_s(tries: int) -> float:
-    """Return how long to wait after so many tries that failed, in real time."""
+    """Return the delay after a number of failed attempts, in real time."""
     return float(min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, tries - 1)))

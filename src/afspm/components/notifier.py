@@ -1,4 +1,4 @@
-"""`Notifier`: tells people of what needs them while the experiment goes on. Part of it where its file has [notify]."""
+"""`Notifier`: notifies people during the experiment. Part of every experiment whose file has [notify]."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import experiment_name
 
 MOST_TOLD = 1000
-"""So much is remembered as told; a component that says something else each time must not fill the memory."""
+"""Limit on the delivered notifications to remember: a component that logs ever new texts must not fill the memory."""
 LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
 class Notifier(Component):
-    """Calls a command, a webhook or both when a problem stays unsolved, a component is given up or says CRITICAL.
+    """Calls a command, a webhook or both when a problem stays unsolved, a component is given up or logs CRITICAL.
 
-    [notify] of the experiment file makes it part of an experiment. It only listens, and holds up nobody. What can't be
-    delivered is retried at growing intervals for half an hour; after a restart it continues, and
-    tells nothing twice that was delivered. Of the end of the experiment `afspm run` itself tells, which sees how it
-    ended.
+    [notify] of the experiment file adds it to an experiment. It only subscribes, and delays no other process. A failed
+    delivery is retried at growing intervals for half an hour; retries continue after a restart, and a delivered
+    notification is never sent twice. The end of the experiment is reported by `afspm run` itself, which knows its
+    reason.
 
     Args:
-        program: a command with arguments, run where the experiment file is; the notice is JSON on its standard input.
-        webhook: where that JSON is posted to; "$NAME" is taken from the environment.
-        on: of what to tell: "unsolved-problem", "given-up", "critical".
-        unsolved_after: how long a problem may be flagged before it counts as unsolved, experiment time.
-        folder: where the command is run; [notify] fills in that of the experiment file.
+        program: a command with arguments, run in the experiment file's folder; the JSON is on its standard input.
+        webhook: address for a POST of the JSON; "$NAME" is taken from the environment.
+        on: occasions: "unsolved-problem", "given-up", "critical".
+        unsolved_after: experiment time after which a flagged problem counts as unsolved.
+        folder: working directory of the command; [notify] sets it to the experiment file's folder.
     """
 
     listens: ClassVar = ("ControlState", "ProcessStates", "LogLines")
@@ -74,7 +74,7 @@ class Notifier(Component):
         self.memory.setdefault("waiting", [])
         self._due_s: dict[str, float] = {}
         if self.targets.webhook:
-            notifications.address(self.targets.webhook)  # what can't work is to be known now, not in the night
+            notifications.address(self.targets.webhook)  # a wrong address fails at the start, not in the night
 
     def on_control(self, control_state: ControlState) -> None:
         since_ns = self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()
@@ -88,15 +88,15 @@ class Notifier(Component):
         for state in states.processes:
             if state.condition is ProcessCondition.GIVEN_UP:
                 how = f": {state.last_exit}" if state.last_exit else ""
-                self._tell(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
+                self._queue_once(GIVEN_UP, f"{state.name} {state.starts}", f"{state.name} is given up{how}")
 
     def on_log_lines(self, lines: LogLines) -> None:
-        first: dict[str, str] = {}  # of each process: what follows it belongs to it
+        first: dict[str, str] = {}  # first CRITICAL line of each process; later ones belong to it
         for line in lines.lines:
             if line.level == "CRITICAL" and line.name not in (LOGGED_AS, self.name):
                 first.setdefault(line.name, line.text)
         for name, text in first.items():
-            self._tell(CRITICAL, f"{name} {text}", f"{name}: {text}")
+            self._queue_once(CRITICAL, f"{name} {text}", f"{name}: {text}")
 
     def on_tick(self) -> None:
         now_ns = self.clock.now_ns()
@@ -104,15 +104,14 @@ class Notifier(Component):
             if now_ns - since_ns >= self.unsolved_after * 1e9:
                 name, since = self.scope.problems.name(int(number)), duration_text((now_ns - since_ns) * 1e-9)
                 text = f"{name} has been flagged for {since}, and is not solved"
-                self._tell(UNSOLVED, f"{number} {since_ns}", text)
+                self._queue_once(UNSOLVED, f"{number} {since_ns}", text)
         self._deliver_what_is_due()
 
     def on_end(self) -> None:
         for waiting in self.memory["waiting"][-LAST_TRIES:]:
             self._try(waiting)
 
-    def _tell(self, what: str, which: str, text: str) -> None:
-        """Have it delivered, once."""
+    def _queue_once(self, what: str, which: str, text: str) -> None:
         key = f"{what} {which}"
         if what not in self.on or key in self.memory["told"]:
             return
@@ -128,7 +127,7 @@ class Notifier(Component):
         for waiting in tuple(self.memory["waiting"]):
             if self.clock.monotonic_s() >= self._due_s.get(_key(waiting), 0.0):
                 self._try(waiting)
-                return  # one a tick: in between, what was published is heard
+                return  # one a tick: packets are processed in between
 
     def _try(self, waiting: Plain) -> None:
         key, way = _key(waiting), waiting["way"]

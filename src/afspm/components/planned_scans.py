@@ -1,4 +1,4 @@
-"""Scans by plan: one region repeatedly, a list of regions, or a grid of them. Each is taken exactly once."""
+"""Scans by plan: one region repeatedly, a list of regions, or a grid. Each scan is taken exactly once."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from afspm.model import Region, names
 from afspm.model.names import BASE_PARAMETERS
 
 Pixels = tuple[int, int]
+# parameters that every scan with a region needs of the microscope
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
@@ -34,21 +35,21 @@ _MISSED: dict[Missed, str] = {
 class PlannedScans(Component):
     """Takes the scans of a plan. Derive from it for a plan of your own, and set `plan` (and `beat_s`) in `__init__`.
 
-    Each scan has a key, so that whatever process is killed, and whenever, no scan is left out or taken twice. While
-    control is lost (to the repair of a tip, to a person) the scan waits; what was interrupted is said in the log.
+    Each scan has a key, so no scan is left out or taken twice, even if processes are killed. While control is lost (to
+    the repair of a tip, to a person) the scan waits; an interruption is logged.
 
     Args:
-        keep_control: whether to keep control between the scans; by default others may measure meanwhile.
+        keep_control: whether to keep control between scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
-        missed: what becomes of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
+        missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never.
 
     Attributes:
-        plan: the regions, and how often.
-        beat_s: between the beginnings of two rounds, experiment time; 0 for one right after the other.
-        ends_on_time: whether rounds that are left out since one takes longer than the period count as taken, so that
-            the plan ends when it should. Those while nothing ran, before a restart, don't.
+        plan: the regions, and the number of rounds.
+        beat_s: between the starts of two rounds, experiment time; 0: no pause.
+        ends_on_time: whether rounds that are left out because a round takes longer than the period count as taken, so
+            that the plan ends on time. Rounds missed while no process ran, before a restart, don't count.
     """
 
     needs_actions = (names.START_SCAN,)
@@ -69,7 +70,7 @@ class PlannedScans(Component):
 
     def run(self) -> None:
         self._began_s = self.clock.now_s()
-        self._round_began_s: float | None = None  # None: it was interrupted, or begun in an earlier life
+        self._round_began_s: float | None = None  # None: the round was interrupted, or begun before a restart
         self.memory.setdefault("start_s", self._began_s)
         rhythm = RoundSchedule(float(self.memory["start_s"]), self.beat_s)
         self.memory.save()
@@ -94,7 +95,6 @@ class PlannedScans(Component):
                 self.scope.set(name, quantity)
 
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
-        """Wait until a step is due. Returns False if the rounds that were left out were the last."""
         if not step.starts_round or self.memory.get("begun") == step.index:
             return True
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
@@ -110,18 +110,17 @@ class PlannedScans(Component):
         self._on_missed(left_out - too_slow)
         if self.memory.get("owed"):
             self._add("owed", -1)
-            due_s -= self.beat_s  # begun at once, in place of a round that was missed
+            due_s -= self.beat_s  # begun at once, in place of a missed round
         is_left = self._total is None or step.index < self._total
         if is_left:
             self.scope.sleep(max(0.0, due_s - self.clock.now_s()))
             self.memory["begun"] = step.index
-        # before it is asked for: a scan that a kill interrupts belongs to the beat that it was begun on
+        # saved before the request: a scan interrupted by a kill still belongs to this beat
         self.memory["due_s"] = due_s
         self.memory.save()
         return is_left
 
     def _on_missed(self, rounds: int) -> None:
-        """Do as wanted about rounds that were due while control was lost or nothing ran, and tell log and record."""
         if not rounds:
             return
         if self.missed == "skip":
@@ -131,7 +130,7 @@ class PlannedScans(Component):
         count = rounds * len(self.plan.regions)
         told = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
         self.log.warning("%s", told)
-        with suppress(RequestError):  # a scheduler of another make may know no notes
+        with suppress(RequestError):  # a scheduler of another make may have no notes
             self.scope.note(told)
 
     def _add(self, counter: str, rounds: int) -> None:
@@ -147,7 +146,7 @@ class PlannedScans(Component):
             round_s = self.clock.now_s() - self._round_began_s
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
-        if self.memory.save():  # else a restart asks for it again
+        if self.memory.save():  # if not saved, a restart requests the same scan
             self.scope.forget(step.key)
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
@@ -157,13 +156,12 @@ class PlannedScans(Component):
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), at)
 
     def _left_s(self, done: int, total: int) -> float:
-        """Return how long the rest takes, as fast as so far, but no faster than the beat."""
+        # as fast as so far, but not faster than `every` allows
         per_scan_s = (self.clock.now_s() - float(self.memory["start_s"])) / done
         return (total - done) * max(per_scan_s, self.beat_s / len(self.plan.regions))
 
     @property
     def _total(self) -> int | None:
-        """The number of scans, as far as it is known; None: without end."""
         missed = int(self.memory.get("missed", 0)) * len(self.plan.regions)
         return None if self.plan.total is None else max(self.plan.total - missed, int(self.memory.get("done", 0)))
 
@@ -172,18 +170,18 @@ class PlannedScans(Component):
 
 
 class ScanSeries(PlannedScans):
-    """The same region every so often, for as long or as many scans as wanted.
+    """The same region again and again, with a period, for a number of scans or a duration.
 
-    With neither `scans` nor `duration` it goes on until another component or a person ends the experiment.
+    With neither `scans` nor `duration` it continues until another component or a person ends the experiment.
 
     Args:
         size: (width, height) of the region, e.g. ["2 um", "2 um"].
         center: (x, y) of its middle.
         angle: counter-clockwise.
         pixels: (columns, rows).
-        every: from the beginning of one scan to that of the next, experiment time; 0 for no pause.
-        scans: how many.
-        duration: for how long scans are begun (instead of `scans`).
+        every: from the start of one scan to the start of the next, experiment time; 0 for no pause.
+        scans: number of scans.
+        duration: time within which scans are started (instead of `scans`).
     """
 
     def __init__(
@@ -200,7 +198,7 @@ class ScanSeries(PlannedScans):
         super().__init__(**planned)
         self.beat_s = period(every)
         if scans is not None and duration is not None:
-            raise ConfigError("both `scans` and `duration` are given", hint="one of them says when to end")
+            raise ConfigError("both `scans` and `duration` are given", hint="give one of them")
         rounds = scans if duration is None else rounds_within(duration, every)
         if self.end_when_done and rounds is None:
             raise ConfigError("`end_when_done` without an end", hint="give `scans` or `duration`")
@@ -222,13 +220,13 @@ class ListedRegion:
 
 
 class ScanList(PlannedScans):
-    """Regions of a list, in its order, in one round or several.
+    """Regions of a list, in order, in one or more rounds.
 
     Args:
         regions: each with center, size and angle.
         pixels: (columns, rows) of each.
-        rounds: how often the list is gone through.
-        every: from the beginning of one round to that of the next, experiment time.
+        rounds: number of rounds.
+        every: from the start of one round to the start of the next, experiment time.
     """
 
     def __init__(
@@ -246,7 +244,7 @@ class ScanList(PlannedScans):
 
 
 class RegionGrid(PlannedScans):
-    """A region about each point of a grid, there and back row after row: a map larger than one scan, or samples of one.
+    """A region at each point of a grid, back and forth row by row: a map larger than one scan, or samples of it.
 
     Args:
         size: (width, height) of each region.
@@ -255,8 +253,8 @@ class RegionGrid(PlannedScans):
         center: (x, y) of the middle of the grid.
         angle: of grid and regions, counter-clockwise.
         pixels: (columns, rows) of each scan.
-        rounds: how often the grid is gone through.
-        every: from the beginning of one round to that of the next, experiment time.
+        rounds: number of rounds.
+        every: from the start of one round to the start of the next, experiment time.
     """
 
     def __init__(
@@ -278,14 +276,14 @@ class RegionGrid(PlannedScans):
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Return two numbers as a tuple: from JSON they come as a list."""
+    """Return two numbers, which JSON delivers as a list, as a tuple."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])
 
 
 def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> dict[str, str | float]:
-    """Return the values to set before a scan. Raises ConfigError: one of them has no meaning."""
+    """Return the parameters to set before a scan. Raises ConfigError if one is invalid."""
     parameters = dict(given or {})
     for name, quantity in parameters.items():
         try:
@@ -298,14 +296,14 @@ def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> d
 
 
 def period(every_s: float, where: str = "every") -> float:
-    """Return the time from one round to the next. Raises ConfigError: no such time."""
+    """Return the time from one round to the next. Raises ConfigError if it is negative or infinite."""
     if not 0.0 <= every_s < math.inf:
         raise ConfigError(f"a period of {every_s:g} s", where=where, hint='above zero, for example "15 min"')
     return every_s
 
 
 def shape_of(pixels: Sequence[int], where: str = "pixels") -> tuple[int, int]:
-    """Return (columns, rows) as (rows, columns). Raises ConfigError: a scan of no pixels."""
+    """Return (columns, rows) as (rows, columns). Raises ConfigError for fewer than 1 x 1 pixels."""
     if len(pixels) != 2 or min(pixels) < 1:
         hint = "columns and rows, each at least 1, for example [128, 128]"
         raise ConfigError(f"{list(pixels)} is no number of pixels", where=where, hint=hint)

@@ -1,4 +1,4 @@
-"""`Recorder`: keeps the record of a run. It is part of every experiment, unless [record] of its file says otherwise."""
+"""`Recorder`: keeps the record of a run. Part of every experiment, unless [record] of its file says otherwise."""
 
 from __future__ import annotations
 
@@ -22,23 +22,22 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 REST_S = 0.5
-"""Shortest time, real, to stay after the end of the experiment: for what components say on their way out."""
+"""Shortest real time to stay after the end of the experiment, for the last packets of other components."""
 LONGEST_REST_S = 30.0
-"""Longest such time: until then the supervisor asks the recorder to leave, after the other components."""
+"""Longest such time; before, the supervisor asks the recorder to end, after the other components."""
 SIGNS_OF_LIFE = ("ControlState",)
-"""What a recorder hears of a scheduler whose log it follows."""
+"""Subscription to a scheduler whose log is followed: only to notice that it lives."""
 
 
 class Recorder(Component):
     """Writes `journal.sqlite`, and every scan and spectrum as an HDF5 file, into the folder of the run.
 
-    It follows the scheduler's packet log, and lets all others have the processor first. Whatever is killed, also
-    everything at once, nothing that was published is missing in the record of a run that is resumed, and nothing is
-    there twice. A disk that is full is logged; the experiment goes on, and what was missed is recorded once there is
-    room, as far as it is still kept then.
+    It follows the scheduler's packet log at low processor priority. Even if all processes are killed at once, the
+    record of a resumed run has each published packet exactly once. A full disk is logged; the experiment goes on, and
+    missed packets are recorded once there is room, as far as the log still has them.
 
     Args:
-        scans: whether scans and spectra are kept; else only the journal is.
+        scans: whether to keep scans and spectra; otherwise only the journal.
     """
 
     listens: ClassVar = ("",)
@@ -56,7 +55,7 @@ class Recorder(Component):
         launch = context.launch
         run_dir = Path(launch.run_dir or ".")
         context.activity.longest_step_s = self.longest_step_s
-        # one that keeps a log need not send us everything, too
+        # a scheduler with a log need not send all packets, too
         heard = SIGNS_OF_LIFE if len(launch.sockets.subscribe) == 1 else None
         port = context.open_port(heard)
         source = launch.sockets.subscribe[0] if launch.sockets.subscribe else ""
@@ -68,7 +67,7 @@ class Recorder(Component):
             context.clock,
             context.log,
             step=context.activity.step,
-            wake=lambda: port.wake_up(),  # of whichever is open then
+            wake=lambda: port.wake_up(),  # the port may have been replaced by then
         )
         writer.start()
         ended_s, until_s, is_to_ask_again = math.inf, math.inf, False
@@ -118,7 +117,6 @@ def _about(context: ProcessContext, run_dir: Path, *, scans: bool) -> RecordSett
 
 
 def _seeds(file: Path) -> Plain:
-    """The seed of each component that has one, as the experiment file says."""
     try:
         said = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,4 +1,4 @@
-"""The recorder's thread: it follows the packet log, and writes the record, so that a slow disk holds up nobody."""
+"""The recorder's thread: follows the packet log and writes the record, so that a slow disk delays no other process."""
 
 from __future__ import annotations
 
@@ -18,14 +18,19 @@ from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import SEGMENT_BYTES, START, LogReader, Position, commit, committed
 
 MOST_BYTES = 256 << 20
-"""So much of other publishers waits at most; beyond it all is dropped, and asked for again once there is room."""
+"""Limit on waiting packets of other publishers; beyond it all are dropped, and asked for again once there is room."""
+# backlog above which a warning is logged: the log is finite, and its oldest packets are overwritten
 FAR_BEHIND_BYTES = 64 << 20
+# limits the memory for one batch, and the length of one step
 AT_ONCE_BYTES = 32 << 20
 LOOK_S = 0.1
-"""How often the log is looked at: nothing is recorded while it is still on its way to others."""
+"""Interval of reads of the log: delivery to other processes comes before recording."""
 AGAIN_S = 2.0
+# after a silence incomplete scans are written, too: their last channel may never come
 QUIET_S = 1.0
+# each commit syncs the disk, so not after every packet
 COMMIT_S = 1.0
+# a run that stops may be resumed, and then the log is read on from the last commit: no need to wait long
 LAST_WORDS_S = 30.0
 STOPPING_S = 1.0
 
@@ -33,7 +38,7 @@ DISK_ERRORS = (OSError, sqlite3.OperationalError)
 
 
 class SourcedPacket(NamedTuple):
-    """A packet with the address of its publisher; `before` is where it stands in the log, None if it came by itself."""
+    """A packet with its publisher's address; `before` is its position in the log, None if it is not from the log."""
 
     packet: Packet
     source: str = SCHEDULER
@@ -41,13 +46,13 @@ class SourcedPacket(NamedTuple):
 
 
 class RecordWriter:
-    """Records the packets of the log, and those that it is given, in a thread.
+    """Records packets of the log, and packets given by `put`, in a thread.
 
     Args:
         folder: of the run.
-        log: folder of the packet log; without one, everything is given by `put`.
+        log: folder of the packet log; without one, all packets are given by `put`.
         step: entered around everything that takes time.
-        wake: called when `check` or `wants_replay` has something to say.
+        wake: called when `check` or `wants_replay` has news.
     """
 
     def __init__(
@@ -74,49 +79,48 @@ class RecordWriter:
         self._heard_s = self._committed_s = clock.monotonic_s()
         self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
 
-    # --- called by the one who listens ---
+    # --- called from the listener's thread ---
 
     def start(self) -> None:
         self._thread.start()
 
     def put(self, packet: Packet, source: str) -> None:
-        """Have a packet recorded that is not in the log."""
+        """Queue a packet that is not in the log."""
         if packet.time_ns is None:  # of a publisher of another make
             packet = Packet(packet.envelope, packet.payload, self._clock.now_ns())
         self._inbox.put(SourcedPacket(packet, source), is_disk_full=self._told_full)
 
     def wants_replay(self) -> bool:
-        """Return whether to ask publishers again for what they keep: something was missed, and there is room now."""
+        """Return whether to ask publishers for their cached packets: some were missed, and the disk has room now."""
         return self._inbox.wants_replay()
 
     def check(self) -> None:
-        """Raise what has ended the writing, if anything."""
+        """Raise the error that ended the writing, if there is one."""
         if self._error is not None:
             raise self._error
 
     def finish(self, *, ended: bool) -> None:
-        """Record what is left; returns when that is done, or takes too long.
+        """Record the remaining packets; return once they are recorded, or after a time limit.
 
         Args:
-            ended: the experiment has ended; else it may go on another time.
+            ended: whether the experiment has ended; otherwise it may be resumed.
         """
         within_s = LAST_WORDS_S if ended else STOPPING_S
         self._inbox.end(self._clock.monotonic_s() + within_s, ended=ended)
         self._thread.join(within_s + AGAIN_S)
         self.check()
 
-    # --- the thread ---
+    # --- in the writer's thread ---
 
     def _run(self) -> None:
         try:
             while (store := self._opened()) is not None and (damage := self._record_all(store)) is not None:
                 self._put_aside(damage)
-        except BaseException as error:
+        except BaseException as error:  # of any kind: `check` raises it in the thread that can end the process
             self._error = error
             self._wake()
 
     def _record_all(self, store: RecordStore) -> FileError | None:
-        """Record until it is over, or the journal turns out to be damaged: then return how."""
         try:
             while self._go_on(store):
                 pass
@@ -141,7 +145,7 @@ class RecordWriter:
                 self._put_aside(error)
 
     def _put_aside(self, error: FileError) -> None:
-        """A journal that can't be read is no reason to record nothing."""
+        # a damaged journal must not keep the rest of the night from being recorded
         number = len(list(self._folder.glob(f"{JOURNAL_FILE}.damaged-*"))) + 1
         for suffix in ("", "-wal", "-shm"):
             file = self._folder / f"{JOURNAL_FILE}{suffix}"
@@ -153,7 +157,6 @@ class RecordWriter:
         self._wake()
 
     def _go_on(self, store: RecordStore) -> bool:
-        """Record what has come; False: it is over."""
         batch, ending = self._next()
         now_s = self._clock.monotonic_s()
         if batch:
@@ -171,7 +174,6 @@ class RecordWriter:
         return False
 
     def _next(self) -> tuple[list[SourcedPacket], bool | None]:
-        """Return the next packets; none if nothing has come for a while, or it is ending."""
         queued, ending = self._inbox.take(within_s=0.0 if self._told_behind else LOOK_S)
         logged: list[SourcedPacket] = []
         try:
@@ -190,7 +192,6 @@ class RecordWriter:
         self._told_behind = behind > (0 if self._told_behind else FAR_BEHIND_BYTES)
 
     def _safely(self, do: Callable[[], None]) -> bool:
-        """Do it as soon as there is room on the disk; False: it is ending, and there was none."""
         while True:
             try:
                 with self._step():
@@ -207,7 +208,7 @@ class RecordWriter:
             return True
 
     def _put_off(self, error: Exception) -> bool:
-        """The disk is full, or gone: said once, and tried again in a while. False: it is ending, and too late."""
+        # the disk is full or gone: logged once, then tried again until it has room, or the run ends
         if not self._told_full:
             self._told_full = True
             self._logger.critical("nothing can be recorded, the experiment goes on: %s", error)
@@ -225,7 +226,7 @@ class RecordWriter:
             store.settle()
 
     def _commit(self, store: RecordStore) -> None:
-        """Say up to where everything is recorded, so that the log may be written over."""
+        # the log may be overwritten up to here
         self._committed_s = self._clock.monotonic_s()
         try:
             with self._step():
@@ -235,7 +236,7 @@ class RecordWriter:
 
 
 class RecordInbox:
-    """Packets that wait to be recorded, and how it is going to end: what listener and writing thread share."""
+    """Packets that wait to be recorded, and the end of the recording: the state that listener and writer share."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -247,7 +248,7 @@ class RecordInbox:
         self._until_s = 0.0
 
     def put(self, packet: SourcedPacket, *, is_disk_full: bool) -> None:
-        """Add a packet; of too many that find no room on the disk none is kept, and publishers are asked for them."""
+        """Queue a packet. If too many wait for room on the disk, all are dropped, to be asked for again later."""
         with self._changed:
             self._queue.append(packet)
             self._bytes += len(packet.packet.payload)
@@ -257,48 +258,47 @@ class RecordInbox:
             self._changed.notify()
 
     def take(self, *, within_s: float) -> tuple[list[SourcedPacket], bool | None]:
-        """Return what has come, and how it ends if it does; waits for much at once, or for the end."""
+        """Return queued packets, and the end if it has come. Waits for many packets, or for the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._bytes > AT_ONCE_BYTES or self._ending is not None, within_s)
             queued, self._queue, self._bytes = self._queue, [], 0
             return queued, self._ending
 
     def end(self, until_s: float, *, ended: bool) -> None:
-        """Let the writing end until then; `ended`: so has the experiment."""
+        """Let the writing end until `until_s`; `ended`: the experiment has ended, too."""
         with self._changed:
             self._ending, self._until_s = ended, until_s
             self._changed.notify()
 
     def pause(self) -> float | None:
-        """Wait a while for room on the disk; return until when that is possible, None: for ever."""
+        """Wait a while for room on the disk; return the time limit for that, None if there is none."""
         with self._changed:
             self._changed.wait_for(lambda: False, AGAIN_S if self._ending is None else AGAIN_S / 10)
             return None if self._ending is None else self._until_s
 
     def want_replay(self) -> None:
-        """Have publishers asked again for what they keep."""
         with self._changed:
             self._wants_replay = True
 
     def has_room_for_missed(self) -> bool:
-        """Have publishers asked again if something was missed; return whether it was."""
+        """Have publishers asked for their cached packets if some were missed; return whether some were."""
         with self._changed:
             missed, self._missed = self._missed, False
             self._wants_replay = self._wants_replay or missed
             return missed
 
     def wants_replay(self) -> bool:
-        """Return whether publishers are to be asked again, once."""
+        """Return, once, whether to ask publishers for their cached packets."""
         with self._changed:
             wanted, self._wants_replay = self._wants_replay, False
             return wanted
 
 
 class LogProgress:
-    """The progress of reading a log, and of recording it.
+    """Progress of reading a packet log, and of recording it.
 
     Args:
-        log: folder of the packet log; it need not be there.
+        log: folder of the packet log; it may be missing.
     """
 
     def __init__(self, log: Path) -> None:
@@ -309,16 +309,15 @@ class LogProgress:
         self._waiting: dict[tuple[int | None, str], Position] = {}
 
     def begin_again(self) -> None:
-        """Read everything that the log still has."""
         self._reader = LogReader(self._log)
         self._waiting.clear()
 
     def stop(self) -> None:
-        """Say no more: something was read that could not be recorded."""
+        """Commit no more: a packet was read that could not be recorded."""
         self._stopped = True
 
     def read(self) -> list[SourcedPacket]:
-        """Return the packets that came since, some at a time."""
+        """Return the next packets of the log, a limited number of bytes at a time."""
         before = self._reader.position
         found = []
         for entry, behind in self._reader.read(AT_ONCE_BYTES):
@@ -327,11 +326,11 @@ class LogProgress:
         return found
 
     def behind_bytes(self) -> int:
-        """Return about how much of the log is not read yet, in whole segments."""
+        """Return the approximate size of the unread part of the log, in whole segments."""
         return max(0, self._reader.newest - self._reader.position.segment - 1) * SEGMENT_BYTES
 
     def took(self, batch: list[SourcedPacket], waiting: list[Packet]) -> None:
-        """Note which packets are recorded only when others have come."""
+        """Note packets that will be recorded only after later ones have arrived."""
         for packet, _, before in batch:
             if before is not None:
                 self._waiting.setdefault((packet.time_ns, packet.envelope), before)
@@ -339,7 +338,7 @@ class LogProgress:
         self._waiting = {key: before for key, before in self._waiting.items() if key in still}
 
     def commit(self, sync: Callable[[], None]) -> None:
-        """Say how far it is recorded, once `sync` has put that on the disk. Raises OSError."""
+        """Commit the position up to which all is recorded, after `sync` has put it on the disk. Raises OSError."""
         position = min(self._waiting.values(), default=self._reader.position)
         if self._stopped or position <= self._committed or committed(self._log) is None:
             return

@@ -1,4 +1,4 @@
-"""Plans of scans and the times when they are due, as plain values that need no microscope."""
+"""Plans of scans, and the times when they are due, as plain values that need no microscope."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ class PlanStep:
 
     Attributes:
         index: its place in the plan, from 0.
-        key: names it within its plan, the same in every life of the component: whatever has been asked for under a
-            key is not measured again.
+        key: idempotency key, the same after a restart of the component: a measurement is taken only once for each key.
         region: where to scan.
-        shape: pixels as (rows, columns); None leaves what is set.
-        starts_round: whether it waits for the plan's period; the steps that follow in the round do not.
+        shape: pixels as (rows, columns); None leaves them unchanged.
+        starts_round: whether it waits for the plan's period; later steps of the round do not.
     """
 
     index: int
@@ -35,12 +34,12 @@ class PlanStep:
 
 @dataclass(frozen=True)
 class ScanPlan:
-    """Regions that are scanned one after the other, in one round or many.
+    """Regions that are scanned one after the other, in one or more rounds.
 
     Attributes:
-        regions: those of one round.
-        shape: pixels as (rows, columns); None leaves what is set.
-        rounds: how often they are gone through; None: without end.
+        regions: of one round.
+        shape: pixels as (rows, columns); None leaves them unchanged.
+        rounds: number of rounds; None: without end.
     """
 
     regions: tuple[Region, ...]
@@ -49,13 +48,13 @@ class ScanPlan:
 
     def __post_init__(self) -> None:
         if not self.regions:
-            raise InvalidValue("a plan needs a region at least")
+            raise InvalidValue("a plan needs at least one region")
         if self.rounds is not None and self.rounds < 1:
-            raise InvalidValue(f"a plan is gone through once at least, not {self.rounds} times")
+            raise InvalidValue(f"a plan needs at least 1 round, not {self.rounds}")
 
     @property
     def total(self) -> int | None:
-        """The number of scans; None: without end."""
+        """Number of scans; None: without end."""
         return None if self.rounds is None else self.rounds * len(self.regions)
 
     def step(self, index: int) -> PlanStep:
@@ -72,14 +71,14 @@ class ScanPlan:
 
 @dataclass(frozen=True)
 class RoundSchedule:
-    """The times when the rounds of a plan are due: multiples of a period after the beginning, in experiment time.
+    """Due times of the rounds of a plan: multiples of a period after the start, in experiment time.
 
-    Rounds whose time goes by while one is taken, or waits for the repair of a tip, are missed: the next is due on the
-    old beat.
+    A round is missed if its time passes while another is taken, or waits for the repair of a tip; the next one is due
+    at the next multiple.
 
     Attributes:
         start_s: when the first is due.
-        period_s: 0 for one right after the other.
+        period_s: between two rounds; 0: no pause.
     """
 
     start_s: float
@@ -90,31 +89,31 @@ class RoundSchedule:
             raise InvalidValue(f"a period of {self.period_s} s")
 
     def next_due_s(self, done_s: float | None) -> float:
-        """Return when the round after the one that was done at `done_s` is due; None: none was."""
+        """Return when the next round is due after one that ended at `done_s`; None: none has ended yet."""
         if done_s is None or self.period_s == 0.0:
             return self.start_s
         beats = math.floor((done_s - self.start_s) / self.period_s) + 1
         return self.start_s + max(beats, 0) * self.period_s
 
     def left_out(self, due_s: float, next_due_s: float) -> int:
-        """Return how many rounds lie between two that were due one after the other."""
+        """Return the number of rounds missed between two due times."""
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
     def too_slow_for(self, left_out: int, pace_s: float) -> int:
-        """Return how many of these rounds were left out since one takes `pace_s`, longer than the period."""
+        """Return how many of these rounds were missed because one takes `pace_s`, longer than the period."""
         return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:
-    """Return the points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
+    """Return the points of a grid about a centre, starting at the row of smallest y; every other row runs backwards.
 
     Args:
         counts: (columns, rows).
-        spacing_m: (x, y) between neighbours, along the axes of the turned grid.
+        spacing_m: (x, y) between neighbours, along the axes of the rotated grid.
     """
     columns, rows = counts
     if columns < 1 or rows < 1:
-        raise InvalidValue(f"a grid of {columns} x {rows} points has none")
+        raise InvalidValue(f"a grid of {columns} x {rows} points is empty")
     for count, step_m in zip(counts, spacing_m, strict=True):
         if count > 1 and not step_m > 0.0:
             raise InvalidValue(
@@ -123,7 +122,7 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     points = []
     for row in range(rows):
-        # there and back: the piezo need not fly over the whole grid, and creeps less
+        # back and forth: the piezo makes no long jumps, and creeps less
         order = range(columns) if row % 2 == 0 else reversed(range(columns))
         for column in order:
             u = (column - (columns - 1) / 2) * spacing_m[0]
@@ -133,7 +132,7 @@ def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad
 
 
 def rounds_within(duration_s: float, period_s: float) -> int:
-    """Return how many rounds begin within a duration; the first begins at once."""
+    """Return the number of rounds that start within a duration; the first starts at once."""
     if period_s <= 0.0:
         raise InvalidValue("a series with a duration needs a period", hint='e.g. every = "15 min"')
     return math.floor(duration_s / period_s * (1 + 1e-12)) + 1

@@ -1,4 +1,4 @@
-"""Spectra on a grid or a list of positions, each exactly once."""
+"""Spectra on a grid or a list of positions, each taken exactly once."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from afspm.components.scan_plan import grid_centers
 from afspm.model import names
 
 MOST_LINES = 20
-"""In the log, on the progress of a grid; what looks on is told of each spectrum."""
+"""Limit on log lines about the progress of a grid; `scope.progress` reports each spectrum."""
 
 
 class SpectroscopyGrid(Component):
-    """A spectrum at each point of a grid, or of a list; points are gone to there and back, row after row.
+    """A spectrum at each point of a grid, back and forth row by row, or at each position of a list.
 
-    Whatever process is killed, and whenever, no spectrum is left out or taken twice.
+    No spectrum is left out or taken twice, even if processes are killed.
 
     Args:
         counts: (columns, rows) of the grid.
         spacing: (x, y) from one point to the next.
-        center: (x, y) of the middle of the grid; (0, 0) if not told.
-        angle: of the grid, counter-clockwise; 0 if not told.
+        center: (x, y) of the middle of the grid; by default (0, 0).
+        angle: of the grid, counter-clockwise; by default 0.
         positions: a list of (x, y) instead of a grid.
-        kind: what is measured, where the microscope can choose, e.g. "IV" or "force".
-        repeats: how many spectra at each point.
+        kind: of the spectrum, if the microscope has several, e.g. "IV" or "force".
+        repeats: number of spectra at each point.
         end_when_done: whether to end the whole experiment after the last.
     """
 
@@ -63,7 +63,7 @@ class SpectroscopyGrid(Component):
         if not self.positions:
             raise ConfigError("no position is listed", where="positions")
         if repeats < 1:
-            raise ConfigError(f"{repeats} repeats are none", where="repeats")
+            raise ConfigError(f"{repeats} is not at least 1", where="repeats")
         self.kind = kind
         self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else []))
         self.repeats = repeats
@@ -77,7 +77,7 @@ class SpectroscopyGrid(Component):
             key = f"spectrum-{place}-{repeat}"
             self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
             self.memory["done"] = index + 1
-            if self.memory.save():  # else a restart asks for it again
+            if self.memory.save():  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
             per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
             self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))

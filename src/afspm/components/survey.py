@@ -27,40 +27,40 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: narrower ones are often refused, and below 8 px nothing is tried."""
+"""Least width of a zoom in pixels of the survey: registration often refuses narrower ones, and all below 8 px."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
 class Survey(Component):
-    """Takes a wide scan, finds targets in it, takes a zoom of each and curves on and beside it.
+    """Takes a wide scan, finds targets in it, and takes a zoom and curves at each target.
 
-    It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture:
-    the survey with its numbered targets, their zooms and curves. A target whose zoom or curve is refused, by a limit
-    for instance, is in the table with the reason, and the next one follows. With a Drift Compensated Scheduler the
-    positions are those of the sample.
+    It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture: the
+    survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
+    instance by a limit, the table has the reason, and the survey goes on with the next target. With a Drift Compensated
+    Scheduler, positions are those on the sample.
 
-    Whatever is killed, and whenever, each scan and each curve is taken once. When the experiment ends early the table
-    and the picture hold what there is. The keys of what was measured are `survey`, `zoom-3`, `curve-top-3` and so on:
+    Each scan and each curve is taken once, even if processes are killed. If the experiment ends early, table and
+    picture show the measurements up to then. Their keys are `survey`, `zoom-3`, `curve-top-3` and so on:
     `run.scan("zoom-3")` finds them in the record.
 
     Args:
         size: (width, height) of the survey, or one length for both.
         zoom: (width, height) of each zoom, or one length for both.
-        curves: by name, where curves are taken: a pair is an offset (x, y) from the target, a length the distance at
-            which the zoom is lowest, 0 the target itself, e.g. {top = "0 nm", beside = "150 nm"}.
-        kind: of the curves, where the microscope can choose, e.g. "IV" or "force".
-        count: the most targets that are visited.
+        curves: places of curves, by name: a pair is an offset (x, y) from the target; a length is a distance, at which
+            the lowest place of the zoom is taken; 0 is the target itself, e.g. {top = "0 nm", beside = "150 nm"}.
+        kind: of the curves, if the microscope has several, e.g. "IV" or "force".
+        count: largest number of targets to visit.
         center: (x, y) of the middle of the survey.
         angle: of survey and zooms, counter-clockwise.
-        pixels: (columns, rows) of the survey. By default 128, or as many as it takes, up to 512, for a zoom to be 20
-            pixels of the survey wide: with fewer it can't be relied on that drift is followed from survey to zoom.
+        pixels: (columns, rows) of the survey. By default 128, or, up to 512, the number at which a zoom is 20 pixels of
+            the survey wide: with fewer, drift between survey and zoom may not be followed.
         zoom_pixels: (columns, rows) of each zoom.
-        channel: that targets are found in.
+        channel: channel in which targets are found.
         min_height: of a particle above the ground around it; by default six times the noise.
         separation: of two particles that are nearer to each other only the higher counts; by default half a zoom.
-        targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it is given the
+        targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it gets the
             `Scan`, and returns positions (x, y) in metres, the best first.
-        refine: whether a target is found again in its zoom, so that curves are taken where it is there.
+        refine: whether to find the target again in its zoom, so that curves are taken at its place there.
         parameters: set before the survey, e.g. {scan-speed = "10 um/s"}.
         zoom_parameters: set before the zooms.
         end_when_done: whether to end the whole experiment after the last target.
@@ -68,7 +68,7 @@ class Survey(Component):
     """
 
     drift_doubts: tuple[ConfigError, ...]
-    """What `afspm check` warns of where drift is corrected."""
+    """Warnings of `afspm check` if drift is corrected."""
     requires = ("afspm[features]",)
     needs_actions: tuple[str, ...] = (names.START_SCAN,)
     _outage = OutageLog("the table of targets can't be written", logging.getLogger("afspm.records"))
@@ -112,9 +112,9 @@ class Survey(Component):
         if targets is not None:
             for name, value in {"min_height": min_height, "separation": separation}.items():
                 if value is not None:
-                    raise ConfigError("is of particles, and says nothing of `targets`", where=name)
+                    raise ConfigError("applies to particles only, not to `targets`", where=name)
         if count < 1:
-            raise ConfigError(f"{count} targets are none", where="count")
+            raise ConfigError(f"{count} is not at least 1", where="count")
         for name, value in {"min_height": min_height, "separation": separation}.items():
             if value is not None and value < 0.0:
                 raise ConfigError(f"{lengths_text([value])} is below zero", where=name)
@@ -131,7 +131,7 @@ class Survey(Component):
         self.needs_parameters = (*FRAME, *probe, *parameters)
 
     def check(self) -> None:
-        """Raise ConfigError: the function that finds targets is not there."""
+        """Raise ConfigError if the function that finds targets does not exist."""
         self.finder.check()
 
     def run(self) -> None:
@@ -149,7 +149,7 @@ class Survey(Component):
             self._visit(visit, mappings)
             self._keep(self._record)
             self.scope.progress(visit.number, len(visits))
-            if visit.number > int(self.memory.get("done", 0)):  # else it was told in an earlier life
+            if visit.number > int(self.memory.get("done", 0)):  # else it was logged before a restart
                 self._tell(visit, self._record.outcome(visit))
                 self.memory["done"] = visit.number
                 self.memory.save()
@@ -178,7 +178,7 @@ class Survey(Component):
                     self.scope.set(name, quantity)
 
     def _targets(self, survey: Scan) -> list[Target]:
-        # saved, so that they are the same in every life: a user's function may be random
+        # saved, so that they are the same after a restart: a user's function may be random
         if "targets" not in self.memory:
             with self.clock.late():
                 found = self.finder.targets(survey)
@@ -212,7 +212,7 @@ class Survey(Component):
     def _position(
         self, visit: Visit, scans: ScanSet, mappings: Events
     ) -> tuple[RegistrationOutcome | None, float | None]:
-        # by the mapping that the scheduler published just before the zoom
+        # the scheduler publishes the mapping just before the zoom
         kept = self.memory.setdefault("positions", {})
         files = {scan.filename for scan in scans.values() if scan.filename}
         for event in mappings:
@@ -223,7 +223,7 @@ class Survey(Component):
         return None if outcome is None else RegistrationOutcome(outcome), sd_m
 
     def _center(self, visit: Visit, zoom: Scan) -> XY:
-        # saved, so that it is the same in every life
+        # saved, so that it is the same after a restart
         centers = self.memory.setdefault("centers", {})
         if str(visit.number) not in centers:
             with self.clock.late():
@@ -289,7 +289,7 @@ def _too_coarse(wide: Region, pixels: Pixels, closer: Region, *, is_given: bool)
 
 @dataclass(frozen=True)
 class _ScanSetup:
-    """A region with its pixels as (rows, columns), and the parameters that are set before it is scanned."""
+    """A region with its pixels as (rows, columns), and the parameters to set before its scan."""
 
     region: Region
     shape: tuple[int, int]
@@ -298,7 +298,7 @@ class _ScanSetup:
 
 @dataclass(frozen=True)
 class _CurvePlace:
-    """Where a curve is taken: at an offset from the target, or at a distance where its zoom is lowest."""
+    """Place of a curve: an offset from the target, or a distance at which the lowest place of the zoom is taken."""
 
     offset_m: XY
     distance_m: float = 0.0
@@ -334,12 +334,12 @@ class TargetFinder:
     """Finds targets in a survey, and each of them again in its zoom.
 
     Attributes:
-        function: of the user, "module.name"; None: particles.
-        count: at most so many.
-        min_height: of a particle, in the unit of the scan; None: what stands out of the noise.
-        separation_m: of two particles that are nearer, only the higher counts.
-        widest_m: of the survey: a particle in a zoom may fill it, and is not ground.
-        refines: whether they are found again in their zooms.
+        function: the user's, "module.name"; None: find particles.
+        count: largest number of targets.
+        min_height: of a particle, in the unit of the scan; None: six times the noise.
+        separation_m: of two particles that are nearer to each other only the higher counts.
+        widest_m: width of the survey: a particle that fills its zoom must not be taken for ground.
+        refines: whether targets are found again in their zooms.
     """
 
     function: str | None
@@ -350,18 +350,17 @@ class TargetFinder:
     refines: bool
 
     def check(self) -> None:
-        """Raise ConfigError: the function is not there."""
         if self.function is not None:
             self._function(self.function)
 
     def targets(self, survey: Scan) -> list[Target]:
-        """Return the targets in a survey, in the order in which they are to be visited."""
+        """Return the targets in a survey, in the order of their visits."""
         if self.function is None:
             return find_particles(survey, self.count, min_height=self.min_height, separation_m=self.separation_m)
         return self._of_function(self.function, survey)[: self.count]
 
     def again(self, zoom: Scan, target: Target) -> XY:
-        """Return where a target lies in its zoom, or where the survey showed it if it is not found there."""
+        """Return the position of a target in its zoom, or that in the survey if it is not found."""
         if not self.refines:
             return target.position_m
         if self.function is None:

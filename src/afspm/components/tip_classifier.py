@@ -1,4 +1,4 @@
-"""`TipClassifier`: sees in the scans that the tip has changed, and that it is good again."""
+"""`TipClassifier`: detects in the scans that the tip has changed, and that it is good again."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion
 
 
 class TipClassifier(Component):
-    """Flags `tip-shape-changed` when scans say that the tip is blunt, double or carries debris, and clears it again.
+    """Flags `tip-shape-changed` when scans show that the tip is blunt, double or carries debris, and clears it again.
 
-    It learns what a good tip shows from the first scans of each size and number of pixels, so the tip has to be good
-    then; it learns nothing while a problem is flagged or the last scan judged was not good. It judges best a place that
-    it has seen before; elsewhere it sees only large changes. What it thinks of each scan it publishes as a
+    It learns the reference from the first scans of each size and number of pixels, so the tip must be good then; it
+    learns nothing while a problem is flagged or after a scan that was not good. It judges best at places that it has
+    seen before; elsewhere it detects only large changes. The verdict on each scan is published as a
     `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
 
     Args:
         channel: of the heights.
-        retrace_channel: their retrace; empty where it is not recorded (then debris is not seen).
-        reference_scans: how many scans of each kind it learns from.
+        retrace_channel: their retrace; empty if not recorded (then debris is not detected).
+        reference_scans: number of scans of each kind for the reference.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
         detail: share of the fine detail at a known place below which the tip is blunt.
         ghost: correlation of a ghost image at a known place above which the tip is double.
         unrest: factor on the disagreement of trace and retrace above which it carries debris.
-        worn: share of the first scans' fine detail below which it is worn, wherever that is seen.
+        worn: share of the first scans' fine detail below which the tip is worn, at any place.
         sigmas: standard deviations of the reference beyond which a scan must lie to be bad.
-        problem: what it flags.
+        problem: the problem to flag.
     """
 
     flags: ClassVar = ("tip-shape-changed",)
@@ -69,16 +69,16 @@ class TipClassifier(Component):
     def on_control(self, control_state: ControlState) -> None:
         was, self._problems = self._is_flagged, control_state.problems
         if self._is_flagged and not was and self.counter.bad < self.counter.flag_after:
-            self.counter.good = 0  # flagged by another component or person: only later scans can tell that it is over
+            self.counter.good = 0  # flagged by another component or a person: only later scans can clear it
         elif was and not self._is_flagged:
-            self.counter.bad = 0  # repaired, or cleared by a person: only later scans can tell that it is bad again
+            self.counter.bad = 0  # repaired, or cleared by a person: only later scans can flag it
             self.judge.trust()
             self._save()
 
     def on_scan(self, scan: Scan) -> None:
         self.expected.see(scan)
         pair = self.pairing.add(scan)
-        # a replay after a restart brings what was judged already
+        # replayed after a restart: judged already
         if pair is None or (scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1)):
             return
         self._judge(pair)
@@ -94,11 +94,12 @@ class TipClassifier(Component):
             self.log.warning("%s is not a height: %s", pair.trace.channel, error)
             return
         self.counter.count(verdict.opinion)
-        self._tell(pair.trace, verdict)
+        self._announce(pair.trace, verdict)
         self._remember(pair.trace)
 
-    def _tell(self, scan: Scan, verdict: Verdict) -> None:
-        """Flag after a bad verdict, so that a solver knows where; clear before a good one, so that it finds no flag."""
+    def _announce(self, scan: Scan, verdict: Verdict) -> None:
+        # A solver needs the verdict to know where the fault is, and must find no flag after a good one:
+        # so flag after a bad verdict, clear before a good one.
         self.log.info("%s: %s (%s)", _name(scan), verdict.opinion.value, verdict.why)
         if self.counter.wants_clear and self._is_flagged:
             self.log.info("the tip is good again: %s", verdict.why)

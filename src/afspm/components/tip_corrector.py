@@ -1,4 +1,4 @@
-"""`TipCorrector`: repairs a tip that was flagged, within what it is allowed to do."""
+"""`TipCorrector`: repairs a tip that was flagged, with the treatments that it is allowed."""
 
 from __future__ import annotations
 
@@ -21,42 +21,43 @@ from afspm.model import Problem, Region, Scan, ScanSet, names
 
 Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns."""
-LAST_FRAMES = 16  # of scans that a verdict may still come for
-VERDICT_WITHIN_S = 20.0  # real time: a classifier that says nothing for that long will not
+LAST_FRAMES = 16  # scans whose verdict may still arrive
+VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected
 
 
 class TipCorrector(Component):
-    """Solves `tip-shape-changed`: pulses of the bias, one after the other, then controlled crashes, deeper and deeper.
+    """Solves `tip-shape-changed` by pulses of the bias, one after the other, then by ever deeper controlled crashes.
 
-    After each it takes a test scan: of the region, with the pixels, of the scan last judged bad, since the fault was
-    seen there; without such a verdict, of the region set last. A component that judges scans (the `TipClassifier`)
+    After each treatment it takes a test scan, with the region and pixels of the scan last judged bad, since the fault
+    was seen there; without such a verdict, of the current region. A component that judges scans (the `TipClassifier`)
     clears the flag when the tip is good, which takes control from the corrector: the experiment goes on. The lists
-    below are all that one repair may do, over restarts too; what a limit of the experiment file or the microscope
-    refuses is logged and left out. When nothing is left it flags `device-malfunction` and waits for a person: the
-    experiment stops measuring rather than measuring with a bad tip. Once that flag is removed it may try again.
+    below are all that one repair may do, also over restarts; a treatment that a limit of the experiment file or the
+    microscope refuses is logged and left out. After the last treatment it flags `device-malfunction` and waits for a
+    person: the experiment stops measuring rather than measure with a bad tip. Once that flag is cleared it may try
+    again.
 
-    What it does to the sample it does at fresh places about `workshop_center`, and never within `keep_away` of the
-    experiment's region or of the test scan. Where control is lost on the way to one of them, to a person who moves the
-    probe, say, it begins again with another place when control is back. It does nothing where the probe is not
-    published to stand there, nor what it can't write down, on a full disk: a restart would do it again. It publishes
-    each action done as an `ActionMsg`.
+    Treatments are made at fresh places about `workshop_center`, never within `keep_away` of the experiment's region or
+    of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), it continues with
+    another place when it has control again. It makes no treatment unless the probe's published position is the place,
+    nor one that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as an
+    `ActionMsg`.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
-        test_center: (x, y) of a first test scan, so that a tip that is worse stays off the experiment's region.
-            Whether it is good is seen best where the fault was seen; there it is tested next, or at once if no place
-            is given here.
-        pulse_voltages: those of one repair, in order.
+        test_center: (x, y) of a first test scan, so that a worse tip stays off the experiment's region. The next test
+            scan is where the fault was seen, which shows best whether the tip is good; without `test_center` it is the
+            first.
+        pulse_voltages: of one repair, in order.
         pulse_duration: of each pulse.
-        crash_depths: those of one repair, in order, after the pulses.
+        crash_depths: of one repair, in order, after the pulses.
         crash_speed: of each crash.
         place_spacing: between the places of two treatments.
         keep_away: least distance of a treatment from the experiment's region and the test scans.
-        judge: "classifier" waits for whoever judges scans to clear the flag; "self" judges the test scans by the first
-            scans of the experiment, and clears it.
+        judge: "classifier" waits until the component that judges scans clears the flag; "self" compares the test scans
+            with the first scans of the experiment, and clears it.
         channel, retrace_channel: of the heights, for judge = "self".
         reference_scans: for judge = "self".
-        problem: what it solves.
+        problem: the problem to solve.
     """
 
     solves: ClassVar = ("tip-shape-changed",)
@@ -83,7 +84,7 @@ class TipCorrector(Component):
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
-        # `afspm check` holds them against the limits
+        # `afspm check` compares them with the limits
         self.positions = tuple(place for place in (self.workshop_center, self.test_center) if place is not None)
         self.allowed = treatments(pulse_voltages, pulse_duration, crash_depths, crash_speed)
         pulses = (names.PULSE,) if pulse_voltages else ()
@@ -102,7 +103,7 @@ class TipCorrector(Component):
             self.judge.restore(self.memory["judge"])
         frames: dict[int | None, Frame] = {}
         with self.scope.events("ControlState", "Scan2d", tip_verdict.MESSAGE) as events:
-            self._look()
+            self._repair_if_flagged()
             problems = self.scope.control_state.problems
             for event in events:
                 if isinstance(event.message, Scan):
@@ -113,18 +114,16 @@ class TipCorrector(Component):
                 elif event.envelope.startswith(tip_verdict.MESSAGE):
                     self._note(read_verdict(event.message), frames)
                 else:
-                    problems = event.message.problems  # as it was when the scans after it came
-                    self._look()
+                    problems = event.message.problems  # the flags when the scans after it were taken
+                    self._repair_if_flagged()
 
     def _note(self, verdict: tuple[int, float] | None, frames: Mapping[int | None, Frame]) -> None:
-        """Keep the frame of the scan last judged bad, until another is judged good."""
         if verdict is None or verdict[1] == tip_verdict.UNCLEAR or "region" in self.memory:
             return
         self.memory["judged_bad"] = frames.get(verdict[0]) if verdict[1] == tip_verdict.BAD else None
         self.memory.save()
 
-    def _look(self) -> None:
-        """Repair if that is wanted."""
+    def _repair_if_flagged(self) -> None:
         if self.memory.get("given_up"):
             if self.scope.is_flagged(self.problem) and self.scope.is_flagged(Problem.DEVICE_MALFUNCTION):
                 return
@@ -168,7 +167,6 @@ class TipCorrector(Component):
         self._give_up(why)
 
     def _of_experiment(self) -> tuple[Region | None, tuple[int, int] | None]:
-        """Region and shape of the experiment's scans, as they were before we moved away."""
         if "region" not in self.memory:
             parameters = self.scope.scan_parameters
             if parameters is None or not isinstance(parameters.region, Region):
@@ -179,11 +177,6 @@ class TipCorrector(Component):
         return _unpacked(self.memory["region"])
 
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
-        """Test scans until it is known whether the tip is good.
-
-        Raises:
-            _Blind: none can be taken.
-        """
         refused: list[str] = []
         for place in looks:
             try:
@@ -202,7 +195,6 @@ class TipCorrector(Component):
         return False
 
     def _own_score(self, scans: ScanSet) -> float:
-        """Judge, and clear the flag of a good tip."""
         for scan in scans.values():
             pair = self.pairing.add(scan)
             if pair is not None and self.judge is not None:
@@ -213,11 +205,10 @@ class TipCorrector(Component):
                     self.scope.clear(self.problem)
                     self._wait_flag(self.problem, flagged=False)
                 return tip_verdict.BAD if verdict.opinion is Opinion.BAD else tip_verdict.UNCLEAR
-        self.log.warning("a test scan that can't be judged: it is without the channels")
+        self.log.warning("the test scan can't be judged: it lacks the channels")
         return tip_verdict.UNCLEAR
 
     def _score_of_others(self, scans: ScanSet, answers: Events) -> float:
-        """Wait for the verdict on these scans, or for the flag to be removed."""
         times = {scan.time_ns for scan in scans.values()}
         for event in answers:
             if not self.scope.is_flagged(self.problem):
@@ -237,7 +228,6 @@ class TipCorrector(Component):
             self.memory.save()
 
     def _restore(self, region: Region | None) -> None:
-        """Set the scan region back to the experiment's: its next scan may take what it finds."""
         if region is None:
             return
         try:
@@ -253,7 +243,7 @@ class TipCorrector(Component):
         self.memory.save()
 
     def _wait_flag(self, problem: int | str, *, flagged: bool) -> None:
-        """Until the scheduler's word for it is here: what is older must not be taken for a change."""
+        # an older ControlState must not be taken for a change
         self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
     def _begin_anew(self) -> None:
@@ -272,4 +262,4 @@ def _unpacked(frame: Frame) -> tuple[Region, tuple[int, int] | None]:
 
 
 class _Blind(AfspmError):
-    """Nobody can tell what the tip is like."""
+    """The state of the tip can't be determined."""

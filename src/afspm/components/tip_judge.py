@@ -1,12 +1,12 @@
-"""Compares scans with a reference that was learnt from the first ones: is the tip still what it was?
+"""Judge of the tip: compares scans with a reference learnt from the first ones.
 
-At a place that it knows the judge compares like with like, and sees small changes. What it knows follows the good
-scans there, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it can tell only what
-no place explains: a large loss of detail, or debris. A ghost image it cannot tell there from the sample's own order.
+At a known place the judge compares like with like, and detects small changes. Its reference there follows the good
+scans, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it detects only changes that
+no place explains: a large loss of detail, or debris. It can't distinguish a ghost image there from order of the sample.
 
-Scans of another size or other pixels have a reference of their own, since what a tip does to a scan depends on the
-pixel: a fault that a zoom shows may be finer than the pixels of an overview. A reference is begun only while all that
-is known speaks for the tip, and a fault found in one kind of scan is over only when as fine a kind says so.
+Scans of another size or number of pixels have a reference of their own, since the effect of a tip on a scan depends on
+the pixel: a fault in a zoom may be finer than the pixels of an overview. A reference is begun only while all others
+show a good tip, and a fault found in one kind of scan is over only when an equally fine kind shows none.
 
 Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan judged by itself, known places):
 
@@ -17,8 +17,8 @@ Measured on simulated nights (128 x 128 pixels, 8 seeds, slow drift, one scan ju
     steps            3 of 80            10 / 10 / 0 of 16      0.4 nm high, 0.05 nm of noise: ask for two in a row
 
 Three kinds in turns (2 um and 500 nm at 128 x 128, 800 nm at 96 x 96, 2 seeds): of 32 good scans of each kind none was
-called bad of 2 um and 500 nm, and one (stamper) of 800 nm; of 6 scans of each fault and kind none was called good on
-particles and stamper. On rough ground and steps debris alone was seen, as above.
+called bad at 2 um and 500 nm, and one (stamper) at 800 nm; of 6 scans of each fault and kind none was called good on
+particles and stamper. On rough ground and steps only debris was detected, as above.
 """
 
 from __future__ import annotations
@@ -36,19 +36,20 @@ from afspm.components.tip_metrics import LEAST_CONTRAST, Array, TipMetrics, auto
 from afspm.model import Region
 from afspm.model.snapshot import from_plain, to_plain
 
-REACH_PX = 32  # how far beside the first the second apex of a double tip is looked for
+REACH_PX = 32  # search range for the second apex of a double tip
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
-SAME_SIZE = 0.02  # relative difference of sizes that are still called the same
-SAME_PLACE = 0.2  # of the size: how far a place may have moved and still be the same
+SAME_SIZE = 0.02  # relative difference within which sizes count as equal
+SAME_PLACE = 0.2  # share of the size within which a centre counts as the same place
+# limits the saved state: each place keeps an autocorrelation of 33 x 65 values
 MOST_PLACES = 16
-DECIMALS = 4  # of an autocorrelation, which is kept on disk
-MOST_KINDS = 4  # of scans that are known or learnt from side by side
-FOLLOW = 0.25  # weight of a new good scan in what is known of its place
-FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # spreads that few scans can't be better than
+DECIMALS = 4  # of an autocorrelation, to limit the saved state
+MOST_KINDS = 4  # of scans with a reference at the same time
+FOLLOW = 0.25  # least weight of a new good scan in the means of its place
+FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
 
 
 class Opinion(Enum):
-    """The opinion on the tip after a scan."""
+    """Opinion on the tip after a scan."""
 
     LEARNING = "learning"
     GOOD = "good"
@@ -58,7 +59,7 @@ class Opinion(Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """The opinion on one scan, and why, for a person."""
+    """Opinion on one scan, with a reason for people."""
 
     opinion: Opinion
     why: str
@@ -67,16 +68,16 @@ class Verdict:
 
 @dataclass(frozen=True)
 class TipTolerance:
-    """The distance from the reference at which a tip is still called good.
+    """Deviations from the reference within which a tip counts as good.
 
     Attributes:
-        detail: at a known place, the share of the fine detail that is left at least.
-        ghost: at a known place, the correlation of a ghost image at most.
+        detail: at a known place, the least share of the fine detail.
+        ghost: at a known place, the largest correlation of a ghost image.
         unrest: factor on the disagreement of trace and retrace.
-        worn: anywhere and against the first scans, the share of the fine detail that is left at least.
-        sigmas: a scan is bad only if it is so many standard deviations of the reference away, too.
+        worn: at any place, the least share of the first scans' fine detail.
+        sigmas: number of standard deviations of the reference that a bad scan must also be away.
         margin: a scan within this share of the way to a limit is good; between it and the limit it is unclear,
-            so that a tip at the limit does not go back and forth.
+            so that the opinion on a tip at the limit does not alternate.
     """
 
     detail: float = 0.85
@@ -97,13 +98,13 @@ class TipTolerance:
 
 @dataclass
 class KnownPlace:
-    """A region as a good tip shows it.
+    """A region as scans with a good tip show it.
 
     Attributes:
-        center_m: in the coordinates that it was scanned in.
-        usual: the metrics there.
-        expected: the autocorrelation of the slopes there.
-        scans: how many told of it.
+        center_m: in the coordinates of the scans.
+        usual: mean metrics.
+        expected: mean autocorrelation of the slopes.
+        scans: number of scans in the means.
     """
 
     center_m: tuple[float, float]
@@ -112,7 +113,7 @@ class KnownPlace:
     scans: int = 1
 
     def follow(self, seen: TipMetrics, correlation: Array) -> None:
-        """Take in one more good scan: a mean at first, then forgetting."""
+        """Add a good scan to the means: equal weights at first, then at least FOLLOW for the newest."""
         weight = max(FOLLOW, 1.0 / (self.scans + 1))
         self.expected = np.round(self.expected + weight * (correlation - self.expected), DECIMALS)
         now, new = asdict(self.usual), asdict(seen)
@@ -122,14 +123,14 @@ class KnownPlace:
 
 @dataclass
 class TipReference:
-    """The scans of a good tip of one kind: all of the same size, angle and shape.
+    """Scans with a good tip of one kind: of the same size, angle and shape.
 
     Attributes:
         size_m, angle_rad, shape: of those scans.
         places: where they were taken, the last seen at the end.
-        first: the metrics of the scans that were learnt from.
-        deviations: how such scans differed at the same place: detail and unrest as ratios, ghost as it is.
-        suspect: whether a fault was found at a known place, and not yet found to be over.
+        first: metrics of the scans that were learnt from.
+        deviations: differences of such scans at the same place: detail and unrest as ratios, ghost as it is.
+        suspect: whether a fault was found at a known place, and its end not yet.
         confirmed: whether a comparison was good after the last scan that was learnt from.
     """
 
@@ -147,14 +148,13 @@ class TipReference:
         return max(size / pixels for size, pixels in zip(self.size_m, reversed(self.shape), strict=True))
 
     def fits(self, region: Region, shape: tuple[int, int]) -> bool:
-        """Return whether a scan can be compared at all."""
         sizes = zip(region.size_m, self.size_m, strict=True)
         same_size = all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
         turned_rad = math.remainder(region.angle_rad - self.angle_rad, math.tau)
         return same_size and abs(turned_rad) < SAME_SIZE and shape == self.shape
 
     def place(self, region: Region) -> KnownPlace | None:
-        """Return what is known of where a scan was taken."""
+        """Return the known place at a region; None if there is none."""
         for place in reversed(self.places):
             away = (abs(a - b) / size for a, b, size in zip(region.center_m, place.center_m, self.size_m, strict=True))
             if max(away) < SAME_PLACE:
@@ -162,7 +162,7 @@ class TipReference:
         return None
 
     def note(self, place: KnownPlace | None, region: Region, seen: TipMetrics, correlation: Array) -> None:
-        """Note what a good tip shows at a place; None: at one that was not known."""
+        """Add a scan with a good tip to a place; None: begin a new place."""
         if place is not None:
             place.follow(seen, correlation)
             return
@@ -170,7 +170,7 @@ class TipReference:
         del self.places[:-MOST_PLACES]
 
     def spread(self, name: str) -> float:
-        """Return the spread of good scans at the same place: relative for detail and unrest."""
+        """Return the standard deviation of a metric of good scans at one place: relative for detail and unrest."""
         floor: float = getattr(FLOORS, name)
         if len(self.deviations) < 2:
             return floor
@@ -178,7 +178,7 @@ class TipReference:
         return max(floor, MAD_TO_SIGMA * float(np.median(np.abs(values - np.median(values)))))
 
     def usual_anywhere(self) -> TipMetrics:
-        """Return the median of the scans that were learnt from."""
+        """Return the median metrics of the scans that were learnt from."""
         names = asdict(self.first[0])
         return TipMetrics(**{name: float(np.median([getattr(seen, name) for seen in self.first])) for name in names})
 
@@ -188,7 +188,7 @@ class JudgeState:
     """State that survives a restart.
 
     Attributes:
-        kinds: the references, known and begun, the last used at the end.
+        kinds: references, complete and incomplete, the last used at the end.
         doubtful: whether the last scan that was compared was not good.
     """
 
@@ -197,23 +197,23 @@ class JudgeState:
 
 
 class TipJudge:
-    """Learns from the first scans of each kind, then judges that kind.
+    """Learns a reference from the first scans of each kind, then judges that kind.
 
     Args:
-        reference_scans: how many are learnt from. The tip has to be good by then: nobody can tell from inside.
-        tolerance: see there.
+        reference_scans: number of scans to learn from. The tip must be good then, which the scans alone can't show.
+        tolerance: limits for a good tip.
     """
 
     def __init__(self, reference_scans: int, tolerance: TipTolerance | None = None) -> None:
         if reference_scans < 2:
-            raise ConfigError(f"{reference_scans} reference scans have no spread", hint="2 at least", where="tip")
+            raise ConfigError(f"{reference_scans} reference scans give no spread", hint="at least 2", where="tip")
         self.reference_scans = reference_scans
         self.tolerance = tolerance or TipTolerance()
         self._state = JudgeState()
 
     @property
     def kinds(self) -> tuple[TipReference, ...]:
-        """The references, known and begun, the last used at the end."""
+        """References, complete and incomplete, the last used at the end."""
         return tuple(self._state.kinds)
 
     def knows(self, region: Region, shape: tuple[int, int]) -> bool:
@@ -221,27 +221,26 @@ class TipJudge:
         return any(self._is_known(kind) and kind.fits(region, shape) for kind in self._state.kinds)
 
     def state(self) -> Plain:
-        """Return what must survive a restart, in JSON's types."""
+        """Return the state to save, in JSON's types."""
         plain: Plain = to_plain(self._state, lists=True)
         return plain
 
     def restore(self, state: Plain) -> None:
-        """Continue from what `state` returned."""
         self._state = from_plain(JudgeState, state)
 
     def trust(self) -> None:
-        """End all suspicion: the tip was seen to, and later scans alone can tell that it is bad."""
+        """Drop all suspicion: the tip was treated, and only later scans can show that it is bad."""
         self._state.doubtful = False
         for kind in self._state.kinds:
             kind.suspect = False
 
     def judge(self, trace: Array, retrace: Array | None, region: Region, *, learns: bool = True) -> Verdict:
-        """Return what a scan says about the tip.
+        """Return the verdict on a scan.
 
         Args:
-            trace, retrace: heights in m, [y, x]; retrace None where it is not recorded.
+            trace, retrace: heights in m, [y, x]; retrace None if not recorded.
             region: where they were taken.
-            learns: whether a kind of scan that is not known yet may be learnt from.
+            learns: whether a new kind of scan may be learnt from.
         """
         shape = (trace.shape[0], trace.shape[1])
         if not self.knows(region, shape) and not (learns and self._is_trusted):
@@ -251,7 +250,7 @@ class TipJudge:
             seen_slopes = slopes(trace, retrace)
         except InvalidValue as error:
             return Verdict(Opinion.UNCLEAR, error.what)
-        kind = self._kind(region, shape)
+        kind = self._reference_for(region, shape)
         place = kind.place(region)
         correlation = autocorrelation(seen_slopes, min(REACH_PX, min(shape) // 3))
         seen = metrics(seen_slopes, correlation, place.expected if place else None)
@@ -266,7 +265,7 @@ class TipJudge:
             for one in self._state.kinds:
                 one.confirmed = True
         elif verdict.opinion is Opinion.BAD:
-            # what was learnt since the last good comparison may be of the bad tip
+            # scans learnt from since the last good comparison may show the bad tip
             self._state.kinds = [one for one in self._state.kinds if one.confirmed or one is kind]
         return verdict
 
@@ -277,8 +276,7 @@ class TipJudge:
     def _is_known(self, kind: TipReference) -> bool:
         return len(kind.first) >= self.reference_scans
 
-    def _kind(self, region: Region, shape: tuple[int, int]) -> TipReference:
-        """Return the reference of such scans, begun if there is none; the least recently used makes room for it."""
+    def _reference_for(self, region: Region, shape: tuple[int, int]) -> TipReference:
         kinds = self._state.kinds
         kind = next((one for one in kinds if one.fits(region, shape)), None)
         if kind is not None:
@@ -320,7 +318,7 @@ class TipJudge:
         return Verdict(Opinion.GOOD, _summary(seen, place.usual if place else reference.usual_anywhere()), seen)
 
     def _clear_suspicion(self, by: TipReference) -> None:
-        """A fault that comparing like with like has found is over if the same comparison, as fine, finds none."""
+        # only a comparison at least as fine as the one that found the fault can clear it
         for kind in self._state.kinds:
             kind.suspect = kind.suspect and by.pixel_m > (1.0 + SAME_SIZE) * kind.pixel_m
 
@@ -329,7 +327,7 @@ class TipJudge:
         now = _relative(seen, usual)
         worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
         faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), worn)]
-        if usual.unrest_m > 0.0:  # else no retrace is recorded
+        if usual.unrest_m > 0.0:  # zero without retrace
             limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
             what = f"{seen.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
             faults.append(((now.unrest_m - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
@@ -353,12 +351,12 @@ class VerdictCounter:
 
     def __init__(self, flag_after: int, clear_after: int) -> None:
         if flag_after < 1 or clear_after < 1:
-            raise ConfigError("it takes one scan at least to flag or to clear")
+            raise ConfigError("`flag_after` and `clear_after` must be at least 1")
         self.flag_after, self.clear_after = flag_after, clear_after
         self.bad = self.good = 0
 
     def count(self, opinion: Opinion) -> None:
-        """Take in one more. What is unclear neither counts nor interrupts."""
+        """Count an opinion. UNCLEAR neither counts nor interrupts a row."""
         if opinion is Opinion.BAD:
             self.bad, self.good = self.bad + 1, 0
         elif opinion is Opinion.GOOD:
@@ -378,7 +376,7 @@ def _kind_text(region: Region, shape: tuple[int, int]) -> str:
 
 
 def _relative(seen: TipMetrics, usual: TipMetrics) -> TipMetrics:
-    """Return detail and unrest as parts of the usual ones, 1 where there is usually none, and the rest as it is."""
+    # ghost and contrast are correlations already, and need no usual value
     unrest = seen.unrest_m / usual.unrest_m if usual.unrest_m > 0 else 1.0
     return TipMetrics(seen.detail / usual.detail if usual.detail > 0 else 1.0, seen.ghost, unrest, seen.contrast)
 

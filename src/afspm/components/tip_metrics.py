@@ -1,16 +1,16 @@
-"""Metrics of the tip from the scans that it took, in numbers that depend little on where it was taken.
+"""Metrics of the tip from its scans, chosen to depend little on the place.
 
-Whatever the tip touches it blunts, doubles or shakes in the same way, so that three properties of a scan tell of the
-tip rather than of the place:
+A changed tip blunts, doubles or shakes all features in the same way, so three properties of a scan characterise the tip
+rather than the place:
 
 - `detail`: the power of the slopes at short wavelengths against that at long ones. Every edge of the sample has both;
-  a blunt tip loses the short ones. (Heights of terraces, or how many particles there are, scale both.) The power is
-  the cross spectrum of trace and retrace, to which noise does not add up.
-- `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats everything at one distance.
-- `unrest`: how far trace and retrace disagree over stretches of flat ground, which loose debris causes and feedback
+  a blunt tip loses the short ones. (Heights of terraces, or the number of particles, scale both.) The power is the
+  cross spectrum of trace and retrace, in which noise averages out.
+- `ghost`: the autocorrelation of the slopes away from zero. A second apex repeats every feature at one distance.
+- `unrest`: the disagreement of trace and retrace over stretches of flat ground, which loose debris causes and feedback
   does not.
 
-(Villarrubia 1997 for what a tip does to an image; the rest is standard signal analysis.)
+(Villarrubia 1997 for the effect of a tip on an image; the rest is standard signal analysis.)
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from afspm.basics.errors import InvalidValue
 
 Array = NDArray[np.float64]
 
+# the long band ends at wavelengths of 32 pixels
 FEWEST_PIXELS = 32
 LARGEST_HOLES = 0.2  # share of pixels that may be missing
 SHORT_PX = (3.0, 8.0)  # wavelengths that a blunt tip loses
 LONG_PX = (8.0, 32.0)  # wavelengths that it keeps
-CORE_PX = 6.0  # lags that an edge correlates over by itself
+CORE_PX = 6.0  # lags within which any edge correlates with itself
 STRETCH = 10  # a stretch of a line is a tenth of it
-LEAST_CONTRAST = 0.1  # slopes common to trace and retrace against those of noise
+LEAST_CONTRAST = 0.1  # slopes common to trace and retrace, relative to those of noise
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class TipMetrics:
 
 @dataclass(frozen=True)
 class Slopes:
-    """The slopes of a scan along its lines, ready to be analysed.
+    """Slopes of a scan along its lines.
 
     Attributes:
         trace, retrace: (rows, columns - 1).
@@ -65,18 +66,20 @@ class Slopes:
 
 
 def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
-    """Take what does not tell of the tip out of a scan: offsets and tilt of its lines, missing pixels.
+    """Return the slopes of a scan, without offsets and tilt of its lines, missing pixels filled.
 
     Args:
-        trace, retrace: heights in m, [y, x], retrace turned round as scans are; NaN where nothing was measured.
+        trace, retrace: heights in m, [y, x], retrace reversed as in scans; NaN where not measured.
 
     Raises:
-        InvalidValue: too small, too many holes, or two pictures of different shape.
+        InvalidValue: too few pixels, too many holes, or different shapes.
     """
     if min(trace.shape) < FEWEST_PIXELS:
-        raise InvalidValue(f"a scan of {trace.shape} pixels is too small to tell", hint=f"{FEWEST_PIXELS} at least")
+        raise InvalidValue(
+            f"a scan of {trace.shape} pixels is too small to judge the tip", hint=f"at least {FEWEST_PIXELS}"
+        )
     if retrace is not None and retrace.shape != trace.shape:
-        raise InvalidValue(f"trace {trace.shape} and retrace {retrace.shape} don't belong together")
+        raise InvalidValue(f"trace {trace.shape} and retrace {retrace.shape} differ in shape")
     level = _levelled(trace)
     if retrace is None:
         return Slopes(_clipped(np.diff(level, axis=1)), None, None)
@@ -85,7 +88,7 @@ def slopes(trace: Array, retrace: Array | None = None) -> Slopes:
 
 
 def autocorrelation(of: Slopes, reach_px: int) -> Array:
-    """Return how much the slopes look like themselves elsewhere, 1 at no distance.
+    """Return the autocorrelation of the slopes, 1 at zero lag.
 
     Returns:
         Lags of 0 … reach rows by -reach … reach columns; the other half is the same by symmetry.
@@ -114,7 +117,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
     Args:
         correlation: its `autocorrelation`.
-        expected: that of a good tip on this sample, which may be periodic; None: nothing is expected.
+        expected: autocorrelation with a good tip on this sample, which may be periodic; None: zero.
     """
     short, long, noise = _band_powers(of)
     return TipMetrics(
@@ -126,7 +129,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
 
 def ghost(correlation: Array, expected: Array | None = None) -> float:
-    """Return the largest correlation beside the centre, less what was expected there."""
+    """Return the largest correlation beside the centre, less the expected one."""
     beyond = _smoothed(correlation if expected is None else correlation - expected)
     reach = correlation.shape[0] - 1
     rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]
@@ -135,7 +138,6 @@ def ghost(correlation: Array, expected: Array | None = None) -> float:
 
 
 def _levelled(heights: Array) -> Array:
-    """Each line less its median and the common tilt, holes filled."""
     values = _filled(np.array(heights, dtype=np.float64))
     tilt = np.median(np.diff(values, axis=1))
     values = values - tilt * np.arange(values.shape[1])
@@ -154,25 +156,24 @@ def _filled(values: Array) -> Array:
 
 
 def _clipped(slope: Array) -> Array:
-    """Less the common slope, the few steepest limited: one large particle must not outweigh all else."""
+    # without the limit one large particle would outweigh all other slopes
     slope = slope - np.median(slope)
     limit = np.quantile(np.abs(slope), 0.995)
     return np.clip(slope, -limit, limit) if limit > 0 else slope
 
 
 def _band_powers(of: Slopes) -> tuple[float, float, float]:
-    """Power of the slopes in the short and the long band, and that of noise in both."""
     nx = of.trace.shape[1]
     window = np.hanning(nx + 2)[1:-1]
     first = np.fft.rfft(of.trace * window, axis=1)
     frequency = np.fft.rfftfreq(nx)
     if of.retrace is None:
-        # the next line looks at nearly the same place with other noise
+        # the next line shows nearly the same place with other noise
         pairs, alone = first[1:] * first[:-1].conj(), np.abs(first) ** 2
     else:
         second = np.fft.rfft(of.retrace * window, axis=1)
         pairs, alone = first * second.conj(), (np.abs(first) ** 2 + np.abs(second) ** 2) / 2
-    # feedback lags, so that trace and retrace are shifted against each other: a phase, not a loss
+    # lag of the feedback shifts trace and retrace against each other: it changes the phase, not the modulus
     common, total = np.abs(pairs.mean(axis=0)), alone.mean(axis=0)
     noise = np.maximum(total - common, 0.0)
 
@@ -180,7 +181,7 @@ def _band_powers(of: Slopes) -> tuple[float, float, float]:
         chosen = (frequency >= 1 / wavelengths[1]) & (frequency < 1 / wavelengths[0])
         return float(power[chosen].sum())
 
-    bias = 1.0 / np.sqrt(len(pairs))  # what the modulus of a mean of that many random phases keeps
+    bias = 1.0 / np.sqrt(len(pairs))  # expected modulus of the mean of that many random phases
     common = np.maximum(common - bias * noise, 0.0)
     return band(common, SHORT_PX), band(common, LONG_PX), band(noise, (SHORT_PX[0], LONG_PX[1]))
 
@@ -200,7 +201,7 @@ def _unrest_m(of: Slopes) -> float:
 
 
 def _flat(slope: Array) -> Array:
-    """1 where the scan is flat, 0 near edges: there trace and retrace differ since feedback lags behind."""
+    # 1 where the scan is flat: near edges trace and retrace differ because the feedback lags behind.
     steep = np.abs(slope)
     steep = np.maximum(steep, np.maximum(np.roll(steep, 1, axis=1), np.roll(steep, -1, axis=1)))
     flat = steep <= np.quantile(steep, 0.6)
@@ -209,7 +210,7 @@ def _flat(slope: Array) -> Array:
 
 
 def _smoothed(correlation: Array) -> Array:
-    """The mean of each 3 x 3: a ghost is as wide as an edge, chance is not."""
+    # a ghost is as wide as an edge, so the mean of 3 x 3 keeps it and lowers chance maxima
     padded = np.pad(correlation, 1, mode="edge")
     windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
     smooth: Array = windows.mean(axis=(-1, -2))

@@ -1,4 +1,4 @@
-"""Treatments of a tip, their order and their places: pure, so that nothing surprising is ever done."""
+"""Treatments of a tip, their order and their places. Pure, so that each repair can be predicted."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Pulse:
 
 @dataclass(frozen=True)
 class Crash:
-    """The tip driven into the sample, so deep and so fast."""
+    """A controlled crash: the tip is driven into the sample by a depth, at a speed."""
 
     depth_m: float
     speed_m_per_s: float
@@ -43,13 +43,13 @@ def treatments(
     crash_depths_m: Sequence[float],
     crash_speed_m_per_s: float,
 ) -> tuple[Treatment, ...]:
-    """Return all that one repair may do, the gentle ones first: pulses as listed, then crashes as listed.
+    """Return the treatments of one repair, gentle ones first: pulses as listed, then crashes as listed.
 
     Raises:
-        ConfigError: nothing is listed, or a value that is no treatment.
+        ConfigError: no treatment is listed, or a value is invalid.
     """
     if not pulse_voltages_v and not crash_depths_m:
-        raise ConfigError("nothing is allowed to be done", hint="list `pulse_voltages`, `crash_depths` or both")
+        raise ConfigError("no treatment is allowed", hint="list `pulse_voltages`, `crash_depths` or both")
     if any(v == 0.0 for v in pulse_voltages_v) or (pulse_voltages_v and pulse_duration_s <= 0.0):
         raise ConfigError("a pulse needs a voltage and a duration", where="pulse_voltages")
     if any(depth <= 0.0 for depth in crash_depths_m) or (crash_depths_m and crash_speed_m_per_s <= 0.0):
@@ -67,7 +67,7 @@ def fresh_place(center_m: XY, spacing_m: float, number: int) -> XY:
 
 
 def clearance_m(place_m: XY, region: Region) -> float:
-    """Return how far a place lies outside of a region; 0 within."""
+    """Return the distance of a place from a region; 0 within."""
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     dx, dy = place_m[0] - region.center_m[0], place_m[1] - region.center_m[1]
     u, v = dx * cos + dy * sin, -dx * sin + dy * cos

@@ -1,4 +1,4 @@
-"""The verdict on a scan as a message of the contract: the places looked at, each with a score."""
+"""The verdict on a scan as a message of the contract: a list of places, each with a score."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GOOD, UNCLEAR = 1.0, 0.5
 
 
 def verdict_message(scan: Scan, score: float) -> Any:
-    """Return a `SpatialROIWithScoreList` with one place: that of the scan, whose time and channel it carries."""
+    """Return a `SpatialROIWithScoreList` with one place: the scan's, with its time and channel."""
     message: Any = wire.message_type(MESSAGE)(channel=scan.channel)
     if scan.time_ns is not None:
         message.timestamp.FromNanoseconds(scan.time_ns)

@@ -1,4 +1,4 @@
-"""The workshop: fresh places on the sample, where treatments of the tip are done."""
+"""The workshop: fresh places on the sample for treatments of the tip."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from afspm.client.component import Component
 from afspm.components.tip_treatments import XY, Pulse, Treatment, clearance_m, fresh_place
 from afspm.model import Region, ScopeState, names
 
-SETTLED_WITHIN_S = 2.0  # real time: a microscope that does not say that it is busy is taken to be ready then
+SETTLED_WITHIN_S = 2.0  # real time: a microscope that has not reported to be busy by then counts as ready
 DONE_ACTION = "ActionMsg"
 
 
 class TipWorkshop:
-    """Treats the tip for a component, which has control around every call.
+    """Treats the tip for a component, which must hold control around every call.
 
     Args:
-        center: about which the places are.
+        center: about which the places lie.
         spacing: between the places of two treatments, in m.
-        keep_away: least distance of a treatment from what is scanned, in m.
+        keep_away: least distance of a treatment from scanned regions, in m.
     """
 
     def __init__(self, component: Component, problem: str, center: XY, spacing: float, keep_away: float) -> None:
@@ -31,12 +31,12 @@ class TipWorkshop:
         self._problem = problem
         self._center = center
         self._spacing, self._keep_away = spacing, keep_away
-        self._frame: Region | None = None  # of our own, about a place
+        self._frame: Region | None = None  # the frame set about a place
 
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
         """Do the `number`-th treatment at a fresh place, in one tenure of control with the move there.
 
-        Returns whether it was done. Raises FileError: it can't be written down.
+        Return whether it was done. Raises FileError if the state can't be saved.
         """
         while True:
             place = self._fresh_place(number)
@@ -52,11 +52,11 @@ class TipWorkshop:
                 self._log.warning("%s was interrupted: %s; retrying at a fresh place", treatment, lost.what)
 
     def _fresh_place(self, number: int) -> XY:
-        """Return where to try the `number`-th treatment. It is counted before: a kill must not make it happen twice."""
+        # counted before it is done: after a kill a treatment is left out rather than repeated
         places = int(self._memory.get("places", 0))
         self._memory["tried"], self._memory["places"] = number, places + 1
         if not self._memory.save():
-            raise FileError("the disk is full: after a restart the treatment would be done again")
+            raise FileError("the disk is full: after a restart the treatment would be repeated")
         return fresh_place(self._center, self._spacing, places)
 
     def _treat_at(self, place: XY, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
@@ -88,7 +88,7 @@ class TipWorkshop:
         return True
 
     def _go_to(self, place: XY) -> None:
-        """Move the probe to a place; with the scan frame, where the microscope moves its tip in that alone."""
+        # some microscopes move the tip only together with the scan frame
         try:
             self._scope.move_probe(place)
         except Refused as refused:
@@ -102,7 +102,6 @@ class TipWorkshop:
             self._scope.move_probe(place)
 
     def _stands_at(self, place: XY) -> bool:
-        """Return whether the probe is published to be nearer to this place than to any other."""
         position = self._scope.probe_position
         return position is not None and math.dist(position.xy_m, place) <= self._spacing / 2
 
@@ -111,7 +110,7 @@ class TipWorkshop:
         return "an unknown place" if position is None else f"at {position_text(position.xy_m)}"
 
     def _act(self, action: str) -> None:
-        """Do it, and let it end: what is asked of a busy microscope it refuses."""
+        # a busy microscope refuses the next action, so wait until this one has ended
         with self._scope.events("ScopeStateMsg", timeout_s=SETTLED_WITHIN_S) as states:
             try:
                 self._scope.action(action)

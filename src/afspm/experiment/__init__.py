@@ -9,8 +9,9 @@
     always holds  all findings are reported at once; an experiment that passes the check starts
 """
 
-from afspm.experiment.experiment import Experiment, ProcessStart, load, load_expanded
+from afspm.experiment.experiment import Experiment, load, load_expanded
 from afspm.experiment.findings import Finding, Level, SourceLocation
+from afspm.experiment.process_starts import ProcessStart
 from afspm.model import Role
 
 __all__ = ["Experiment", "Finding", "Level", "ProcessStart", "Role", "SourceLocation", "load", "load_expanded"]

@@ -1,4 +1,4 @@
-"""The capabilities of a microscope, as far as its class tells before it runs."""
+"""Capabilities of a microscope, as far as they are known from its class, before it runs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MicroscopeCapabilities:
-    """The generic names of actions, and of parameters with their SI unit (None: it depends).
+    """Generic names of actions, and of parameters with their SI unit (None: it depends on the operating mode).
 
     Attributes:
-        sets: by name of an action that the experiment file adds, the parameters that it sets.
-        table: of its parameters.
+        sets: parameters set by an action that the experiment file adds, by its name.
+        table: its parameter table.
     """
 
     actions: frozenset[str]
@@ -29,7 +29,7 @@ class MicroscopeCapabilities:
     table: ParameterTable
 
     def refuses(self, parameter: Parameter) -> str:
-        """Return why the microscope would refuse a value; empty: it would not, or has no such parameter."""
+        """Return why the microscope would refuse a value; empty if it would not, or has no such parameter."""
         if parameter.name not in self.table or parameter.value is None:
             return ""
         try:
@@ -40,7 +40,7 @@ class MicroscopeCapabilities:
 
 
 def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None:
-    """Return the abilities of a `Driver` class with these settings; None where the class does not tell."""
+    """Return the capabilities of a `Driver` class with these settings; None if they can't be known before it runs."""
     from afspm.translator.driver import Driver
 
     if not issubclass(microscope, Driver):
@@ -52,19 +52,20 @@ def of_class(microscope: type, settings: Table) -> MicroscopeCapabilities | None
         table = microscope.parameter_table(microscope.rows(settings))
         sets = {name: _set_by(what, table) for name, what in added.items()}
     except (AfspmError, AttributeError):
-        return None  # the microscope itself will say what is wrong with its table
+        return None  # the check of its settings reports the error in the table
     return MicroscopeCapabilities(frozenset(actions), {name: table[name].si_unit for name in table}, sets, table)
 
 
 def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:
-    """Return what an action of the experiment file sets, in SI."""
     given = action.get("set") if isinstance(action, Mapping) else None
     values = table.written(given, where="actions") if isinstance(given, Mapping) else {}
     return tuple(Parameter(name, str(value), table[name].si_unit or None) for name, value in values.items())
 
 
 def base() -> dict[str, str | None]:
-    """Return the base parameters and the extensions of ours with their SI units, where nothing better is known."""
+    """Return the base parameters and afspm's extensions with their SI units, for a microscope with unknown
+    capabilities.
+    """
     ours = {
         names.PULSE_VOLTAGE: "V",
         names.PULSE_DURATION: "s",

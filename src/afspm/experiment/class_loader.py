@@ -1,4 +1,4 @@
-"""From `class = "module.Name"` to the class itself: imported late, since only checking and starting need it."""
+"""From `class = "module.Name"` to the class: imported only when an experiment is checked or started."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from afspm.experiment.toml_lines import Table
 from afspm.model import Role
 
 _OTHER_MAKE = "is it written for the published implementation? see docs/how-to/from-the-published-implementation.md"
-# By where they come from: a class of the user is recognised by what it is derived from.
+# Roles by the package of a base class: a user's class is recognised by its bases.
 _ROLE_BY_BASE = (
     ("afspm.scheduler", Role.SCHEDULER),
     ("afspm.translator", Role.TRANSLATOR),
@@ -33,7 +33,7 @@ _ROLE_BY_BASE = (
 
 @dataclass(frozen=True)
 class ComponentDeclaration:
-    """Declarations of a component in attributes of its class (a command: in its table)."""
+    """Declarations in class attributes of a component (of a command: in its table)."""
 
     solves: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ class ComponentDeclaration:
 
 
 class Unloadable(Exception):
-    """A class that can't be had; the message and the hint are for the user."""
+    """The class can't be loaded; message and hint are for the user."""
 
     def __init__(self, what: str, hint: str = "") -> None:
         super().__init__(what)
@@ -64,9 +64,9 @@ class Unloadable(Exception):
 
 @contextlib.contextmanager
 def importing_from(folders: Sequence[Path]) -> Iterator[None]:
-    """Let modules beside the experiment file be imported within this block.
+    """Make modules beside the experiment file importable within the block.
 
-    Two experiments may both have a `component.py`: what was imported from the folders is forgotten afterwards.
+    Two experiments may both have a `component.py`, so modules imported from the folders are unloaded afterwards.
     """
     before = set(sys.modules)
     added = [str(folder) for folder in folders]
@@ -83,7 +83,7 @@ def importing_from(folders: Sequence[Path]) -> Iterator[None]:
 
 
 def _is_from(folder: Path, name: str) -> bool:
-    """Return whether a module was imported from a folder, and not from an environment (.venv) that lies in it."""
+    # a module of an environment (.venv) inside the folder is not the user's file
     file = getattr(sys.modules[name], "__file__", None)
     if not file:
         return False
@@ -92,10 +92,10 @@ def _is_from(folder: Path, name: str) -> bool:
 
 
 def full_path(name: str) -> str:
-    """Return a name without a module as the full path of the class that a package declares; other paths as they are.
+    """Return the full path of the class that a package declares under a bare name; return other paths unchanged.
 
     Raises:
-        Unloadable: there is no such class, or several packages declare it.
+        Unloadable: no package declares the class, or several do.
     """
     if "." in name:
         return name
@@ -113,7 +113,7 @@ def load(path: str) -> Any:
     """Return the object `module.Name`.
 
     Raises:
-        Unloadable: no such module or name, or the module fails when it is imported.
+        Unloadable: no such module or name, or its import fails.
     """
     module_name, _, name = path.rpartition(".")
     if not module_name or not name:
@@ -122,13 +122,13 @@ def load(path: str) -> Any:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise _no_module(module_name, error) from error
-    except (Exception, SystemExit) as error:
-        raise Unloadable(f"importing {module_name} fails: {_where(error)}") from error
+    except (Exception, SystemExit) as error:  # the user's module may do anything when imported, even exit
+        raise Unloadable(f"importing {module_name} fails: {_error_line(error)}") from error
     return _attribute(module, name)
 
 
 def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
-    """Return the spec of a module, also from beside the file; None: there is none."""
+    """Return the spec of a module, which may lie beside the file; None if there is none."""
     with importing_from(folders):
         try:
             return importlib.util.find_spec(name)
@@ -137,7 +137,7 @@ def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
 
 
 def role_of(component: type) -> Role | None:
-    """Return scheduler, translator or component, by the bases of a class or its `role`; None: it is none of them."""
+    """Return the role of a class by its bases or its attribute `role`; None if it has none."""
     for base in component.__mro__:
         for package, role in _ROLE_BY_BASE:
             if base.__module__ == package or base.__module__.startswith(package + "."):
@@ -147,25 +147,27 @@ def role_of(component: type) -> Role | None:
 
 
 def _attribute(module: ModuleType, name: str) -> Any:
-    """Return a name of a module, which a package may only import when it is asked for."""
+    # packages may import a name lazily, by a module-level `__getattr__`
     try:
         return getattr(module, name)
     except AttributeError:
-        hint = _hidden(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
+        hint = _shadowing_hint(module) or nearest(name, getattr(module, "__all__", None) or _public_classes(module))
         raise Unloadable(f"{module.__name__} has no {name!r}", hint) from None
     except ModuleNotFoundError as error:
         raise _no_module(f"{module.__name__}.{name}", error) from error
-    except (Exception, SystemExit) as error:
-        raise Unloadable(f"importing {name} fails: {_where(error)}") from error
+    except (Exception, SystemExit) as error:  # a lazy import may run the user's code, too
+        raise Unloadable(f"importing {name} fails: {_error_line(error)}") from error
 
 
-def _hidden(module: ModuleType) -> str:
-    """Return what to do where a file of the user's has the name of a module of Python's; empty where none has."""
+def _shadowing_hint(module: ModuleType) -> str:
+    # Python imported another module of this name instead of the user's file.
     for folder in sys.path:
         file = Path(folder, f"{module.__name__}.py")
         if file.exists():
             own = getattr(module, "__file__", None)
-            return "" if own and file.samefile(own) else f"another module is called so: give {file.name} another name"
+            return (
+                "" if own and file.samefile(own) else f"Python imported another module of this name: rename {file.name}"
+            )
     return ""
 
 
@@ -198,8 +200,7 @@ def _search_paths(parent: str) -> list[str]:
     return list(spec.submodule_search_locations or ()) if spec else []
 
 
-def _where(error: BaseException) -> str:
-    """Return the last line of a traceback with file and line, in one line."""
+def _error_line(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
     said = str(error)
@@ -213,7 +214,6 @@ def _public_classes(module: ModuleType) -> list[str]:
 
 
 def _names(value: object) -> tuple[str, ...] | None:
-    """Return a text or texts as a tuple of texts; enum members by their name. None for what is not declared."""
     if value is None or isinstance(value, property):
         return None
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""One or more TOML files read, laid over each other, and remembered line by line."""
+"""One or more TOML files, merged, with the line of each key."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from afspm.experiment.toml_lines import Settings
 
 @dataclass
 class Document:
-    """The merged tables, and where each key was set last.
+    """Merged tables, and the place where each key was last set.
 
     Attributes:
-        homes: the folders that relative file names are meant from, and where modules are found; empty: those of the
-            files. (An expanded file is in the folder of its run, and speaks of files beside the one it was made of.)
+        homes: folders for relative file names and modules; empty: those of the files. (An expanded file lies in the run
+            folder, but names files beside the original.)
         is_whole: whether all files could be read.
-        findings: what is wrong or doubtful in them.
+        findings: errors and warnings so far.
     """
 
     files: tuple[Path, ...]
@@ -33,15 +33,13 @@ class Document:
     findings: Findings = field(default_factory=Findings)
 
     def error(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Report an error at the line where `path` is set."""
         self.findings.error(what, self.place(*path), hint)
 
     def warning(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Report a warning at the line where `path` is set."""
         self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:
-        """Return where `path` was set: its own line, or that of the nearest thing around it."""
+        """Return where `path` is set: its own line, or the line of the innermost table around it."""
         for depth in range(len(path), 0, -1):
             found = self.places.get(path[:depth])
             if found is not None:
@@ -49,17 +47,17 @@ class Document:
         return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:
-        """Return the folder of the file that set `path`; relative file names in it are meant from there."""
+        """Return the folder of the file that sets `path`: relative file names start there."""
         return self.homes[0] if self.homes else Path(self.place(*path).file).resolve().parent
 
     @property
     def folders(self) -> list[Path]:
-        """The folders of the files, the first file's first; modules beside a file are found there."""
+        """Folders of the files, the first file's first; modules are found there."""
         return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 
 def read(files: Sequence[Path], homes: Sequence[Path] = ()) -> Document:
-    """Read the files and lay each over those before it: tables merge, of anything else the later wins."""
+    """Read the files and merge them in order: tables key by key; for any other value the last file wins."""
     document = Document(tuple(files), homes=tuple(homes))
     for file in files:
         text = _text(file, document.findings)
@@ -100,12 +98,12 @@ def _parse(text: str, file: Path, findings: Findings) -> Settings | None:
             findings.error(f"[{name}] is there twice", SourceLocation(str(file), line), "two components need two names")
         else:
             written = dict(enumerate(text.splitlines(), 1)).get(line, "")
-            findings.error(f"not valid TOML: {what}", SourceLocation(str(file), line), _habit(what, written))
+            findings.error(f"not valid TOML: {what}", SourceLocation(str(file), line), _syntax_hint(what, written))
         return None
 
 
-# what was complained of, how the line looks, and what would be right: habits from Python, YAML, JSON and Windows
-_HABITS = (
+# the parser's complaint, the form of the line, and the remedy: habits from Python, YAML, JSON and Windows
+_SYNTAX_HINTS = (
     ("Cannot overwrite", r"", "this key is there already"),
     ("Illegal character '\\n'", r"", "the quote that ends the text is missing"),
     ("", r"=\s*(True|False)\b", "true and false are written in lower case"),
@@ -119,9 +117,8 @@ _HABITS = (
 )
 
 
-def _habit(what: str, written: str) -> str:
-    """Return what to write instead of a line that would be right elsewhere."""
-    return next((hint for said, line, hint in _HABITS if what.startswith(said) and re.search(line, written)), "")
+def _syntax_hint(what: str, written: str) -> str:
+    return next((hint for said, line, hint in _SYNTAX_HINTS if what.startswith(said) and re.search(line, written)), "")
 
 
 def _lay_over(document: Document, data: Settings, where: dict[toml_lines.Path, SourceLocation]) -> None:
@@ -138,5 +135,5 @@ def _merge(
             _merge(below[key], value, here, places)
             continue
         for old in [p for p in places if p[: len(here)] == here]:
-            del places[old]  # what stood there is replaced as a whole
+            del places[old]  # the value there is replaced as a whole
         below[key] = copy.deepcopy(value)

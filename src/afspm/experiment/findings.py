@@ -1,4 +1,4 @@
-"""Findings of a check, each with file, line, and what would put it right."""
+"""Findings of a check, each with file, line and remedy."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class SourceLocation:
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that is wrong (or doubtful) in an experiment file."""
+    """One error or warning about an experiment file."""
 
     level: Level
     what: str
@@ -46,7 +46,7 @@ class Finding:
 
 @dataclass
 class Findings:
-    """Collects what is found, so that one check reports everything."""
+    """Collects findings, so that one check reports them all."""
 
     found: list[Finding] = field(default_factory=list)
 
@@ -62,16 +62,15 @@ class Findings:
 
     @property
     def errors(self) -> int:
-        """The number of errors so far."""
         return sum(finding.is_error for finding in self.found)
 
     def ordered(self) -> list[Finding]:
-        """Return errors first, then in the order of the files' lines."""
+        """Return the findings: errors first, then by file and line."""
         return sorted(self.found, key=lambda f: (not f.is_error, f.place.file, f.place.line))
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
-    """Return a hint that names the valid name nearest to `name`, or, where none is near, a few of them."""
+    """Return a hint with the valid name nearest to `name`, or with a few valid names if none is near."""
     names = sorted(set(valid))
     close = closest(name, names, cutoff)
     if close:
@@ -83,7 +82,7 @@ def nearest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str:
 
 
 def closest(name: str, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return the valid name nearest to `name` (upper and lower case alike), or None where none is near."""
+    """Return the valid name nearest to `name`, ignoring case; None if none is near."""
     by_fold = {v.casefold(): v for v in valid}
     match = difflib.get_close_matches(name.casefold(), list(by_fold), n=1, cutoff=cutoff)
     return by_fold[match[0]] if match else None

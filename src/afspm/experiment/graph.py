@@ -1,8 +1,7 @@
-"""An experiment as a picture: the scheduler as a bar, its translator below it, the components above.
+"""Picture of an experiment: the scheduler as a bar, its translator below it, the components above.
 
-Every component has a column of its own, in which its envelopes come up from the bar and its requests go down to it;
-what components publish to each other runs in lanes above them. So no two lines share a way, and nothing has to be
-searched for.
+Every component has a column: envelopes go up to it from the bar, its requests go down. Envelopes between components run
+in lanes above them. No two lines share a path, so each can be followed.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.experiment import Experiment
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
 
 ENVELOPES, CONTROL, VENDOR = "#1f6fb2", "#c2570c", "#777777"
 GREY, RED, GREEN = "#666666", "#a3241c", "#1d7a3e"
@@ -34,7 +33,7 @@ BAR_HEIGHT, ARROW_AT, MOST_LABELS = 62.0, 16.0, 7
 
 @dataclass
 class ProcessBox:
-    """One process and its column. Widths first, then places."""
+    """One process and its column. Widths are set first, then places."""
 
     part: ExperimentPart
     lines: list[tuple[str, str]]
@@ -51,14 +50,13 @@ class ProcessBox:
 
     @property
     def _sides(self) -> tuple[float, float]:
-        """The room that the two arrows and their labels take, left and right of the middle between the arrows."""
         left = max([text_width(label, LABEL_SIZE) for label in self.labels], default=0.0)
         right = text_width("requests", LABEL_SIZE) if self.asks else 0.0
         return left + ARROW_AT + 8, right + ARROW_AT + 8
 
     @property
     def arrows_at(self) -> float:
-        """Where the middle between the arrows is, from the middle of the box: labels are not of one length."""
+        """Offset of the midpoint between the two arrows from the middle of the box: labels differ in length."""
         left, right = self._sides
         most = self.width / 2 - ARROW_AT - 12
         return max(-most, min(most, (left - right) / 2))
@@ -75,7 +73,7 @@ class ProcessBox:
 
 @dataclass(frozen=True)
 class PublisherLane:
-    """The publications of one component to others."""
+    """Envelopes that one component publishes to others."""
 
     publisher: ProcessBox
     listeners: tuple[ProcessBox, ...]
@@ -83,7 +81,6 @@ class PublisherLane:
 
 
 def draw(experiment: Experiment) -> str:
-    """Return the picture as the text of an SVG file."""
     return _Drawing(experiment.resolved, experiment.name).document()
 
 
@@ -114,7 +111,7 @@ class _Drawing:
         width = self.bar_width + 2 * MARGIN
         return self.svg.document(width, bottom + 66, self.name, (ENVELOPES, CONTROL, VENDOR))
 
-    # --- what there is ------------------------------------------------------------------------------------------
+    # --- contents ------------------------------------------------------------------------------------------
 
     def _box(self, part: ExperimentPart) -> ProcessBox:
         said = self.resolved.processes[part.name].declared
@@ -129,7 +126,7 @@ class _Drawing:
         return ProcessBox(part, lines, labels, asks=not written)
 
     def _from_scheduler(self, part: ExperimentPart) -> list[str]:
-        """Return what it hears from the scheduler: not what only other components publish; at least that it is over."""
+        # KILL reaches every component, so no list is empty.
         prefixes = self.resolved.processes[part.name].envelopes
         if prefixes is None or "" in prefixes:
             return ["all envelopes"]
@@ -150,13 +147,12 @@ class _Drawing:
             )
             label = ", ".join(self.resolved.processes[box.part.name].declared.publishes) or "messages of its own"
             lanes.append(PublisherLane(box, listeners, f"{label} {_at(slot.address)}"))
-        # short ways near the boxes, long ways above them: fewer crossings
+        # short lanes near the boxes, long ones above them: fewer crossings
         return sorted(lanes, key=lambda lane: len(lane.listeners))
 
-    # --- where it goes --------------------------------------------------------------------------------------------
+    # --- layout --------------------------------------------------------------------------------------------
 
     def _top(self) -> float:
-        """Return the y of the components' upper edge."""
         return MARGIN + 34 + LANE * len(self.lanes)
 
     def _place(self) -> None:
@@ -171,7 +167,7 @@ class _Drawing:
         labels = max((len(box.labels) for box in self.components), default=0)
         self.bar_y = self._top() + height + max(64.0, LINE * labels + 34.0)
 
-    # --- drawn ----------------------------------------------------------------------------------------------------
+    # --- drawing ----------------------------------------------------------------------------------------------------
 
     def _process(self, box: ProcessBox) -> None:
         fill, stroke = FILLS[self.resolved.processes[box.part.name].role]
@@ -191,7 +187,6 @@ class _Drawing:
             self._down(box.x + box.arrows_at + ARROW_AT, top, bottom)
 
     def _hears_scheduler(self, box: ProcessBox) -> bool:
-        """Some only listen to other components."""
         sources = self.resolved.net.links[box.part.name].subscribe
         own = {f"{p.name}/publish" for p in self.resolved.with_role(Role.SCHEDULER)}
         own |= {slot.address for key, slot in self.resolved.net.slots.items() if key in own and slot.address}
@@ -200,7 +195,6 @@ class _Drawing:
         return any(source in own or source not in others for source in sources)
 
     def _up(self, x: float, top: float, bottom: float, labels: Sequence[str]) -> None:
-        """Envelopes, from below to above, with their names to the left."""
         self.svg.line([(x, bottom), (x, top + 1)], stroke=ENVELOPES)
         y = (top + bottom) / 2 - LINE * (len(labels) - 1) / 2 + 4
         for label in labels:
@@ -208,7 +202,6 @@ class _Drawing:
             y += LINE
 
     def _down(self, x: float, top: float, bottom: float) -> None:
-        """Requests, from above to below."""
         self.svg.line([(x, top), (x, bottom - 1)], stroke=CONTROL)
         self.svg.text(x + 8, (top + bottom) / 2 + 4, "requests", size=LABEL_SIZE, fill=CONTROL, anchor="start")
 
@@ -226,7 +219,6 @@ class _Drawing:
         self.svg.text(middle, y - 6, lane.label, size=LABEL_SIZE, fill=ENVELOPES, halo=True)
 
     def _entry(self, lane: PublisherLane, box: ProcessBox) -> float:
-        """Return where a lane comes down to a listener: each at a place of its own, left of the box's own."""
         arriving = [other for other in self.lanes if box in other.listeners]
         return box.x - box.width / 4 + arriving.index(lane) * min(14.0, box.width / 2 / (len(arriving) + 1))
 
@@ -240,7 +232,6 @@ class _Drawing:
         self._addresses(part.name, self.bar_x + 14, self.bar_x + self.bar_width - 14, self.bar_y + 27)
 
     def _addresses(self, name: str, left: float, right: float, y: float) -> None:
-        """Where a process publishes (left) and answers (right)."""
         for use, said, x, anchor, colour in (
             ("publish", "publishes", left, "start", ENVELOPES),
             ("serve", "answers", right, "end", CONTROL),
@@ -251,7 +242,6 @@ class _Drawing:
                 self.svg.text(x, y + LINE, _at(slot.address), size=TEXT_SIZE, fill=GREY, anchor=anchor)
 
     def _translator(self, box: ProcessBox) -> float:
-        """Return the translator below the bar and its microscope below it; returns where that ends."""
         middle = self.bar_x + self.bar_width / 2
         top = self.bar_y + BAR_HEIGHT
         name = box.part.name

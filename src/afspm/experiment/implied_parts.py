@@ -1,4 +1,4 @@
-"""Components that are part of an experiment without being in its file: the recorder, and the notifier of [notify]."""
+"""Components of every experiment that its file does not list: the recorder, and the notifier of [notify]."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from afspm.experiment.toml_lines import Settings
 from afspm.model import Role
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
     from afspm.experiment.sections import NotifySection
 
 RECORDER, NOTIFIER = "recorder", "notifier"
 RECORDS, NOTIFIES = "records", "notifies"
-"""Attributes by which a class says that it does what the recorder or the notifier does."""
+"""Class attributes that mark a recorder or a notifier."""
 
 
 def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the recorder as [record] wants it; None: it wants none, the file has one, or there is no scheduler."""
+    """Return the recorder of [record]; None if it is off, the file lists one, or there is no scheduler."""
     section = resolved.sections.record
-    if not section.on or resolved.saying(RECORDS) or not resolved.with_role(Role.SCHEDULER):
+    if not section.on or resolved.declaring(RECORDS) or not resolved.with_role(Role.SCHEDULER):
         return None
     return _implied(resolved, RECORDER, {} if section.scans else {"scans": False}, "record")
 
 
 def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the notifier as [notify] wants it; None if nobody is told of what happens during the experiment."""
+    """Return the notifier of [notify]; None if it sends nothing during the experiment, or the file lists one."""
     section = resolved.sections.notify
     occasions = (set(OCCASIONS) - {END}) & set(section.on)
     is_wanted = (section.command or section.webhook) and occasions
-    if not is_wanted or resolved.saying(NOTIFIES) or not resolved.with_role(Role.SCHEDULER):
+    if not is_wanted or resolved.declaring(NOTIFIES) or not resolved.with_role(Role.SCHEDULER):
         return None
     wanted = targets(section, resolved.document.folders[0])
     settings: Settings = {"program": list(wanted.command)} if wanted.command else {}
@@ -50,7 +50,7 @@ def _implied(resolved: ResolvedExperiment, name: str, settings: Settings, sectio
 
 
 def targets(section: NotifySection, folder: Path) -> Targets:
-    """Return who is told. "python" as the program means the one that runs us."""
+    """Return the targets of notifications. "python" as the program means the running interpreter."""
     command = section.command
     if command[:1] == ("python",):
         command = (sys.executable, *command[1:])
@@ -58,7 +58,7 @@ def targets(section: NotifySection, folder: Path) -> Targets:
 
 
 def check_notify(resolved: ResolvedExperiment) -> None:
-    """Check that [notify] names a way to tell people, and that it works."""
+    """Check that [notify] has a target, and that the target can be reached."""
     section = resolved.sections.notify
     if "notify" in resolved.parts.sections and not (section.command or section.webhook):
         resolved.document.error("[notify] has no recipient", "notify", hint="give a `command` or a `webhook`")
@@ -69,11 +69,11 @@ def check_notify(resolved: ResolvedExperiment) -> None:
         try:
             address(section.webhook)
         except ConfigError as error:
-            # the environment may be that of another computer, where the scheduler is started
+            # the scheduler may start on another computer, where the environment has this variable
             report = resolved.document.warning if section.webhook.startswith("$") else resolved.document.error
             report(f"[notify] webhook: {error.what}", "notify", "webhook", hint=error.hint)
 
 
 def is_program(name: str, folder: Path) -> bool:
-    """Return whether a command may begin with this: "python", which is ours, a program, a file in a folder."""
+    """Return whether a command may begin with this: "python", an installed program, or a file in `folder`."""
     return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

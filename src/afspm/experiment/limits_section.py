@@ -1,4 +1,6 @@
-"""[limits]: what of the microscope may be set, how far, how fast, where and by whom: see `scheduler.safety.limits`.
+"""[limits]: which parameters may be set, how far, how fast, where and by what component.
+
+The limits are enforced by `scheduler.safety.limits`.
 
 [limits]
 region = { x = ["-5 um", "5 um"], y = ["-5 um", "5 um"] }
@@ -45,7 +47,7 @@ Pair = tuple[Length, Length]
 
 
 class RegionSection(Section):
-    """[limits] region: from and to in x and y, or a rectangle by its centre that may be turned."""
+    """[limits] region: ranges in x and y, or a rectangle given by centre, size and angle."""
 
     x: Pair | None = None
     y: Pair | None = None
@@ -55,7 +57,7 @@ class RegionSection(Section):
 
 
 class LimitsSection(Section):
-    """The keys of [limits] that are not parameters."""
+    """Keys of [limits] that are not parameters."""
 
     region: RegionSection | None = None
     most_pixels: Count = ExperimentLimits.most_pixels
@@ -66,13 +68,13 @@ _OWN: Final = (*LimitsSection.model_fields, "actions")
 
 @dataclass(frozen=True)
 class LimitsReader:
-    """Reads the section, given what the microscope has.
+    """Reads the section for a microscope's capabilities.
 
     Args:
-        parameters: the generic names that exist with their SI units (None: it depends on the operating mode).
-        actions: those that exist; None: not known before it runs.
-        sets: by name of an action, the parameters that it sets.
-        certain: whether these are all parameters, or only those that any microscope may have.
+        parameters: known generic names with their SI units (None: it depends on the operating mode).
+        actions: known actions; None if they can't be known before the microscope runs.
+        sets: parameters that an action sets, by its name.
+        certain: whether these are all parameters, or only the base parameters and afspm's extensions.
     """
 
     document: Document
@@ -87,7 +89,7 @@ class LimitsReader:
         return frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self.actions is None else self.actions
 
     def read(self, table: Table) -> ExperimentLimits:
-        """Return the limits; what is wrong is reported and left out."""
+        """Return the limits; errors are reported, and the entries left out."""
         own = {key: value for key, value in table.items() if key in LimitsSection.model_fields}
         whole = parse(LimitsSection, "limits", own, self.document)
         parameters = {key: value for key, value in table.items() if key not in _OWN}
@@ -207,7 +209,6 @@ class LimitsReader:
         return Region(center, size, box.angle)
 
     def _check_sizes(self, limits: ExperimentLimits) -> None:
-        """The smallest scan allowed must fit into the region allowed."""
         if limits.region is None:
             return
         longest_m = math.hypot(*limits.region.size_m)
@@ -230,7 +231,6 @@ def _unit_given(given: Table) -> str | None:
 
 
 def _rate(value: Quantity, unit: str) -> float:
-    """Return a change per second, in `unit` per second: "1 V/s", "0.1 V/min"."""
     if not isinstance(value, str):
         require_unit(value, unit)
         return float(value)

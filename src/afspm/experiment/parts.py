@@ -1,4 +1,4 @@
-"""The file's top level sorted into variables, our own sections, intermediary tables and components."""
+"""The top level of the file, sorted into variables, sections, intermediary tables and components."""
 
 from __future__ import annotations
 
@@ -16,27 +16,28 @@ SECTIONS: Final = (
     "clock", "control", "limits", "problems", "cache", "security", "restart", "record", "metadata", "notify",
 )  # fmt: skip
 
-# Keys of a component's table that are for us; everything else is a setting of its class or command.
+# Keys of a component's table that are afspm's; all others are settings of its class or command.
 OWN_KEYS: Final = frozenset(
     {"component", "class", "command", "envelopes", "listens_to", "role", "heartbeats", *WIRE_KEYS}
 )
 SIMULATED = "simulated"
-"""For a translator that is a command: whether its microscope is simulated, as a class says by an attribute."""
+"""Marks a simulated microscope: an attribute of its class, or a key in the table of a command."""
 EMULATED = "emulated"
-"""An attribute by which a class says that it is the controller, emulated: the translator then talks to it."""
+"""Class attribute that marks an emulated controller; the translator talks to it."""
+# a command declares in its table what a class declares by attributes
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
 
 
 @dataclass(frozen=True)
 class ExperimentPart:
-    """One process of the experiment as the file has it, references replaced.
+    """One process as it is in the file, references replaced.
 
     Attributes:
-        class_path: as written (a class of another form already ours); empty for a command.
+        class_path: as written (converted, if it was of another form); empty for a command.
         command: program and arguments; empty for a Python class.
-        settings: what goes to the constructor, still with units.
-        own: the keys of the table that are for us (wiring, envelopes, role …).
-        implied: it is not in the file, but part of every experiment; it runs where the scheduler does.
+        settings: arguments of the constructor, still with units.
+        own: keys of the table that are afspm's (wiring, envelopes, role …).
+        implied: whether it is not in the file, but part of every experiment; it runs where the scheduler does.
     """
 
     name: str
@@ -50,19 +51,19 @@ class ExperimentPart:
 
 @dataclass
 class ExperimentParts:
-    """The sorted and expanded file."""
+    """The file, sorted and expanded."""
 
     variables: Settings = field(default_factory=dict)
     sections: dict[str, Settings] = field(default_factory=dict)
     intermediaries: dict[str, Settings] = field(default_factory=dict)
     components: list[ExperimentPart] = field(default_factory=list)
     became: dict[Path, str] = field(default_factory=dict)
-    """What became of each line of another form (`forms`)."""
+    """Equivalent of each line of a file of another form (`forms`)."""
     instead: dict[str, Settings] = field(default_factory=dict)
-    """Tables of components that have no counterpart, by their names, as they are in the file."""
+    """Tables of components without equivalent, by name, unchanged."""
 
     def free_name(self, wanted: str) -> str:
-        """Return a name for a component that is not in the file: `wanted`, numbered where that is taken."""
+        """Return a name for a component that is not in the file: `wanted`, with a number if that is taken."""
         taken = {part.name.casefold() for part in self.components}
         taken |= {name.casefold() for name in (*self.variables, *self.intermediaries)}
         names = itertools.chain([wanted], (f"{wanted}{number}" for number in itertools.count(2)))
@@ -70,19 +71,19 @@ class ExperimentParts:
 
 
 class Converter(Protocol):
-    """Makes components of another form of files ours."""
+    """Converts components of another form of files."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-        """Return the components of a file as ours, by name; those that are ours already as they are.
+        """Return the components in afspm's form, by name; components already in it are returned unchanged.
 
         Args:
-            tables: the components, with their references replaced.
-            parts: the rest of the file; intermediaries and sections may be changed, `became` says what was.
+            tables: components with their references replaced.
+            parts: the rest of the file; intermediaries and sections may be changed, as noted in `became`.
         """
 
 
 def sort(document: Document, converters: Iterable[Converter] = ()) -> ExperimentParts:
-    """Sort and expand; report what can't be part of an experiment."""
+    """Sort the tables and expand references; report tables that can't be part of an experiment."""
     parts = ExperimentParts()
     raw_components: dict[str, Settings] = {}
     for key, value in document.data.items():
@@ -172,13 +173,13 @@ def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -
 
 
 class VariableReferences:
-    """Replaces references in values: a text that equals a top-level key stands for that key's value, as in the paper.
+    """Replaces references: a text that equals a top-level key stands for that key's value, as in the paper.
 
-    Only whole texts count, and only keys that hold a variable or an intermediary table: components and the sections
-    are no values, so that a component may be named (in a role, in a limit) without being pasted in.
+    Only whole texts count, and only keys of variables and intermediary tables. Components and sections are no values,
+    so a component can be named (in a role, in a limit) without its table being pasted in.
 
     Attributes:
-        used: the keys that were referred to.
+        used: keys that were referred to.
     """
 
     def __init__(self, document: Document, variables: Table) -> None:
@@ -187,7 +188,7 @@ class VariableReferences:
         self.used: set[str] = set()
 
     def expand(self, value: Any, path: Path) -> Any:
-        """Return `value`, which stands at `path`, with every reference in it replaced, again and again."""
+        """Return `value`, set at `path`, with all references in it replaced, also within replacements."""
         return self._expand(value, path, ())
 
     def _expand(self, value: object, path: Path, through: tuple[str, ...]) -> object:
@@ -204,9 +205,9 @@ class VariableReferences:
         return self._expand(self._variables[value], (value,), (*through, value))
 
     def _report_cycle(self, around: tuple[str, ...]) -> None:
-        # the same ring is met from each of its keys: begin it at its smallest name, so that it is reported once
+        # a cycle is found from each of its keys: begin it at its smallest name, so that it is reported once
         ring = around[:-1]
         start = ring.index(min(ring))
         ring = ring[start:] + ring[:start]
         what = " -> ".join((*ring, ring[0]))
-        self._document.error(f"the references go in a circle: {what}", ring[0])
+        self._document.error(f"references form a cycle: {what}", ring[0])

@@ -1,4 +1,4 @@
-"""The plan of a ready-made component, as far as it is fixed before it runs: made once, never started."""
+"""The plan of a component, as far as its settings fix it. The component is constructed, never started."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 
 @dataclass(frozen=True)
 class PlannedMeasurements:
-    """The measurements of a plan, and what the microscope must have for them.
+    """Measurements of a plan, and the capabilities that it needs.
 
     Attributes:
-        drift_doubts: what to warn of where drift is corrected; `where` names the setting.
+        drift_doubts: warnings for an experiment that corrects drift; `where` names the setting.
         parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
-        period_s: between the beginnings of two rounds; 0: no pause.
+        period_s: between the starts of two rounds; 0: no pause.
         scan_speed_m_s: of a microscope that knows the speed of its first scan.
-        is_listed: whether the file lists the regions, each with a place of its own.
+        is_listed: whether the file lists the regions, each at a place of its own.
     """
 
     regions: tuple[Region, ...] = ()
@@ -55,10 +55,10 @@ class PlannedMeasurements:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A reason for which the limits refuse a part of a plan.
+    """Reason why the limits refuse a part of a plan.
 
     Attributes:
-        where: the setting that it is about; empty: several.
+        where: path of the setting; empty if several are concerned.
     """
 
     reason: str
@@ -67,10 +67,10 @@ class Refusal:
 
 
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
-    """Return the plan of a component with these settings; None where it has none, or none that can be known.
+    """Return the plan of a component with these settings; None if it has none, or none that can be known.
 
-    Only declared classes, and those derived from them, are made: they do nothing in `__init__` but to keep and to
-    check their settings.
+    Only classes declared by entry points, and classes derived from them, are constructed: their `__init__` only stores
+    and checks settings.
 
     Raises:
         AfspmError: the component refuses its settings.
@@ -79,7 +79,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
         return None
     made = component(**settings)
     if callable(check := getattr(made, "check", None)):
-        check()  # what takes longer than `__init__` may
+        check()  # checks that would be too slow in `__init__`
     plan = getattr(made, "plan", None)
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
@@ -99,7 +99,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
 
 
 _PARAMETERS = ("parameters", "zoom_parameters", "initial")
-"""Attributes with values that a component sets, as its settings are called."""
+"""Attributes of components with parameters to set, named as the settings."""
 
 
 def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
@@ -108,8 +108,8 @@ def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
-    """Return why the limits would refuse what is planned; each reason once."""
-    # steps and rates depend on what is in force by then
+    """Return why the limits would refuse the plan; each reason once."""
+    # steps and rates depend on the value before, which is unknown here
     guard = LimitChecker(_without_changes(limits))
     found: dict[str, Refusal] = {}
 
@@ -119,12 +119,12 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
             found.setdefault(refused.reason, Refusal(refused.reason, where, hint))
 
     for setting, parameters in planned.parameters.items():
-        if setting == "initial":  # set by the microscope itself; a frame comes in parts
+        if setting == "initial":  # values of the microscope itself; its frame is checked in parts
             guard = LimitChecker(replace(_for_all(_without_changes(limits)), region=None))
         for parameter in parameters:
             check(ControlRequest.PARAM, parameter, (setting, parameter.name))
     guard = LimitChecker(_without_changes(limits))
-    cure = _cure(planned, limits.region)
+    cure = _remedy(planned, limits.region)
     for number, region in enumerate(planned.regions):
         wanted, where = ScanParameters(region, planned.shape), ("regions", number)
         if planned.is_listed:
@@ -136,8 +136,7 @@ def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) 
     return list(found.values())
 
 
-def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
-    """Return how a plan would lie within the region allowed: the nearest region, or how far all of it has to move."""
+def _remedy(planned: PlannedMeasurements, allowed: Region | None) -> str:
     points = [point for region in planned.regions for point in region.corners_m()] + list(planned.positions)
     if allowed is None or not points:
         return ""
@@ -147,7 +146,7 @@ def _cure(planned: PlannedMeasurements, allowed: Region | None) -> str:
     if shift is None:
         return f"all of it is larger than the region allowed, {lengths_text(allowed.size_m, ' x ')}"
     x, y = (lengths_text([value]) for value in shift)
-    return f"moved by ({x}, {y}) all of it fits"
+    return f"it fits if moved by ({x}, {y})"
 
 
 def _nearest_text(region: Region, allowed: Region | None) -> str:
@@ -159,13 +158,13 @@ def _nearest_text(region: Region, allowed: Region | None) -> str:
     return f"the nearest that fits: center = {center}, size = {size}"
 
 
-_REACH = 1e-9  # as of the limits: what lies on the border, to the precision of the arithmetic, is inside
+_REACH = 1e-9  # the tolerance of the limits: a point on the border counts as inside despite rounding
 _MARGIN = 1e-3
-"""Relative: by so much a cure stays within the region where its rounded numbers would not."""
+"""Relative distance of a suggested region from the border, used if its rounded numbers would exceed it."""
 
 
 def nearest_region(region: Region, allowed: Region) -> Region:
-    """Return the region of the same angle, in round numbers, nearest to one that fits; smaller if need be."""
+    """Return the nearest region of the same angle that fits, in round numbers; smaller if need be."""
     exact = _rounded(_nearest(region, allowed, 0.0))
     reach = replace(allowed, size_m=(allowed.size_m[0] * (1 + _REACH), allowed.size_m[1] * (1 + _REACH)))
     if all(reach.contains(corner) for corner in exact.corners_m()):
@@ -174,7 +173,7 @@ def nearest_region(region: Region, allowed: Region) -> Region:
 
 
 def _rounded(region: Region) -> Region:
-    """Return a region in the digits of `lengths_text`; a centre that is zero but for the arithmetic is zero."""
+    # the digits of `lengths_text`; a centre of 1e-22 m from rounding is shown as zero
     width, height = (float(f"{size_m:.5g}") for size_m in region.size_m)
     x, y = (float(f"{place_m:.5g}") if abs(place_m) > 1e-6 * width else 0.0 for place_m in region.center_m)
     return replace(region, center_m=(x, y), size_m=(width, height))
@@ -189,7 +188,6 @@ def _nearest(region: Region, allowed: Region, margin: float) -> Region:
 
 
 def _extent(points: Iterable[XY], allowed: Region) -> list[tuple[float, float]]:
-    """Return the lowest and highest place of points along the sides of the region allowed, from its centre."""
     cos, sin = math.cos(allowed.angle_rad), math.sin(allowed.angle_rad)
     places = [(float(x) - allowed.center_m[0], float(y) - allowed.center_m[1]) for x, y in points]
     along = [cos * x + sin * y for x, y in places]
@@ -198,7 +196,6 @@ def _extent(points: Iterable[XY], allowed: Region) -> list[tuple[float, float]]:
 
 
 def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
-    """Return the shortest shift by which points come to lie within a region; None: they are too far apart."""
     moves = []
     for (low, high), size in zip(_extent(points, allowed), allowed.size_m, strict=True):
         if high - low > size * (1 + 1e-12):
@@ -213,10 +210,10 @@ def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
 
 
 def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
-    """Return that a round takes longer than its period; empty: it does not, or its speed is not known.
+    """Return a text if a round takes longer than its period; empty if it does not, or its speed is unknown.
 
     Args:
-        usual_m_s: the speed of a scan where the plan sets none.
+        usual_m_s: scan speed where the plan sets none.
     """
     speeds = [one for one in planned.parameters.get("parameters", ()) if one.name == names.SCAN_SPEED]
     speed_m_s = si(f"{speeds[0].value} {speeds[0].unit or 'm/s'}", "m/s") if speeds else usual_m_s
@@ -234,8 +231,8 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
 
 
 def refused_actions(limits: ExperimentLimits) -> list[tuple[str, str]]:
-    """Return the actions whose settings the limits would always refuse, and why."""
-    # where the tip is is not known yet
+    """Return the actions whose settings the limits would always refuse, with the reasons."""
+    # the tip's position is unknown before the start
     guard = LimitChecker(replace(_for_all(_without_changes(limits)), actions={}, region=None))
     found = []
     for action in limits.sets:

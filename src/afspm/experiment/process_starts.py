@@ -1,48 +1,76 @@
-"""Launch lines of the processes to start."""
+"""Processes to start, with their launch lines."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from afspm.basics.addresses import connectable, reaches
 from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch, Sockets
 from afspm.basics.requirements import require
-from afspm.experiment.experiment import ProcessStart
 from afspm.experiment.findings import Finding, Level, nearest
 from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.toml_writer import SECRET
-from afspm.experiment.wiring import ProcessSockets
+from afspm.experiment.wiring_classes import ProcessSockets
 from afspm.model import Frame, Role
 from afspm.model.microscope_status import FEEDBACK_OFF
 from afspm.model.snapshot import to_plain
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
+    from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 
 DASHBOARD = "dashboard"
-"""The name under which `afspm dashboard` joins a run."""
+"""Name under which `afspm dashboard` joins a run."""
 DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
-"""The environment variable that only dashboards get."""
+"""Environment variable that only dashboards get."""
+# each connects to a socket that the process before it binds
 _ORDER = (Role.TRANSLATOR, Role.SCHEDULER, Role.COMPONENT)
+
+
+@dataclass(frozen=True)
+class ProcessStart:
+    """One process to start.
+
+    Attributes:
+        launch: line for its standard input; the supervisor adds heartbeat, log, clock and folders unless they were
+            given to `Experiment.launches`.
+        command: program and arguments; empty: the Python host runs `launch.class_`.
+        folder: working directory of commands: the experiment file's folder.
+        beats: whether it sends heartbeats; without them (`heartbeats = false`) only its exit shows that it is dead.
+        python_path: folders to put before PYTHONPATH, so that modules beside the file are found.
+        leaves_last: whether it stays until the other components have ended, to record their last packets.
+        acts: whether it follows a plan of its own, as a series does, or that is unknown; the others react.
+        hidden: environment variables that hold secrets of other processes.
+    """
+
+    launch: Launch
+    role: Role
+    command: tuple[str, ...]
+    folder: Path
+    python_path: tuple[str, ...]
+    beats: bool = True
+    leaves_last: bool = False
+    acts: bool = False
+    hidden: tuple[str, ...] = ()
 
 
 def starts(
     resolved: ResolvedExperiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
 ) -> list[ProcessStart]:
-    """Return the processes chosen, translator and scheduler first; clock and folders are still to be added."""
+    """Return the chosen processes, translator and scheduler first; clock and folders are added later."""
     implied = {name for name, process in resolved.processes.items() if process.part.implied}
     chosen = chosen_names(resolved, only, without)
     if any(scheduler.name in chosen for scheduler in resolved.with_role(Role.SCHEDULER)):
-        chosen |= implied - set(only) - set(without)  # what is not in the file is started where the scheduler is
+        chosen |= implied - set(only) - set(without)  # implied parts start where the scheduler does
     else:
         chosen -= implied - set(only)
     links = {name: _subscribing(resolved, name, chosen, set(without)) for name in chosen}
-    # those that are not chosen run elsewhere; without `only` they may just have been left out
+    # with `only` the others run elsewhere; without, they may just have been left out
     _require_addresses(resolved, {**resolved.net.links, **links} if only else links, chosen, implied)
     addresses = resolved.net.addresses(take_address)
     processes = [process for role in _ORDER for process in resolved.with_role(role) if process.name in chosen]
@@ -54,14 +82,14 @@ def starts(
 
 
 def knowing_the_run(resolved: ResolvedExperiment) -> set[str]:
-    """Return who is told the identity of the run: all, unless the scheduler is of another language."""
+    """Return the processes that get the run's identity: all, unless the scheduler is written in another language."""
     if all(not scheduler.part.command for scheduler in resolved.with_role(Role.SCHEDULER)):
         return set(resolved.processes)
     return {*resolved.emulators, *(translator.name for translator in resolved.with_role(Role.TRANSLATOR))}
 
 
 def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: Collection[str]) -> set[str]:
-    """Return the names that are chosen to be started here.
+    """Return the names of the processes to start here.
 
     Raises:
         ConfigError: there is no such component.
@@ -74,9 +102,9 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
 
 
 def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
-    """Return whether a run of these processes ends when nothing that acts is left.
+    """Return whether a run of these processes ends once no process with a plan is left.
 
-    Only where all that act, and the scheduler, are started here: plans on other computers may go on.
+    Only if all processes with plans, and the scheduler, are started here: plans on other computers may go on.
     """
     acting = {name for name, process in resolved.processes.items() if process.role is Role.COMPONENT and process.acts}
     schedulers = {scheduler.name for scheduler in resolved.with_role(Role.SCHEDULER)}
@@ -84,7 +112,7 @@ def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
 
 
 def not_installed(resolved: ResolvedExperiment, names: Collection[str]) -> Iterator[Finding]:
-    """Yield an error for each of these processes whose class requires a package that is not installed here."""
+    """Yield an error for each of these processes whose class needs a package that is not installed here."""
     for process in resolved.processes.values():
         try:
             if process.name in names:
@@ -95,11 +123,8 @@ def not_installed(resolved: ResolvedExperiment, names: Collection[str]) -> Itera
 
 
 def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], without: set[str]) -> ProcessSockets:
-    """Return the sockets of a process, without those that nobody can know of.
-
-    A component that is left out, and has no address, is not there. And nobody has to write down an address for the
-    sake of what is not in the file.
-    """
+    # Left out: publishers without an address that are not started here. Parts that the file does not mention must not
+    # force an address into it.
     links, is_implied = resolved.net.links[name], resolved.processes[name].part.implied
     unknown = {
         key
@@ -116,7 +141,6 @@ def _subscribing(resolved: ResolvedExperiment, name: str, chosen: set[str], with
 def _require_addresses(
     resolved: ResolvedExperiment, links: Mapping[str, ProcessSockets], chosen: set[str], implied: set[str]
 ) -> None:
-    """Between a process started here and one started elsewhere the address must be written down."""
     missing: dict[str, set[str]] = {}
     for name in links.keys() - implied:
         for key in (links[name].control, *links[name].subscribe):
@@ -168,43 +192,45 @@ def _start(
         simulated=resolved.simulated_with(chosen),
         controller=resolved.controller_of(name, chosen) if role is Role.TRANSLATOR else "",
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
-        retracts=role is Role.TRANSLATOR and _retracts(resolved),
+        retracts=role is Role.TRANSLATOR and _retracts_when_released(resolved),
         adjustable=control.adjustable if role is Role.TRANSLATOR else (),
     )
-    if command[:1] == ("python",):  # the one that runs us, wherever that is
+    if command[:1] == ("python",):  # the running interpreter
         command = (sys.executable, *command[1:])
     folders = resolved.document.folders
     beats = process.part.own.get("heartbeats") is not False
-    hidden, is_last = _hidden(resolved, process), process.says(RECORDS)
+    hidden, is_last = _hidden_variables(resolved, process), process.declares(RECORDS)
     acts = role is Role.COMPONENT and process.acts
     return ProcessStart(launch, role, command, folders[0], tuple(map(str, folders)), beats, is_last, acts, hidden)
 
 
-def _hidden(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
-    """Environment variables that hold secrets of others."""
-    every = {DASHBOARD_PASSWORD, *_variable(resolved.sections.notify.webhook)}
+def _hidden_variables(resolved: ResolvedExperiment, process: ResolvedProcess) -> tuple[str, ...]:
+    # environment variables with secrets of other processes
+    every = {DASHBOARD_PASSWORD, *_variable_name(resolved.sections.notify.webhook)}
     every.update(*map(_secrets, resolved.processes.values()))
     return tuple(sorted(every - _secrets(process)))
 
 
 def _secrets(process: ResolvedProcess) -> set[str]:
-    return {*_variable(process.settings.get(SECRET)), *([DASHBOARD_PASSWORD] if process.says("operates") else [])}
+    return {
+        *_variable_name(process.settings.get(SECRET)),
+        *([DASHBOARD_PASSWORD] if process.declares("operates") else []),
+    }
 
 
-def _variable(secret: object) -> list[str]:
-    """The environment variable that is named instead of a secret."""
+def _variable_name(secret: object) -> list[str]:
     return [secret[1:]] if isinstance(secret, str) and secret.startswith("$") else []
 
 
 def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | None:
-    """Return a launch line by which to ask a scheduler elsewhere, in the name of the first of `names`.
+    """Return a launch line for requests to a scheduler elsewhere, in the name of the first of `names`.
 
-    None where it is not said where it is, or it is of another language and perhaps knows nothing of our requests.
+    None if its address is not in the file, or it is written in another language and may not know these requests.
     """
     scheduler = next(iter(resolved.with_role(Role.SCHEDULER)), None)
     if scheduler is None or scheduler.part.command:
         return None
-    # as those that are started here reach it; a translator, which asks nobody, by what the scheduler binds
+    # the address that processes here connect to; else (a translator sends no requests) the one the scheduler binds
     known = [*(resolved.net.links[name].control for name in names), f"{scheduler.name}/serve"]
     slots = resolved.net.slots.items()
     addresses = {key: slot.address for key, slot in slots if slot.address is not None}
@@ -219,14 +245,13 @@ def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | Non
 
 
 def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mapping[str, str]) -> dict[str, str] | None:
-    """Return the folder of the keys, and whose key to expect at each address; see `Network.from_launch`."""
     if resolved.keys_folder is None:
         return {"insecure": "true"} if resolved.sections.security.insecure else None
     slots = resolved.net.slots.items()
     owners = {connectable(addresses[key]): slot.owner for key, slot in slots if key in addresses}
     keys = {"folder": str(resolved.keys_folder)}
     for scheduler in resolved.with_role(Role.SCHEDULER)[:1]:
-        keys["scheduler"] = scheduler.name  # whom alone a translator obeys
+        keys["scheduler"] = scheduler.name  # a translator obeys this scheduler alone
     for key in (links.control, *links.subscribe):
         if key is None:
             continue
@@ -238,29 +263,26 @@ def _keys(resolved: ResolvedExperiment, links: ProcessSockets, addresses: Mappin
 
 
 def _in_sample_coordinates(resolved: ResolvedExperiment) -> bool:
-    """Return whether the scheduler maps places, as its class says."""
     schedulers = resolved.with_role(Role.SCHEDULER)
     return any(getattr(scheduler.component, "frame", None) is Frame.SAMPLE for scheduler in schedulers)
 
 
 def _solved(resolved: ResolvedExperiment, without: Collection[str]) -> tuple[str, ...]:
-    """Return the problems that components solve, here or on another computer."""
     solvers = (process for process in resolved.processes.values() if process.name not in without)
     return tuple(sorted({problem for process in solvers for problem in process.declared.solves}))
 
 
-def _retracts(resolved: ResolvedExperiment) -> bool:
-    """Return whether a tip without feedback is to be retracted when nobody is in control any more."""
+def _retracts_when_released(resolved: ResolvedExperiment) -> bool:
+    # a tip without feedback drifts into the sample: it is retracted once no component is in control
     watchdog = resolved.sections.control.watchdog()
     return watchdog.retract is not None and FEEDBACK_OFF in watchdog.dangerous
 
 
 def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
-    """Return the sections that the scheduler enforces, as arguments of its constructor: plain data, in SI."""
     control = resolved.sections.control
     if control.roles.operate is None:
-        # components by which a person may command, and a dashboard that joins later, which is under no other's name
-        operators = resolved.saying("operates")
+        # components through which a person sends requests, and a dashboard that joins later, under its usual name
+        operators = resolved.declaring("operates")
         operate = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
         control = replace(control, roles=replace(control.roles, operate=tuple(operate)))
     return {

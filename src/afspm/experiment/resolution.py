@@ -1,16 +1,13 @@
-"""From the sorted file to what can be started: classes imported, settings in SI, sections parsed, sockets connected."""
+"""Resolution of the sorted file: classes imported, settings in SI, sections parsed, sockets connected."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
+from afspm import wire
 from afspm.basics.errors import AfspmError, InvalidValue, individual_errors
-from afspm.client.component import Component
 from afspm.experiment import (
-    cache_section,
     capabilities,
     class_loader,
     implied_parts,
@@ -24,154 +21,33 @@ from afspm.experiment.capabilities import MicroscopeCapabilities
 from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
-from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
-from afspm.experiment.planned_measurements import PlannedMeasurements
-from afspm.experiment.sections import ExperimentSections, read_sections
-from afspm.experiment.toml_lines import Settings, Table
-from afspm.experiment.wiring import BoundSocket, Wiring, WiringKeys
-from afspm.model import Parameter, ProblemNames, Role
-from afspm.scheduler.publishing.envelopes import CacheSettings
-from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.experiment.parts import ExperimentPart, ExperimentParts
+from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
+from afspm.experiment.sections import parse, read_sections
+from afspm.experiment.toml_lines import Table
+from afspm.experiment.wiring_classes import BoundSocket
+from afspm.model import PacketHeader, Parameter, ProblemNames, Role
+from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 FROM_SECTIONS = ("control", "limits", "cache")
-"""Arguments of a scheduler's constructor that come from sections of these names."""
+"""Arguments of a scheduler's constructor, filled from the sections of these names."""
+_EXAMPLE_HEADERS = (
+    PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
+    PacketHeader("Spec1d", kind="IV"),
+    *(
+        PacketHeader(one.name)
+        for one in wire.declared()
+        if one.kind is wire.MessageKind.STATE and one.source is Role.TRANSLATOR
+    ),
+)
+"""Headers for a trial of the user's mapping."""
 DRIFT = "DriftMapping"
-"""Published by a scheduler that corrects drift."""
-
-
-@dataclass
-class ResolvedProcess:
-    """One process with all that is known of it before it starts.
-
-    Attributes:
-        component: its class, and `class_path` where that is; None and empty for a command, or what can't be loaded.
-        settings: as its constructor gets them: in SI, of JSON's types.
-        wrong: the settings that were refused; None where all are right.
-    """
-
-    part: ExperimentPart
-    wires: WiringKeys
-    role: Role = Role.COMPONENT
-    declared: ComponentDeclaration = field(default_factory=ComponentDeclaration)
-    settings: Settings = field(default_factory=dict)
-    component: type | None = None
-    class_path: str = ""
-    wrong: frozenset[str] | None = None
-
-    @property
-    def name(self) -> str:
-        return self.part.name
-
-    @property
-    def acts(self) -> bool:
-        """Return whether it follows a plan of its own: a script, unless it solves problems. A command: unknown."""
-        if self.component is None or not issubclass(self.component, Component):
-            return self.component is None
-        return self.component.run is not Component.run and not self.declared.solves
-
-    def says(self, attribute: str) -> bool:
-        """Return whether its class has an attribute that is true."""
-        return getattr(self.component, attribute, False) is True
-
-    @property
-    def is_microscope(self) -> bool:
-        """True for a simulated microscope, as its class (a command: its table) says."""
-        return self.part.own.get(SIMULATED) is True if self.part.command else self.says(SIMULATED)
-
-    @property
-    def envelopes(self) -> tuple[str, ...] | None:
-        """The prefixes that it subscribes to: as the file says, else as its class declares; None: all."""
-        wanted = self.part.own.get("envelopes", self.wires.envelopes)
-        if wanted is None:
-            return self.declared.listens
-        return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
-
-    def capabilities(self) -> MicroscopeCapabilities | None:
-        """Return what a translator can do; None where that is not known before it runs."""
-        return None if self.component is None else capabilities.of_class(self.component, self.settings)
-
-
-@dataclass
-class ResolvedExperiment:
-    """Everything about the experiment that is known before it starts.
-
-    Attributes:
-        processes: by name, in the order of the file.
-        listening: where components listen by settings of their own, beside the wiring.
-        plans: by component, as far as they are fixed before it runs.
-    """
-
-    parts: ExperimentParts
-    document: Document
-    sections: ExperimentSections
-    messages: tuple[str, ...]
-    named_problems: dict[str, int]
-    processes: dict[str, ResolvedProcess] = field(default_factory=dict)
-    net: Wiring = field(default_factory=Wiring)
-    listening: list[BoundSocket] = field(default_factory=list)
-    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
-    caching: CacheSettings = field(default_factory=CacheSettings)
-    plans: dict[str, PlannedMeasurements] = field(default_factory=dict)
-
-    @property
-    def problems(self) -> ProblemNames:
-        return ProblemNames(self.named_problems)
-
-    def error(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Report an error at the line where `path` is set."""
-        self.document.error(what, *path, hint=hint)
-
-    def warning(self, what: str, *path: str | int, hint: str = "") -> None:
-        """Report a warning at the line where `path` is set."""
-        self.document.warning(what, *path, hint=hint)
-
-    def with_role(self, role: Role) -> list[ResolvedProcess]:
-        return [process for process in self.processes.values() if process.role is role]
-
-    def saying(self, attribute: str) -> list[str]:
-        """Return the names of the processes whose class has an attribute that is true."""
-        return [name for name, process in self.processes.items() if process.says(attribute)]
-
-    @property
-    def keys_folder(self) -> Path | None:
-        """The folder of [security] keys, absolute."""
-        keys = self.sections.security.keys
-        return None if keys is None else self.document.folder_of("security", "keys") / keys
-
-    @property
-    def simulated(self) -> bool:
-        """True if the microscope is simulated for certain, where all of the file is started on this computer."""
-        return self.simulated_with(self.processes)
-
-    def simulated_with(self, started: Collection[str]) -> bool:
-        """Return whether the microscope is simulated for certain, where these processes are started together.
-
-        Either the translator is the microscope itself, or it is wired to an emulator that is started with it.
-        """
-        translators = self.with_role(Role.TRANSLATOR)
-        return bool(translators) and all(
-            translator.is_microscope or bool(self.controller_of(translator.name, started)) for translator in translators
-        )
-
-    def controller_of(self, translator: str, started: Collection[str]) -> str:
-        """Return the name of the emulator that a translator is wired to; empty: none that is started with it.
-
-        A translator of another language can't be: nothing proves to whom it talks.
-        """
-        process = self.processes[translator]
-        if process.is_microscope or process.part.command or translator not in started:
-            return ""
-        return next((name for name in self.emulators if name in started), "")
-
-    @property
-    def emulators(self) -> list[str]:
-        """The emulated controllers among the components."""
-        return self.saying(EMULATED)
+"""Envelope that a scheduler publishes if it corrects drift."""
 
 
 def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
-    """Resolve all that can be; what can't is reported and left out."""
+    """Resolve the experiment; errors are reported, and the faulty parts left out."""
     resolved = ResolvedExperiment(
         parts=parts,
         document=document,
@@ -224,7 +100,7 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
 
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
-    """Return what the class says; a setting `problem` takes the place of its default there."""
+    # a setting `problem` replaces its default value in what the class solves and flags
     said = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
@@ -237,9 +113,8 @@ def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
 
 
 def _resolve_sections(resolved: ResolvedExperiment) -> None:
-    """The sections whose meaning depends on the components: what is kept, what is allowed, what is planned."""
     parts, document = resolved.parts, resolved.document
-    resolved.caching = cache_section.read(parts.sections.get("cache", {}), document)
+    resolved.caching = _cache_section(parts.sections.get("cache", {}), document)
     translators = resolved.with_role(Role.TRANSLATOR)
     has = next((has for translator in translators if (has := translator.capabilities())), None)
     reader = limits_section.LimitsReader(
@@ -259,7 +134,7 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         if process.component is None:
             continue
         if process.wrong is not None:
-            _look_inside(process, process.component, resolved)
+            _report_errors_inside(process, process.component, resolved)
         else:
             _resolve_plan(process, process.component, resolved, has)
     speeds = [plan.scan_speed_m_s for plan in resolved.plans.values()]
@@ -269,11 +144,33 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
             resolved.warning(f"[{name}] {what}", name, "every", hint="rounds that come too late are left out")
 
 
-def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
-    """Report errors within the tables of a component some of whose other settings are wrong already.
+def _cache_section(table: Table, document: Document) -> CacheSettings:
+    section = parse(CacheSettings, "cache", dict(table), document)
+    if section.mapping is not None:
+        _check_cache_mapping(section.mapping, document)
+    return section
 
-    Only settings that are right as far as was seen count: what does not fit together may do so when others are mended.
-    """
+
+def _check_cache_mapping(name: str, document: Document) -> None:
+    try:
+        function = class_loader.load(name)
+    except class_loader.Unloadable as error:
+        document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
+        return
+    if not callable(function):
+        document.error(f"[cache] mapping: {name} is not a function", "cache", "mapping")
+        return
+    for header in _EXAMPLE_HEADERS:  # a failure at run time would lose packets
+        try:
+            Envelopes(mapping=function).of(header)
+        except AfspmError as error:
+            document.error(f"[cache] mapping: {error.what}", "cache", "mapping", hint=error.hint)
+            return
+
+
+def _report_errors_inside(process: ResolvedProcess, component: type, resolved: ResolvedExperiment) -> None:
+    # Some settings are wrong already, so the component can't be made properly; its errors count only within
+    # tables that were sound, since settings that contradict each other may agree once the others are corrected.
     sound = process.settings.keys() - (process.wrong or ())
     try:
         planned_measurements.plan_of(component, process.settings)
@@ -282,7 +179,7 @@ def _look_inside(process: ResolvedProcess, component: type, resolved: ResolvedEx
             inside = _inside(one)
             if len(inside) > 1 and inside[0] in sound:
                 _report(process.name, one, resolved)
-    except Exception:  # made of what is wrong, it may fail in any way
+    except Exception:  # made of wrong settings, its constructor may raise anything
         return
 
 
@@ -293,7 +190,7 @@ def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:
-    """Return where in a component's table an error says that it is: "panel[1].set" as ("panel", 1, "set")."""
+    # "panel[1].set" is ("panel", 1, "set").
     where = error.where.removeprefix("simulation.").removeprefix("the experiment file, ")
     return tuple(int(index) if index else key for key, index in _STEP.findall(where))
 
@@ -301,7 +198,7 @@ def _inside(error: AfspmError) -> tuple[str | int, ...]:
 def _resolve_plan(
     process: ResolvedProcess, component: type, resolved: ResolvedExperiment, has: MicroscopeCapabilities | None
 ) -> None:
-    """Make a ready-made component once: it knows best whether its settings fit together."""
+    # the component is made once, since its constructor checks best whether settings fit together
     name = process.name
     try:
         plan = planned_measurements.plan_of(component, process.settings)
@@ -309,7 +206,7 @@ def _resolve_plan(
         for one in individual_errors(error):
             _report(name, one, resolved)
         return
-    except Exception as error:
+    except Exception as error:  # the constructor may be the user's, and raise anything
         resolved.document.error(f"[{name}] refuses its settings: {type(error).__name__}: {error}", name)
         return
     if plan is None:
@@ -334,7 +231,7 @@ def _resolve_plan(
 
 
 def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
-    """By the key `role`, else by the wiring keys that only one role has."""
+    # a command has no class to derive from: the key `role` decides, else wiring keys that only one role has
     written = part.own.get("role")
     if written is not None:
         if written in [role.value for role in Role]:
@@ -347,7 +244,6 @@ def _written_role(part: ExperimentPart, resolved: ResolvedExperiment) -> Role:
 
 
 def _messages(given: object, document: Document) -> tuple[str, ...]:
-    """`messages`: .proto files, absolute, and modules with messages of the user."""
     if not isinstance(given, list) or not all(isinstance(one, str) for one in given):
         document.error("`messages` is not a list of texts", "messages", hint='messages = ["my.proto"]')
         return ()
@@ -367,7 +263,6 @@ def _messages(given: object, document: Document) -> tuple[str, ...]:
 
 
 def _problems(table: Table, document: Document) -> dict[str, int]:
-    """[problems]: each name with its number; a wrong one is reported and left out."""
     named: dict[str, int] = {}
     for name, number in table.items():
         if not isinstance(number, int) or isinstance(number, bool):

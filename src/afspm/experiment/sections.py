@@ -1,12 +1,13 @@
-"""Our own sections of the experiment file, as pydantic models. Only loaded where a file is checked or run."""
+"""Sections of the experiment file as pydantic models. Loaded only when a file is checked or run."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import is_dataclass
 from datetime import datetime
 from functools import partial
-from typing import Annotated, ClassVar, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, ClassVar, Final, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import pydantic
 from pydantic import Field, StrictBool
@@ -14,20 +15,38 @@ from pydantic import Field, StrictBool
 from afspm.basics.plain_data import file_key
 from afspm.basics.units import Duration, PositiveDuration
 from afspm.experiment.document import Document
-from afspm.experiment.run_metadata import Orcid
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.validation_messages import report
 from afspm.scheduler.settings import ControlSettings
 
+_ORCID: Final = re.compile(r"(?:https://orcid\.org/)?(\d{4}-\d{4}-\d{4}-\d{3}[\dX])")
+
+
+def _checked_orcid(text: str) -> str:
+    # the last digit is a check digit after ISO 7064 (MOD 11-2)
+    found = _ORCID.fullmatch(text)
+    if found is None:
+        raise ValueError("an ORCID iD looks like 0000-0002-1825-0097")
+    digits = found[1].replace("-", "")
+    total = 0
+    for digit in digits[:-1]:
+        total = (total + int(digit)) * 2
+    if "0123456789X"[(12 - total % 11) % 11] != digits[-1]:
+        raise ValueError("this is not an ORCID iD: its last digit does not match the others")
+    return f"https://orcid.org/{found[1]}"
+
+
+Orcid = Annotated[str, pydantic.AfterValidator(_checked_orcid)]
+
 
 class Section(pydantic.BaseModel):
-    """Base: an unknown key is an error."""
+    """Base class: unknown keys are errors."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
 
 
 class ClockSection(Section):
-    """[clock]: when the experiment's time begins and how fast it goes (simulated microscopes only)."""
+    """[clock]: start and speed of experiment time (simulated microscopes only)."""
 
     start: datetime | None = None
     speed: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
@@ -35,23 +54,23 @@ class ClockSection(Section):
 
 
 class SecuritySection(Section):
-    """[security]: the folder of CURVE keys, or consent that there are none."""
+    """[security]: the folder of CURVE keys, or consent to run without."""
 
     keys: str | None = None
     plain: StrictBool = False
     """Programs without keys may join through a bridge, which opens plain sockets; all other sockets stay private."""
     insecure: StrictBool = False
     tcp: StrictBool = False
-    """Unix sockets are not used: for programs whose library has none. Every socket has keys then."""
+    """Use no unix sockets, for programs whose library has none. Every socket then has keys."""
 
     @property
     def are_sockets_private(self) -> bool:
-        """Whether sockets without an address in the file are unix sockets, where the system has them."""
+        """Whether sockets that the file leaves open are unix sockets, where the system has them."""
         return not (self.keys or self.insecure or self.tcp)
 
 
 class RestartSection(Section):
-    """[restart]: how patiently processes are watched, and how often they are started again. Real time."""
+    """[restart]: time limits and restarts of processes. Real time."""
 
     beat_period: PositiveDuration = 1.0
     missed_beats: Annotated[int, Field(ge=1)] = 3
@@ -66,7 +85,7 @@ class RestartSection(Section):
 
 
 class RecordSection(Section):
-    """[record]: what is kept of a run, beside what components write."""
+    """[record]: contents of the record of a run, beside files that components write."""
 
     on: StrictBool = True
     scans: StrictBool = True
@@ -74,24 +93,24 @@ class RecordSection(Section):
 
 
 class MetadataSection(Section):
-    """[metadata]: what is written into every file of the run; None: not known."""
+    """[metadata]: entries written into every file of the run; None: unknown."""
 
     technique: Literal["STM", "STS", "AFM"] | None = None
-    """STM, STS or AFM; of a microscope that is always the same, its class knows it."""
+    """STM, STS or AFM; filled in by the class of a microscope that has only one."""
     sample: str | None = None
     person: str | None = None
     orcid: Orcid | None = None
     project: str | None = None
     microscope: str | None = None
-    """The model, such as "Cypher S"."""
+    """Model, such as "Cypher S"."""
     vendor: str | None = None
-    """Of the microscope; if it is not given, that of the controller."""
+    """Vendor of the microscope; by default the controller's."""
     probe: str | None = None
-    """The probe or tip that is mounted, such as "PPP-NCHR 12/7": `afspm probes` lists the history of each."""
+    """The mounted probe or tip, such as "PPP-NCHR 12/7": `afspm probes` lists the history of each."""
 
 
 class NotifySection(Section):
-    """[notify]: who is told, outside of the experiment, of what."""
+    """[notify]: targets and occasions of notifications."""
 
     command: tuple[str, ...] = ()
     webhook: str = ""
@@ -103,7 +122,7 @@ class NotifySection(Section):
 
 
 class ExperimentSections(Section):
-    """The sections that mean the same whatever components there are."""
+    """Sections that do not depend on the components."""
 
     clock: ClockSection = ClockSection()
     control: ControlSettings = ControlSettings()
@@ -115,7 +134,7 @@ class ExperimentSections(Section):
 
 
 def read_sections(tables: Mapping[str, Settings], document: Document) -> ExperimentSections:
-    """Read them all; what is wrong with one is reported, and its defaults taken."""
+    """Read all sections; a faulty section is reported, and its defaults are used."""
     return ExperimentSections.model_construct(
         **{
             name: parse(type(field.default), name, tables.get(name, {}), document)
@@ -128,7 +147,7 @@ S = TypeVar("S")
 
 
 def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
-    """Return the section `[name]`, a model or a dataclass; report errors, and return the defaults then."""
+    """Return the section `[name]`, a model or a dataclass. Report errors, and return the defaults then."""
     try:
         return pydantic.TypeAdapter(kind).validate_python(table)
     except pydantic.ValidationError as error:

@@ -1,4 +1,4 @@
-"""A component's settings against the constructor of its class: names, types and units, all before anything starts."""
+"""Check of a component's settings against its constructor: names, types and units, before anything starts."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from afspm.experiment.findings import closest, nearest
 from afspm.experiment.toml_lines import Settings, Table
 from afspm.experiment.validation_messages import report
 
+# units of the annotations in basics.units, tried in this order
 _ANNOTATED = ("m", "s", "rad", "V", "A", "m/s", "Hz")
 _KINDS_WITHOUT_NAME = {inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD}
 _TYPES = pydantic.ConfigDict(arbitrary_types_allowed=True)
@@ -37,11 +38,11 @@ def check(
     given: Collection[str] = (),
     wrong: set[str] | None = None,
 ) -> Settings:
-    """Return the settings as the process gets them: validated, in SI units, of JSON's types. Reports what is wrong.
+    """Return the settings for the process: validated, in SI units, of JSON's types. Reports errors.
 
     Args:
-        given: parameters that are not for the table to set.
-        wrong: those whose values are wrong are added to it.
+        given: parameters that the table must not set.
+        wrong: names of settings with errors are added to it.
     """
     everything = _parameters(component)
     parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
@@ -53,7 +54,7 @@ def check(
         if name in parameters:
             annotation = kinds.get(name, Any)
             if name not in kinds and _is_quantity(value):
-                what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument does not say what it is"
+                what = f"[{'.'.join(path)}] {name} = {value!r} stays a text: the argument has no annotation with a unit"
                 hint = f"e.g. `def __init__(self, {name}: Length)`, with Length from afspm.basics.units"
                 document.warning(what, *path, name, hint=hint)
             errors = document.findings.errors
@@ -64,29 +65,29 @@ def check(
             checked[name] = jsonable(value, document.folder_of(*path, name))
         else:
             unknown.append(name)
-            replaced = "" if closest(name, parameters) else _replaced(path, name, document)
+            replaced = "" if closest(name, parameters) else _replaced_class_hint(path, name, document)
             what = f"[{'.'.join(path)}] has no setting {name!r}"
             document.error(what, *path, name, hint=replaced or nearest(name, parameters))
     _report_missing(parameters, settings, unknown, path, document)
     return checked
 
 
-def _replaced(path: tuple[str, ...], name: str, document: Document) -> str:
-    """Return what to do about a setting of a class that a later file has replaced; empty: none has."""
+def _replaced_class_hint(path: tuple[str, ...], name: str, document: Document) -> str:
+    # a later file that changes the class alone leaves behind settings that only the earlier class had
     of_class, of_setting = document.place(*path, "class").file, document.place(*path, name).file
     if document.files.index(Path(of_class)) <= document.files.index(Path(of_setting)):
         return ""
-    return f"the class is that of {of_class}: what only another class has belongs into a file laid over for that one"
+    return f"the class is set in {of_class}: move settings of the replaced class into an overlay for that class"
 
 
 def default_of(component: type, name: str) -> Any:
-    """Return the default of a setting; None where it has none."""
+    """Return the default of a setting; None if it has none."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 
 
 def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool]]:
-    """Yield (setting, address, whether keys guard it) of each place at which a component will listen."""
+    """Yield (setting, address, whether keys guard it) of each socket that a component binds by its settings."""
     everything = {**{name: default_of(component, name) for name in _parameters(component)}, **settings}
     for name, annotation in _annotations(component).items():
         for mark in getattr(annotation, "__metadata__", ()):
@@ -97,7 +98,7 @@ def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool
 
 
 def jsonable(value: Any, folder: Path) -> Any:
-    """Return `value` in JSON's own types; a relative path is one beside the experiment file."""
+    """Return `value` in JSON's types; a relative path is resolved against the experiment file's folder."""
     if isinstance(value, Enum):
         return value.value
     if isinstance(value, Path):
@@ -111,18 +112,18 @@ def jsonable(value: Any, folder: Path) -> Any:
     if isinstance(value, datetime | date):
         return value.isoformat()
     if isinstance(value, str) and value.startswith(("./", "../")):
-        return str((folder / value).resolve())  # within tables of any content only this says that it is a file
+        return str((folder / value).resolve())  # a path within a table without types is recognised only here
     return value
 
 
 def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Document) -> object:
     folder = document.folder_of(*path)
     if _is_object(value):
-        return _object(value, path, document)
+        return _user_intermediary(value, path, document)
     if isinstance(value, list) and any(map(_is_object, value)):
         return [_value(Any, item, path, document) for item in value]
     if annotation is bool:
-        annotation = pydantic.StrictBool  # pydantic reads "yes" and 1 as true, TOML has true
+        annotation = pydantic.StrictBool  # pydantic would accept "yes" and 1 as true
     try:
         adapter = pydantic.TypeAdapter(annotation, config=None if _has_own_config(annotation) else _TYPES)
     except pydantic.PydanticUndefinedAnnotation:
@@ -134,8 +135,8 @@ def _value(annotation: Any, value: Any, path: tuple[str, ...], document: Documen
         return jsonable(value, folder)
 
 
-def _object(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
-    """Return an intermediary class of the user's own: checked here, made by the process."""
+def _user_intermediary(value: Settings, path: tuple[str, ...], document: Document) -> Settings:
+    # an intermediary class of the user's is checked here, and made in its process
     settings = {key: item for key, item in value.items() if key != "class"}
     try:
         wanted = class_loader.load(value["class"])
@@ -149,7 +150,6 @@ def _object(value: Settings, path: tuple[str, ...], document: Document) -> Setti
 
 
 def _is_quantity(value: object) -> bool:
-    """Return whether a text is a number with a unit for which there is an annotation."""
     if not isinstance(value, str):
         return False
     for unit in _ANNOTATED:
@@ -172,7 +172,6 @@ def _has_own_config(annotation: object) -> bool:
 
 @cache
 def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
-    """Return the parameters of the constructor, and those of its base classes that it hands **settings on to."""
     found: dict[str, inspect.Parameter] = {}
     for init in _constructors(component):
         own = list(inspect.signature(init).parameters.values())[1:]  # without self
@@ -183,7 +182,6 @@ def _parameters(component: type) -> Mapping[str, inspect.Parameter]:
 
 @cache
 def _constructors(component: type) -> Sequence[Callable[..., object]]:
-    """`__init__` of the class, and of its bases for as long as each passes **keywords on."""
     chain: list[Callable[..., object]] = []
     for base in component.__mro__:
         init = vars(base).get("__init__")
@@ -197,7 +195,7 @@ def _constructors(component: type) -> Sequence[Callable[..., object]]:
 
 @cache
 def _annotations(component: type) -> Table:
-    """Of every parameter, resolved; those that can't be (imported for typing only) are left out."""
+    # annotations imported under TYPE_CHECKING only can't be resolved, and are left out
     kinds: Settings = {}
     for init in reversed(_constructors(component)):
         try:
@@ -218,5 +216,5 @@ def _report_missing(
         if parameter.default is not inspect.Parameter.empty or name in settings:
             continue
         if closest(name, unknown, 0.7):
-            continue  # the misspelt key has been reported with this name as the hint
+            continue  # missing because misspelt: reported already
         document.error(f"[{'.'.join(path)}] needs the setting {name!r}", *path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import re
 from collections.abc import Callable, Collection, Iterator
 from typing import Final
@@ -10,22 +11,25 @@ from typing import Final
 from afspm import wire
 from afspm.basics.addresses import EXAMPLE, hint_on, is_address, reaches
 from afspm.basics.errors import InvalidValue
-from afspm.experiment import class_loader, wiring
+from afspm.client.component import Component
+from afspm.experiment import class_loader
 from afspm.experiment.findings import closest, nearest
-from afspm.experiment.handlers import check_handlers
 from afspm.experiment.implied_parts import check_notify, is_program
-from afspm.experiment.resolution import ResolvedExperiment, ResolvedProcess
-from afspm.experiment.wiring_classes import WIRE_SETTINGS, wire_of
+from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
+from afspm.experiment.wiring_classes import WIRE_SETTINGS, BoundSocket, wire_of
 from afspm.model import Role, component_of, is_process_name
 from afspm.model.events import LONGEST_PROCESS_NAME, PERSON
 from afspm.transport.network import is_local
 from afspm.wire.messages import SCAN_LINES
 
 OPENS_PLAIN: Final = "opens_plain"
-"""An attribute by which a class says that programs without keys can send requests by it."""
+"""Class attribute that marks a component through which programs without keys can send requests."""
 ADDRESS: Final = "address"
-"""By convention the setting of a translator that says where its controller is."""
+"""Usual name of a translator's setting for the address of its controller."""
 _WORD = re.compile(r"[A-Za-z_][\w-]*")
+# high, so that an unrelated method named on_… is no typo of a handler
+_HANDLER_CUTOFF = 0.8
+_CALLED_METHODS = ("run", *(name for name in vars(Component) if name.startswith("on_")))
 _MISSING = {
     Role.SCHEDULER: 'add [scheduler] with component = true and class = "Scheduler"',
     Role.TRANSLATOR: 'add e.g. [microscope] with component = true and class = "Simulator"',
@@ -33,9 +37,9 @@ _MISSING = {
 
 
 def check(resolved: ResolvedExperiment) -> None:
-    """Run every check; what is found goes to the findings of its document.
+    """Run every check; errors and warnings go to the document's findings.
 
-    Nothing is said of what a missing scheduler or translator, or a class that can't be loaded, may have provided.
+    If scheduler or translator is missing, or a class can't be loaded, checks that depend on them are left out.
     """
     for one in CHECKS if _is_complete(resolved) else ALWAYS:
         one(resolved)
@@ -52,12 +56,12 @@ def _all_loaded(resolved: ResolvedExperiment) -> bool:
 
 
 def check_roles(resolved: ResolvedExperiment) -> None:
-    """Require one scheduler, one translator, and no two names that only differ in upper and lower case."""
+    """Require one scheduler, one translator, and names that differ by more than case."""
     for role, hint in _MISSING.items():
         having = resolved.with_role(role)
         if not having and (name := _not_a_component(resolved, role)):
             resolved.document.error(f"there is no {role.value}", name, hint=f"[{name}] needs `component = true`")
-        elif not having and _all_loaded(resolved):  # else it may be what can't be loaded
+        elif not having and _all_loaded(resolved):  # a class that can't be loaded may be the missing one
             resolved.document.error(f"there is no {role.value}", hint=hint)
         for extra in having[1:]:
             what = f"[{extra.name}] is a second {role.value} beside [{having[0].name}]"
@@ -66,12 +70,11 @@ def check_roles(resolved: ResolvedExperiment) -> None:
     for name in resolved.processes:
         other = seen.setdefault(name.casefold(), name)
         if other != name:
-            what = f"[{name}] and [{other}] are the same name but for upper and lower case"
+            what = f"[{name}] and [{other}] differ only in upper and lower case"
             resolved.document.error(what, name, hint="their files would be the same on some computers")
 
 
 def _not_a_component(resolved: ResolvedExperiment, role: Role) -> str | None:
-    """Return the table of a class of this role that lacks `component = true`."""
     for name, table in resolved.parts.intermediaries.items():
         with contextlib.suppress(class_loader.Unloadable):
             if (
@@ -84,7 +87,7 @@ def _not_a_component(resolved: ResolvedExperiment, role: Role) -> str | None:
 
 
 def check_names(resolved: ResolvedExperiment) -> None:
-    """Require names that can be those of files, on every system, and of connections."""
+    """Require names that are valid for files, on every system, and for connections."""
     for name in resolved.processes:
         if not is_process_name(name):
             hint = f"letters, digits, _, - and spaces, at most {LONGEST_PROCESS_NAME} bytes, as in [tip_corrector]"
@@ -92,7 +95,7 @@ def check_names(resolved: ResolvedExperiment) -> None:
 
 
 def check_commands(resolved: ResolvedExperiment) -> None:
-    """Find the program of each command."""
+    """Require that the program of each command exists."""
     for part in resolved.parts.components:
         if part.command and not is_program(part.command[0], resolved.document.folders[0]):
             what = f"[{part.name}] there is no program {part.command[0]!r}"
@@ -100,7 +103,7 @@ def check_commands(resolved: ResolvedExperiment) -> None:
 
 
 def check_intermediaries(resolved: ResolvedExperiment) -> None:
-    """Check intermediary tables: settings that their kind knows, and addresses where they belong."""
+    """Check intermediary tables: known settings only, and addresses where they belong."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for name, table in resolved.parts.intermediaries.items():
         kind = wire_of(table)
@@ -122,8 +125,8 @@ def check_intermediaries(resolved: ResolvedExperiment) -> None:
 
 
 def check_addresses(resolved: ResolvedExperiment) -> None:
-    """Refuse addresses bound twice, open to the network without keys, or connected to and bound by nobody."""
-    bound: dict[str, wiring.BoundSocket] = {}
+    """Refuse addresses that are bound twice, open to the network without keys, or connected to but not bound."""
+    bound: dict[str, BoundSocket] = {}
     security = resolved.sections.security
     secure = security.keys is not None or security.insecure
     for slot in (*resolved.net.slots.values(), *resolved.listening):
@@ -141,7 +144,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
                 'make keys with `afspm keys` and set [security] keys = "keys"; or say [security] insecure = true',
             )
     if not all(is_address(address) for address in bound):
-        return  # what is no address has been reported as such; whoever looks for it may be right
+        return  # a text that is no address was reported above; connections to it may be right
     for name, links in resolved.net.links.items():
         for target in (links.control, *links.subscribe):
             if target is None or target in resolved.net.slots or not is_address(target):
@@ -152,7 +155,7 @@ def check_addresses(resolved: ResolvedExperiment) -> None:
 
 
 def check_self_subscription(resolved: ResolvedExperiment) -> None:
-    """Refuse components that listen to themselves: each packet would be the cause of the next."""
+    """Refuse components that subscribe to themselves: each packet would cause the next."""
     for name, links in resolved.net.links.items():
         own = resolved.net.slots.get(links.publish or "")
         if own is None or resolved.processes[name].role is not Role.COMPONENT:
@@ -163,7 +166,7 @@ def check_self_subscription(resolved: ResolvedExperiment) -> None:
 
 
 def check_listens_to(resolved: ResolvedExperiment) -> None:
-    """Require that `listens_to` names others that publish."""
+    """Require that `listens_to` names other components that publish."""
     publishers = {slot.owner for slot in resolved.net.slots.values() if slot.use == "publish"}
     for name, process in resolved.processes.items():
         wanted = process.part.own.get("listens_to", [])
@@ -179,7 +182,9 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Require that problems exist, and that each one flagged is solved by somebody, or ends the experiment."""
+    """Require that problems exist, and that each flagged one is solved by a component or a person, or ends the
+    experiment.
+    """
     control = resolved.sections.control
     by_hand = (*control.solved_by_hand, *control.end_on)
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
@@ -238,7 +243,7 @@ def _may_publish_lines(translator: ResolvedProcess) -> bool:
 
 
 def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bool:
-    """A prefix fits what it begins; scans, spectra and what rules of the cache fill in go on behind their beginning."""
+    # names of scans, spectra, and rules of the cache with {fields} go on after their beginning
     continued = [*(f"{one.name}_" for one in wire.declared() if one.named), *filter(None, made)]
     return any(name.startswith(prefix) for name in published) or prefix.startswith(tuple(continued))
 
@@ -257,11 +262,11 @@ def check_controller(resolved: ResolvedExperiment) -> None:
 
 
 def check_clock(resolved: ResolvedExperiment) -> None:
-    """Refuse a time other than real where the microscope is not simulated."""
+    """Refuse simulated time if the microscope is not simulated."""
     if not resolved.with_role(Role.TRANSLATOR) or resolved.simulated:
         return
     if (speed := resolved.sections.clock.speed) != 1.0:
-        hint = "time can't be made faster there: leave it out, or set it to 1 in the file for this microscope"
+        hint = "a real microscope has real time: remove it, or set it to 1 in the file for this microscope"
         what = f"[clock] speed = {speed:g} on a microscope that is not simulated"
         resolved.document.error(what, "clock", "speed", hint=hint)
     if "start" in resolved.parts.sections.get("clock", {}):
@@ -285,10 +290,10 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
                 hint = f"`afspm dashboard --make-password` makes a line of people for [{component_of(member)}]"
                 resolved.document.warning(what, *path, hint=hint)
     if any_role and security.insecure:
-        hint = "leave [security] insecure away, or make keys with `afspm keys` and set [security] keys"
+        hint = "remove [security] insecure, or make keys with `afspm keys` and set [security] keys"
         what = "[control.roles] without keys: any program that takes the name has the role"
         resolved.document.warning(what, "control", "roles", hint=hint)
-    for name in resolved.saying(OPENS_PLAIN):
+    for name in resolved.declaring(OPENS_PLAIN):
         if not (security.plain or security.insecure):
             what = f"[{name}] lets programs without keys command the microscope"
             resolved.document.error(what, name, "class", hint="[security] plain = true allows that")
@@ -298,16 +303,16 @@ def check_names_of_people(resolved: ResolvedExperiment) -> None:
 
 
 def _has_password(resolved: ResolvedExperiment, member: str) -> bool:
-    """False for a person of a dashboard or gateway that does not know the password of this person."""
+    # a role for a person who has no password at this page would be open to anyone who types the name
     name, _, person = member.partition(PERSON)
     process = resolved.processes.get(name)
-    if not person or process is None or not process.says("has_people"):
+    if not person or process is None or not process.declares("has_people"):
         return True
     return person in (process.settings.get("people") or {})
 
 
 def check_likely_typos(resolved: ResolvedExperiment) -> None:
-    """Warn of texts that are nearly a variable's name."""
+    """Warn of texts that almost equal a variable's name."""
     names = [*resolved.parts.variables, *resolved.parts.intermediaries]
     for part in resolved.parts.components:
         for path, text in _texts(part.settings, (part.name,)):
@@ -326,7 +331,7 @@ def _texts(value: object, path: tuple[str | int, ...]) -> Iterator[tuple[tuple[s
 
 
 def check_needs(resolved: ResolvedExperiment) -> None:
-    """Require the actions and parameters that components need, where the microscope tells before it runs."""
+    """Require the actions and parameters that components need, if the microscope's capabilities are known."""
     for translator in resolved.with_role(Role.TRANSLATOR):
         has = translator.capabilities()
         if has is None:
@@ -340,6 +345,55 @@ def check_needs(resolved: ResolvedExperiment) -> None:
                 for one in [one for one in needed if one not in offered]:
                     what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"
                     resolved.document.error(what, name, hint=nearest(one, offered))
+
+
+def check_handlers(resolved: ResolvedExperiment) -> None:
+    """Check the names and arguments of methods that look like handlers."""
+    for process in resolved.with_role(Role.COMPONENT):
+        component = process.component
+        if component is None or not issubclass(component, Component):
+            continue
+        for name, method in _handlers_of(component):
+            shown, path = f"[{process.name}] {component.__name__}.{name}", (process.name, "class")
+            if hint := _hint_on_handler(name, resolved):
+                resolved.document.warning(f"{shown} is never called: there is no such handler", *path, hint=hint)
+            wanted = _handler_arguments(name)
+            if wrong := _wrong_signature(method, wanted):
+                hint = f"write `def {name}({', '.join(wanted)})`"
+                resolved.document.error(f"{shown} can't be called with its arguments: {wrong}", *path, hint=hint)
+
+
+def _handlers_of(component: type[Component]) -> Iterator[tuple[str, Callable[..., object]]]:
+    ours = set(Component.__mro__)
+    seen: set[str] = set()
+    for base in (base for base in component.__mro__ if base not in ours):
+        for name, method in vars(base).items():
+            if (name == "run" or name.startswith("on_")) and inspect.isfunction(method) and name not in seen:
+                seen.add(name)
+                yield name, method
+
+
+def _hint_on_handler(name: str, resolved: ResolvedExperiment) -> str:
+    valid = {*_CALLED_METHODS, *(message.handler for message in wire.declared())}
+    near = closest(name, valid, _HANDLER_CUTOFF)
+    if name in valid or (near is None and resolved.messages):  # a handler of a message of the user's own
+        return ""
+    return f"did you mean {near!r}?" if near else "on_scan, on_state, …; for a message of your own, named after it"
+
+
+def _handler_arguments(name: str) -> list[str]:
+    base = getattr(Component, name, None)
+    return list(inspect.signature(base).parameters) if base is not None else ["self", "message"]
+
+
+def _wrong_signature(method: Callable[..., object], arguments: list[str]) -> str:
+    if inspect.iscoroutinefunction(method) or inspect.isgeneratorfunction(method):
+        return "an async function or a generator does nothing when called"
+    try:
+        inspect.signature(method).bind(*arguments)
+    except TypeError as error:
+        return str(error)
+    return ""
 
 
 Check = Callable[[ResolvedExperiment], None]

@@ -1,4 +1,4 @@
-"""The few SVG shapes that a drawing of an experiment needs, and how wide a text will be."""
+"""SVG shapes for drawings of an experiment, and an estimate of text widths."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _NARROW, _WIDE = set("iljtfrI.,:;'|!()[]/ -"), set("mwMW@%")
 
 
 def text_width(text: str, size: float, *, bold: bool = False) -> float:
-    """Return about the width of a text in a sans-serif font, rather too wide than too narrow."""
+    """Return the approximate width of a text in a sans-serif font, too wide rather than too narrow."""
     ems = sum(0.34 if c in _NARROW else 0.9 if c in _WIDE else 0.73 if c.isupper() else 0.62 for c in text)
     return ems * size * (1.07 if bold else 1.0)
 
 
 class Svg:
-    """Collects shapes; lines first, then boxes, then texts, so that no line runs over what is to be read."""
+    """Collects shapes; lines come first, then boxes, then texts, so that no line covers a text."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []
@@ -36,7 +36,6 @@ class Svg:
         dashed: bool = False,
         corner: float = 7,
     ) -> None:
-        """Draw a rectangle with round corners; (x, y) is its top left."""
         dash = ' stroke-dasharray="5 4"' if dashed else ""
         self._boxes.append(
             f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{height:.1f}" rx="{corner:g}" '
@@ -58,7 +57,7 @@ class Svg:
         """Write one line of text on the baseline y; a halo keeps it legible over lines."""
         weight = ' font-weight="600"' if bold else ""
         shape = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}"{weight}'
-        if halo:  # a text of its own beneath: not every viewer knows paint-order
+        if halo:  # drawn as a second text beneath: not every viewer supports paint-order
             self._texts.append(
                 f'<text {shape} fill="#ffffff" stroke="#ffffff" stroke-width="5" stroke-linejoin="round" '
                 f'aria-hidden="true">{escape(text)}</text>'
@@ -84,7 +83,7 @@ class Svg:
         )
 
     def document(self, width: float, height: float, title: str, colours: Iterable[str]) -> str:
-        """Return the whole picture, on white."""
+        """Return the whole picture as SVG, on white."""
         heads = "".join(
             f'<marker id="head-{c[1:]}" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" '
             f'orient="auto-start-reverse"><path d="M0 0.8 L10 5 L0 9.2 z" fill="{c}"/></marker>'
@@ -100,7 +99,6 @@ class Svg:
 
 
 def _rounded(points: Sequence[tuple[float, float]], radius: float = 8) -> str:
-    """Return a path with right angles rounded off."""
     x, y = points[0]
     path = [f"M{x:.1f} {y:.1f}"]
     for (ax, ay), (bx, by), (cx, cy) in zip(points, points[1:], points[2:], strict=False):

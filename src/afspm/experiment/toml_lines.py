@@ -1,4 +1,4 @@
-"""Where in a TOML text each key stands: the standard parser gives values, but no lines."""
+"""Line numbers of the keys in a TOML text: the standard parser returns values without lines."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import TypeAlias
 from afspm.basics.plain_data import Plain, PlainMapping
 
 Path: TypeAlias = tuple[str | int, ...]
-"""A way into the parsed document: keys, and indices into arrays."""
+"""Path in the parsed document: keys, and indices of arrays."""
 Table: TypeAlias = PlainMapping
-"""A table of a TOML file, to read."""
+"""A table of a TOML file, read-only."""
 Settings: TypeAlias = Plain
-"""What a table has become: settings of a component, in types of TOML or JSON."""
+"""Settings of a component made from a table, in types of TOML or JSON."""
 
 _TOKEN = re.compile(
     r'''"""(?:\\.|[^\\])*?"{3,5}'''
@@ -38,7 +38,7 @@ def locate(text: str) -> dict[Path, int]:
 
 
 class _Scanner:
-    """Reads the tokens of a text that `tomllib` has accepted, so it need not look for errors."""
+    """Scans a text that `tomllib` has accepted, so it need not detect errors."""
 
     def __init__(self, text: str) -> None:
         self.lines: dict[Path, int] = {}
@@ -62,7 +62,7 @@ class _Scanner:
         path: Path = ()
         for key in tables if is_array else [*tables, last]:
             path = (*path, key)
-            if path in self._array_lengths:  # a header that leads through an array of tables means its newest element
+            if path in self._array_lengths:  # a header through an array of tables refers to its last element
                 path = (*path, self._array_lengths[path] - 1)
         if is_array:
             array = (*path, last)
@@ -94,11 +94,11 @@ class _Scanner:
                 self._key_value(path)
             self._next()
         else:
-            while self._peek() not in ("", ",", "]", "}", "\n"):  # a number or a date is of several tokens
+            while self._peek() not in ("", ",", "]", "}", "\n"):  # numbers and dates consist of several tokens
                 self._next()
 
     def _note(self, path: Path, line: int) -> None:
-        for depth in range(1, len(path) + 1):  # a dotted key opens the tables above it as well
+        for depth in range(1, len(path) + 1):  # a dotted key also opens the tables above it
             self.lines.setdefault(path[:depth], line)
 
     def _dotted_key(self) -> tuple[str, ...]:

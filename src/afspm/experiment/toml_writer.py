@@ -1,4 +1,4 @@
-"""The experiment written out as one TOML text: references replaced and defaults filled in."""
+"""The experiment as one TOML text: references replaced and defaults filled in."""
 
 from __future__ import annotations
 
@@ -7,26 +7,23 @@ import math
 import re
 from collections.abc import Mapping
 from datetime import date, datetime, time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from afspm.experiment.parts import ExperimentParts
 from afspm.experiment.toml_lines import Settings, Table
 
-if TYPE_CHECKING:
-    from afspm.experiment.experiment import Experiment
-
-
 SECRET = "webhook"
-"""The name of settings and keys whose value is a secret, where it is not the "$NAME" of an environment variable."""
+"""Name of settings and keys whose value is a secret, unless it is the "$NAME" of an environment variable."""
 _NAMED_INSTEAD = "$AFSPM_WEBHOOK"
 
 
-def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
-    """Return variables, sections and components as they are in force; they read back as the same experiment.
+def to_toml(parts: ExperimentParts, *, secrets: bool = True) -> str:
+    """Return variables, sections and components as TOML; reading the text gives the same experiment.
 
     Args:
-        secrets: else an environment variable is named in place of each, which has to be set where it is read back.
+        secrets: whether to include secrets; otherwise each is replaced by the name of an environment variable, which
+            must be set where the text is read.
     """
-    parts = experiment.parts
     tables: Settings = dict(parts.variables)
     tables.update(parts.sections)
     for part in parts.components:
@@ -37,7 +34,6 @@ def to_toml(experiment: Experiment, *, secrets: bool = True) -> str:
 
 
 def _secrets_in(value: object) -> list[str]:
-    """Return the secrets in a document, each once, wherever they are."""
     if isinstance(value, list | tuple):
         return list(dict.fromkeys(secret for one in value for secret in _secrets_in(one)))
     if not isinstance(value, Mapping):
@@ -48,7 +44,7 @@ def _secrets_in(value: object) -> list[str]:
 
 
 def _without(secrets: list[str], value: object) -> Any:
-    """Return a document with names of environment variables instead of secrets, which a variable may hold, too."""
+    # a variable may hold the same secret, so values are compared, not keys
     if isinstance(value, Mapping):
         return {key: _without(secrets, one) for key, one in value.items()}
     if isinstance(value, list | tuple):
@@ -76,7 +72,7 @@ def _key(key: str) -> str:
 
 
 def value(of: object) -> str:
-    """Return a value as TOML writes it."""
+    """Return a value in TOML's notation."""
     if isinstance(of, bool):
         return "true" if of else "false"
     if isinstance(of, str):

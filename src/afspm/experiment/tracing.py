@@ -1,16 +1,16 @@
-"""An experiment with a trace of all that is said to and by its controller."""
+"""Overlay that makes a translator trace its traffic with the controller."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from afspm.experiment.resolution import ResolvedExperiment
+from afspm.experiment.resolved_experiment import ResolvedExperiment
 from afspm.experiment.settings import default_of
 from afspm.model import Role
 
 
 def trace_overlay(experiment: ResolvedExperiment, folder: Path) -> Path | None:
-    """Write a file for `folder` that has the translator keep a trace; None if it has no controller to talk to."""
+    """Write an overlay into `folder` that switches the trace on; None if no translator talks to a controller."""
     for translator in experiment.with_role(Role.TRANSLATOR):
         if translator.component is not None and default_of(translator.component, "trace") is not None:
             overlay = folder / "trace.toml"

@@ -1,4 +1,4 @@
-"""The errors of pydantic in the words of an experiment file: one sentence for each value that is wrong."""
+"""Errors of pydantic, reworded for an experiment file: one sentence for each wrong value."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _WANTED: Final = {
     "less_than": "below {lt:g}",
     "less_than_equal": "at most {le:g}",
 }
-"""What was wanted, by pydantic's types of errors."""
+"""Expected values, by pydantic's types of errors."""
 
 
 def report(
@@ -48,17 +48,17 @@ def report(
     document: Document,
     known: Callable[[SettingPath], Iterable[str]] = lambda place: (),
 ) -> None:
-    """Report what is wrong with the value given at `path` of the document, once for each place within it.
+    """Report the errors of the value given at `path` of the document, one for each place within it.
 
     Args:
-        known: returns the names that are valid beside an unknown one.
+        known: returns the valid names for the place of an unknown one.
     """
     by_place: dict[SettingPath, list[ErrorDetails]] = {}
     for one in error.errors(include_url=False):
         by_place.setdefault(_place(one, given), []).append(one)
     for place, errors in by_place.items():
         if any(other[: len(place)] == place != other for other in by_place):
-            continue  # another alternative of the type fits better: it is only wrong further inside
+            continue  # another member of the union fits better: its error lies deeper
         full = (*path, *place)
         what, hint = _sentence(errors, name_of(full), known(place))
         document.error(what, *full, hint=hint)
@@ -73,7 +73,7 @@ def name_of(path: SettingPath) -> str:
 
 
 def _place(one: ErrorDetails, given: Any) -> SettingPath:
-    """Return where in the given value an error is: its location without the names of alternatives and validators."""
+    # pydantic's location also holds names of union members and validators, which the file does not.
     place: list[str | int] = []
     for number, part in enumerate(one["loc"], 1):
         if part in (given if isinstance(given, Mapping) else range(len(given)) if isinstance(given, list) else ()):
@@ -85,9 +85,8 @@ def _place(one: ErrorDetails, given: Any) -> SettingPath:
 
 
 def _sentence(errors: Sequence[ErrorDetails], shown: str, known: Iterable[str]) -> tuple[str, str]:
-    """Return what is wrong with one value, and the hint."""
     given = errors[0].get("input")
-    if len(errors) > 1 and isinstance(given, list | Mapping):  # alternatives: it is not meant as a quantity
+    if len(errors) > 1 and isinstance(given, list | Mapping):  # a union: the value is not meant as a quantity
         errors = [one for one in errors if _cause(one) is None] or errors
     last = errors[-1]
     kind, context = last["type"], last.get("ctx", {})

@@ -1,80 +1,32 @@
-"""The sockets that each process binds or connects to; the file may leave addresses open.
+"""Sockets that each process binds or connects to; the file may leave addresses open.
 
-Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's,
-every component to the scheduler's; a component that publishes has an address of its own, to which those connect that
-listen to what it publishes.
+Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's, every
+component to the scheduler's. A component that publishes binds a publisher, to which its listeners connect.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Mapping
 
 from afspm.basics.addresses import hint_on, is_address
 from afspm.experiment.document import Document
-from afspm.experiment.findings import SourceLocation
 from afspm.experiment.parts import ExperimentPart
+from afspm.experiment.resolved_experiment import ResolvedProcess
 from afspm.experiment.toml_lines import Table
-from afspm.experiment.wiring_classes import WIRE_KEYS, WiringClass, wire_of
+from afspm.experiment.wiring_classes import (
+    WIRE_KEYS,
+    BoundSocket,
+    ProcessSockets,
+    Wiring,
+    WiringClass,
+    WiringKeys,
+    wire_of,
+)
 from afspm.model import Role
-
-if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedProcess
-
-
-@dataclass(frozen=True)
-class BoundSocket:
-    """One end that a process binds: the address the file gives under `key`, or None where it is left open."""
-
-    owner: str
-    use: str
-    address: str | None
-    key: str
-    place: SourceLocation
-    keyed: bool = True
-    """Whether it is open to nobody without a key, where the experiment has keys."""
-
-
-@dataclass
-class WiringKeys:
-    """The wiring keys of one component, as plain addresses."""
-
-    publish: str | None = None
-    subscribe: list[str] | None = None
-    envelopes: list[str] | None = None
-    control: str | None = None
-    serve: str | None = None
-    cache_in: str | None = None
-    cache_out: str | None = None
-    request_timeout_s: float | None = None
-    request_retries: int | None = None
-
-
-@dataclass(frozen=True)
-class ProcessSockets:
-    """Every socket of one process; an open address is a `BoundSocket`'s key "owner/use" until it is given one."""
-
-    publish: str | None = None
-    subscribe: tuple[str, ...] = ()
-    serve: str | None = None
-    control: str | None = None
-
-
-@dataclass
-class Wiring:
-    """All slots and links of an experiment."""
-
-    slots: dict[str, BoundSocket] = field(default_factory=dict)
-    links: dict[str, ProcessSockets] = field(default_factory=dict)
-
-    def addresses(self, take: Callable[[], str]) -> dict[str, str]:
-        """Return every slot's key with the address bound there, open ones filled by `take()`."""
-        return {key: slot.address or take() for key, slot in self.slots.items()}
 
 
 def read_wires(part: ExperimentPart, document: Document) -> WiringKeys:
-    """Return what the wiring keys of a component mean; reports what doesn't fit them."""
+    """Return the wiring keys of a component as addresses; report wrong ones."""
     wires = WiringKeys()
     for key, kinds in WIRE_KEYS.items():
         if key not in part.own:
@@ -142,7 +94,7 @@ def _apply_timeouts(wires: WiringKeys, table: Table) -> None:
 
 
 def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wiring:
-    """Fill in what the wiring keys leave out."""
+    """Return the sockets of all processes: as the wiring keys say, defaults elsewhere."""
     net = Wiring()
     scheduler = next((p for p in processes.values() if p.role is Role.SCHEDULER), None)
     translator = next((p for p in processes.values() if p.role is Role.TRANSLATOR), None)
@@ -180,7 +132,6 @@ def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wir
 def _sources(
     process: ResolvedProcess, scheduler: ResolvedProcess | None, processes: Mapping[str, ResolvedProcess], net: Wiring
 ) -> tuple[str, ...]:
-    """Return where it subscribes: as said, else at the scheduler and at publishers of what it listens to."""
     own = process.wires
     published = f"{scheduler.name}/publish" if scheduler else ""
     if own.subscribe is not None:
@@ -201,5 +152,5 @@ def _sources(
 
 
 def _overlap(published: Collection[str], prefixes: Collection[str] | None) -> bool:
-    """Return whether any envelope of the one is wanted by the other; no prefixes means all are."""
+    # no prefixes: all envelopes are wanted
     return prefixes is None or any(e.startswith(p) or p.startswith(e) for e in published for p in prefixes)

@@ -1,14 +1,17 @@
-"""The intermediary classes, which say where sockets are, and the keys by which components name them."""
+"""Sockets of processes: the intermediary classes that name them in a file, and the resolved addresses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final
 
+from afspm.experiment.findings import SourceLocation
+
 
 class WiringClass(Enum):
-    """The kinds of intermediary classes: they say where sockets are, and are not imported."""
+    """Kinds of intermediary classes: they name sockets, and are not imported."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -36,9 +39,9 @@ WIRE_SETTINGS: Final[dict[WiringClass, frozenset[str]]] = {
     WiringClass.ROUTER: frozenset({"server_url", "router_url", *_REQUESTS}),
     WiringClass.CLIENT: frozenset({"url", *_REQUESTS}),
 }
-"""The settings that each kind understands."""
+"""Settings of each kind."""
 
-# The keys by which a component names its intermediaries, and the kinds that fit.
+# Keys of a component that name its intermediaries, and the kinds that fit.
 WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
     "subscriber": (WiringClass.SUBSCRIBER,),
     "control_client": (WiringClass.CLIENT,),
@@ -50,6 +53,56 @@ WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
 
 
 def wire_of(table: object) -> WiringClass | None:
-    """Return the kind of intermediary that a value is, or None."""
+    """Return the kind of an intermediary table; None for any other value."""
     name = table.get("class") if isinstance(table, Mapping) else None
     return WIRE_CLASSES.get(name) if isinstance(name, str) else None
+
+
+@dataclass(frozen=True)
+class BoundSocket:
+    """A socket that a process binds: the address that the file gives under `key`, or None if it is left open."""
+
+    owner: str
+    use: str
+    address: str | None
+    key: str
+    place: SourceLocation
+    keyed: bool = True
+    """Whether peers need a key, if the experiment has keys."""
+
+
+@dataclass
+class WiringKeys:
+    """Wiring keys of one component, as plain addresses."""
+
+    publish: str | None = None
+    subscribe: list[str] | None = None
+    envelopes: list[str] | None = None
+    control: str | None = None
+    serve: str | None = None
+    cache_in: str | None = None
+    cache_out: str | None = None
+    request_timeout_s: float | None = None
+    request_retries: int | None = None
+
+
+@dataclass(frozen=True)
+class ProcessSockets:
+    """Sockets of one process; an open address is the key "owner/use" of a `BoundSocket` until an address is chosen."""
+
+    publish: str | None = None
+    subscribe: tuple[str, ...] = ()
+    serve: str | None = None
+    control: str | None = None
+
+
+@dataclass
+class Wiring:
+    """All bound sockets and connections of an experiment."""
+
+    slots: dict[str, BoundSocket] = field(default_factory=dict)
+    links: dict[str, ProcessSockets] = field(default_factory=dict)
+
+    def addresses(self, take: Callable[[], str]) -> dict[str, str]:
+        """Return the address of every bound socket by its key; open ones are filled by `take()`."""
+        return {key: slot.address or take() for key, slot in self.slots.items()}

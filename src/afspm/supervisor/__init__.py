@@ -1,4 +1,4 @@
-"""Starts the processes of an experiment, watches them, restarts what dies, and ends the run.
+"""Start the processes of an experiment, watch them, restart dead ones, and end the run.
 
 **Theory of operation.** The decisions are pure (`supervision/`): events and real monotonic times in, effects out. The
 loop around them (`supervisor`) waits in one poller for heartbeats, exits, output, signals and the next deadline.
@@ -7,7 +7,7 @@ loop around them (`supervisor`) waits in one poller for heartbeats, exits, outpu
     state         for each child: its lives, its phase, its last heartbeat (`supervised_child`)
     goes out      children started, killed, asked to end; states of processes and log lines to the scheduler; the run
                   folder
-    always holds  a process counts as hanging if its heart stops or one step takes longer than it may, never because the
+    always holds  a process counts as hanging if its heartbeats stop or one step exceeds its limit, never because the
                   computer slept (`supervision/liveness`); no child outlives its supervisor (`reaper`); the microscope
                   is left safe
 """

@@ -1,7 +1,7 @@
-"""A look from outside at a process that does not beat: the operating system tells whether it works.
+"""Activity of a process without heartbeats, as the operating system sees it.
 
-Beats come from a thread of Python. Code that holds Python's lock for long, such as a call into a library, or the
-loading of a large one off a slow disk, lets none through, and yet it works.
+Heartbeats come from a Python thread. Code that holds Python's lock for long (a call into a library, the import of a
+large one from a slow disk) stops them although the process works.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from typing import Any
 import psutil
 
 LEAST_SHARE = 0.05
-"""Of a processor's time, to count as work. Threads that wait for Python's lock look for it 200 times a second, which
-takes some thousandths each, and those of a socket library live on while all else hangs."""
+"""Share of a processor above which a process works. A hanging process uses less: each thread that waits for Python's
+lock polls it 200 times a second, which takes some thousandths, and threads of a socket library run on."""
 LOOKS = 10
-"""So many looks are made in the time that is judged by, at most: a wait for a disk is seen only while it lasts."""
+"""Samples in the judged time span: frequent, since a wait for the disk shows only while it lasts."""
 
 
 @dataclass(frozen=True, slots=True)
 class ActivitySample:
-    """A process as it is seen at one time.
+    """Activity of a process at one moment.
 
     Attributes:
-        processor_s: the processor time that it has used in its life.
-        waits_for_disk: one of its threads does.
-        stopped: somebody has stopped it: it does nothing now, whatever it did a moment before.
-        runs: its main thread does, or would if the processor were free.
+        processor_s: processor time used since the process started.
+        waits_for_disk: whether one of its threads waits for the disk.
+        stopped: whether the process is suspended (SIGSTOP); then it counts as idle, even if it worked a moment before.
+        runs: whether its main thread runs, or would if a processor were free.
     """
 
     processor_s: float
@@ -43,15 +43,15 @@ Look = Callable[[int], ActivitySample | None]
 
 
 class ActivityMonitor:
-    """Looks at one process again and again, and judges by what it has done lately.
+    """Samples one process repeatedly, and judges by the latest samples whether it works.
 
     Args:
-        pid: of the process.
-        lately_s: how long ago that may be, real time.
-        look: sees what there is to be seen, for tests.
+        pid: process to sample.
+        lately_s: age up to which samples count, real time.
+        look: takes a sample; replaced in tests.
 
     Attributes:
-        again_s: when to look next, in real monotonic time.
+        again_s: time of the next sample, real monotonic time.
     """
 
     def __init__(self, pid: int, lately_s: float, look: Look | None = None) -> None:
@@ -64,11 +64,11 @@ class ActivityMonitor:
 
     @property
     def processor_s(self) -> float | None:
-        """The processor time that the process has used in its life; None: that can't be told."""
+        """Processor time used since the process started; None if unknown."""
         return self._seen[-1][1].processor_s if self._seen else None
 
     def work(self, now_s: float) -> bool | None:
-        """Return whether it works, in real monotonic time; None: that can't be told, or not yet."""
+        """Return whether the process works at a real monotonic time; None if unknown."""
         if now_s >= self.again_s:
             self.again_s = now_s + self._lately_s / LOOKS
             self._works = self._judge(self._look(self._pid), now_s)
@@ -82,8 +82,8 @@ class ActivityMonitor:
             self._seen.popleft()
         if signs.stopped:
             return False
-        # on a busy computer the share of one that works may be less than any; and one that has just done so has yet to
-        # beat
+        # on a busy computer a working process may get less than LEAST_SHARE, and one that has just stopped working has
+        # yet to send its heartbeat
         if any(seen.waits_for_disk or seen.runs for _, seen in self._seen):
             return True
         since_s, first = self._seen[0]
@@ -93,7 +93,7 @@ class ActivityMonitor:
 
 
 def of_process(pid: int) -> ActivitySample | None:
-    """Return what the operating system says of a process; None: nothing, or there is none."""
+    """Return a sample of a process; None if there is no such process, or the operating system gives no data."""
     try:
         process = psutil.Process(pid)
         with process.oneshot():
@@ -105,7 +105,7 @@ def of_process(pid: int) -> ActivitySample | None:
         processor_s=times.user + times.system,
         waits_for_disk=waits_for_disk,
         stopped=status in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP),
-        # elsewhere it is not told apart from waiting
+        # other systems don't distinguish running from waiting
         runs=sys.platform == "linux" and status == psutil.STATUS_RUNNING,
     )
 

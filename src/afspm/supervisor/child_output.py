@@ -1,4 +1,4 @@
-"""The output of one child: its lines, and a limit to how much of it is kept."""
+"""Output of one child: its lines, and the limit on how many are kept."""
 
 from __future__ import annotations
 
@@ -10,22 +10,23 @@ from typing import Literal
 
 from afspm.basics.clock import ExperimentClock
 
+# bytes: a start with many warnings, or a few tracebacks, pass in full
 AT_ONCE = 500_000
 BYTES_PER_S = 5_000
-"""For as long as it likes: 0.2 GB in a night of ten hours."""
+"""Permanent rate: 0.2 GB in a night of ten hours."""
 PAUSE_S = 10.0
-"""So long lines are left out at a time."""
+"""Duration of one pause."""
 LAST_BYTES = 10_000
-"""Of what was held back the last goes on after all: what matters most, a traceback, comes at the end."""
+"""Size of the last lines that are kept after a pause: a traceback, the most important part, comes last."""
 STAMP_BYTES = 100
-"""What a line costs besides its text: stamp and name in the file, and its place in memory."""
+"""Size of a line besides its text: time and name in the file, overhead in memory."""
 
 Stream = Literal["stdout", "stderr"]
 
 
 @dataclass(frozen=True, slots=True)
 class OutputLine:
-    """A child wrote a line."""
+    """A line that a child wrote."""
 
     name: str
     pid: int
@@ -35,17 +36,17 @@ class OutputLine:
 
 @dataclass(frozen=True, slots=True)
 class OutputDropped:
-    """A child writes more than can be kept: so many lines of it are left out here."""
+    """A number of lines of a child that were dropped here, because its output exceeded the limit."""
 
     name: str
     lines: int
 
 
 class OutputLimit:
-    """Which lines of a stream go on, and which are left out.
+    """Rate limit on the lines of one stream.
 
-    A stream has AT_ONCE to its credit, and gets BYTES_PER_S. Once that is used up it pauses: from then on its lines are
-    left out until `go_on` is called, PAUSE_S later or at the end of the stream.
+    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Beyond that it pauses: until `go_on` is called,
+    PAUSE_S later or at the end of the stream, all lines but the last are dropped.
     """
 
     def __init__(self, now_s: float) -> None:
@@ -55,7 +56,7 @@ class OutputLimit:
         self.pausing = False
 
     def passes(self, line: bytes, now_s: float) -> bool:
-        """Return whether a line is to go on now. If not it is held back, as one that may be the last.
+        """Return whether a line passes now; otherwise it is kept aside, as it may be among the last.
 
         Args:
             now_s: real monotonic time.
@@ -69,7 +70,7 @@ class OutputLimit:
         return not self.pausing
 
     def go_on(self) -> tuple[int, list[bytes]]:
-        """End the pause: how many lines were left out for good, and those after them, which are to go on now."""
+        """End the pause; return the number of dropped lines, and the last lines, which pass now."""
         left_out, last = self._left_out, list(self._last)
         self._left_out = self._last_bytes = 0
         self._last.clear()
@@ -85,13 +86,13 @@ class OutputLimit:
 
 
 class ChildOutput:
-    """Tells what a stream of a child says, as far as that can be kept.
+    """Reports the lines of a child's stream, within the limit.
 
-    The child never has to wait for us: a driver that says much must not become slow.
+    The child never waits for the supervisor: a driver that logs much must not slow down.
     """
 
     def __init__(self, name: str, pid: int, stream: Stream, tell: Callable[[OutputLine | OutputDropped], None]) -> None:
-        self._name, self._pid, self._stream, self._tell = name, pid, stream, tell
+        self._name, self._pid, self._stream, self._report = name, pid, stream, tell
         self._clock = ExperimentClock.real()
         self._thinning = OutputLimit(self._clock.monotonic_s())
         self._lock = threading.Lock()
@@ -109,7 +110,7 @@ class ChildOutput:
                 self._pause.start()
 
     def end(self) -> None:
-        """Nothing more comes."""
+        """Report what was kept aside: the stream has ended."""
         if self._pause is not None:
             self._pause.cancel()
         self._go_on()
@@ -118,10 +119,10 @@ class ChildOutput:
         with self._lock:
             left_out, last = self._thinning.go_on()
             if left_out:
-                self._tell(OutputDropped(self._name, left_out))
+                self._report(OutputDropped(self._name, left_out))
             for line in last:
                 self._tell_line(line)
 
     def _tell_line(self, line: bytes) -> None:
         text = line.decode("utf-8", errors="replace").rstrip("\r\n")
-        self._tell(OutputLine(self._name, self._pid, self._stream, text))
+        self._report(OutputLine(self._name, self._pid, self._stream, text))

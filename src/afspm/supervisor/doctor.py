@@ -1,4 +1,4 @@
-"""Examines an experiment from one of its computers, whether it runs, does not yet, or runs in part."""
+"""Examination of an experiment from one of its computers, before, during or after its run."""
 
 from __future__ import annotations
 
@@ -34,13 +34,14 @@ from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
 
 _PROBE_BYTES = 16 << 20
+# keys that are usually on any computer of an experiment; else any key found there is used
 _ASKED_AS = (SUPERVISOR, "terminal")
 _ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP)
 
 
 @dataclass
 class Examination:
-    """The findings, the packets counted by sender, and the experiment's processes on this computer."""
+    """Findings, packets counted by sender, and the experiment's processes on this computer."""
 
     found: list[Diagnosis] = field(default_factory=list)
     heard: list[Heard] = field(default_factory=list)
@@ -52,12 +53,12 @@ class Examination:
 
 
 def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands: Collection[str] = ()) -> Examination:
-    """Look at everything that can be seen from here, and listen to the scheduler for so long.
+    """Examine an experiment from this computer, and listen to its scheduler for `listen_s`.
 
-    Without an experiment, look at this computer alone.
+    Without an experiment only this computer is examined.
 
     Args:
-        commands: of the core, which no package replaces.
+        commands: names of the core's commands, which no package can replace.
     """
     found = Examination([] if experiment is None else [*_file(experiment)])
     found.found += diagnosis.of_packages(entry_points.inventory(commands))
@@ -70,7 +71,6 @@ def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands
 
 
 def _file(experiment: Experiment) -> Iterator[Diagnosis]:
-    """Yield the errors that `afspm check` tells."""
     errors = [one for one in experiment.check() if one.is_error]
     for one in errors:
         yield Diagnosis("file", Severity.ERROR, str(one.place), one.what, one.hint)
@@ -79,7 +79,6 @@ def _file(experiment: Experiment) -> Iterator[Diagnosis]:
 
 
 def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
-    """Yield what is wrong with the key files of this computer."""
     if (folder := experiment.keys_folder) is None:
         return
     here = sorted(file.stem for file in (folder / "private").glob("*.key_secret"))
@@ -88,7 +87,7 @@ def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
         try:
             own = keys.load(folder, name)
             if name in own.peers.values() and own.public not in own.peers:
-                what, hint = "is not the public part of the secret key here", "make both anew, or copy the right one"
+                what, hint = "is not the public part of the secret key here", "make both again, or copy the right one"
                 yield Diagnosis("key-pair", Severity.ERROR, str(folder / "public" / f"{name}.key"), what, hint)
                 wrong = True
         except AfspmError as error:
@@ -108,7 +107,6 @@ def _keys(experiment: Experiment) -> Iterator[Diagnosis]:
 
 
 def _disk(runs: Path) -> Iterator[Diagnosis]:
-    """Yield space and speed of the disk of the run folders."""
     folder = next(one for one in (runs.resolve(), *runs.resolve().parents) if one.is_dir())
     clock, file = ExperimentClock.real(), folder / f".afspm-doctor-{os.getpid()}"
     try:
@@ -127,7 +125,6 @@ def _disk(runs: Path) -> Iterator[Diagnosis]:
 
 
 def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
-    """Return what processes of this computer take, bytes."""
     sizes: dict[str, int] = {}
     for name, pid in pids.items():
         with suppress(psutil.Error):
@@ -136,14 +133,14 @@ def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
 
 
 class _Connections:
-    """Looks at the addresses of an experiment, then speaks with its scheduler."""
+    """Examines the addresses of an experiment, then talks to its scheduler."""
 
     def __init__(self, experiment: Experiment, into: Examination) -> None:
         self._experiment, self._into = experiment, into
         self._scheduler = next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "scheduler")
 
     def examine(self, listen_s: float) -> None:
-        """Look at addresses, keys, clock, versions, and at what is published."""
+        """Examine addresses, keys, clock, versions, and the packets published."""
         reached = self._addresses()
         launch = self._launch()
         if launch is None or not launch.sockets.control:
@@ -155,7 +152,6 @@ class _Connections:
             self._into.found.append(diagnosis.of_versions(probe.versions_here(), None))
 
     def _addresses(self) -> dict[str, Reach]:
-        """Look at every address that the file holds."""
         slots = [slot for slot in self._experiment.resolved.net.slots.values() if slot.address]
         reached = {
             slot.address: (slot, probe.reach(connectable(slot.address)))
@@ -170,12 +166,12 @@ class _Connections:
         return {connectable(address): one for address, (_, one) in reached.items()}
 
     def _launch(self) -> Launch | None:
-        """Return how the scheduler is asked: as the file says, or as the run that goes on here does."""
+        # a run that goes on here is joined as a guest: keys made for a run are in its folder, not in the file
         experiment = self._experiment
         asking = experiment.asking([part.name for part in experiment.resolved.with_role(Role.COMPONENT)])
         publish = experiment.resolved.net.slots.get(f"{self._scheduler}/publish")
         written = None if publish is None or publish.address is None else connectable(publish.address)
-        guest = None if experiment.keys_folder else self._guest()  # keys that are made for a run are in its folder
+        guest = None if experiment.keys_folder else self._guest()
         if guest is not None or asking is None or written is None:
             return guest
         told = None if asking.keys is None else {**asking.keys, written: self._scheduler}
@@ -184,7 +180,6 @@ class _Connections:
         return replace(asking, name=name, sockets=sockets, keys=told, messages=messages)
 
     def _guest(self) -> Launch | None:
-        """Return how a guest joins the newest run here; None: nothing goes on."""
         try:
             folder = find_run(self._experiment.files[0])
             return guest_of(folder, f"guest:doctor-{os.getpid()}") if goes_on(folder) else None
@@ -192,13 +187,11 @@ class _Connections:
             return None
 
     def _owner_of_key(self) -> str:
-        """Return whose key the doctor uses: that of the supervisor, or another that is here."""
         folder = self._experiment.keys_folder
         here = [] if folder is None else [file.stem for file in sorted((folder / "private").glob("*.key_secret"))]
         return next((name for name in (*_ASKED_AS, *here) if name in here), SUPERVISOR)
 
     def _speak(self, launch: Launch, listen_s: float) -> None:
-        """Exchange keys with the scheduler; then ask for its time, and listen."""
         address, owner = str(launch.sockets.control), launch.name.partition(":")[0]
         try:
             network = Network.from_launch(launch.name, launch.keys)
@@ -214,7 +207,6 @@ class _Connections:
             self._into.found.append(Diagnosis("key-file", Severity.ERROR, error.where, error.what, error.hint))
 
     def _listen(self, launch: Launch, listen_s: float) -> None:
-        """Ask what time it is, and count what is published."""
         wall = ExperimentClock.real()
         port = open_port(launch, wall)
         until_s, asked_s, caught_up_s = wall.monotonic_s() + listen_s + probe.WITHIN_S, 0.0, None
@@ -244,8 +236,7 @@ class _Connections:
         self._into.found.append(told)
 
     def _compare(self, told: Plain, asked_s: float, answered_s: float) -> None:
-        """Compare clocks and versions with those of the scheduler."""
-        if not told.get("waits"):  # a simulated time that slows down does not tell real time
+        if not told.get("waits"):  # simulated time that waits for late processes does not show real time
             now_s, start_s, origin_s, speed = (float(told[name]) for name in ("now_ns", "start_s", "origin_s", "speed"))
             real_s = origin_s + (now_s / NS_PER_S - start_s) / speed
             ahead_s, uncertain_s = (asked_s + answered_s) / 2 - real_s, (answered_s - asked_s) / 2
@@ -255,7 +246,6 @@ class _Connections:
         self._into.found.append(diagnosis.of_versions(probe.versions_here(), theirs))
 
     def _processes(self, states: object) -> None:
-        """Note which processes are not well, as their supervisors tell."""
         if not isinstance(states, ProcessStates):
             return
         if states.supervisor.startswith(computer_name()):

@@ -1,7 +1,7 @@
-"""`python -m afspm.supervisor.foreign [--] command …` runs a component of another language.
+"""`python -m afspm.supervisor.foreign [--] command …` runs a component written in another language.
 
-The command gets the launch line on its standard input, which stays open for as long as our parent holds ours open, and
-is ended when that is closed or the parent dies: terminated, then killed. Its exit code is ours.
+The command gets the launch line on its standard input, which stays open as long as the parent's does. When that closes
+or the parent dies, the command is terminated, then killed. The exit code is the command's.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import threading
 from afspm.basics.exit_codes import ExitCode
 from afspm.transport.process.parent import end_within, leave_interrupts_to_parent, take_standard_input
 
-ASK_S = 0.6  # to end by itself once its standard input is closed
-TERMINATE_S = 0.4  # to end after it was told to; then it is killed
+ASK_S = 0.6  # from the end of standard input to SIGTERM
+TERMINATE_S = 0.4  # from SIGTERM to SIGKILL
 _CHUNK = 1 << 16
 
 
@@ -28,11 +28,11 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("ERROR foreign: no command given\n")
         return ExitCode.CONFIG
     leave_interrupts_to_parent()
-    # a terminal's or a supervisor's wish to end us must not leave the command behind, however early it comes
+    # a signal that arrives before the command has started must still end it
     wished = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: wished.set())
     try:
-        # in our process group, so that a supervisor who kills us, or finds us killed, sweeps the command away too
+        # in our process group, so that a supervisor that kills us, or finds us killed, kills the command too
         child = subprocess.Popen(command, stdin=subprocess.PIPE)
     except (OSError, ValueError) as error:
         sys.stderr.write(f"ERROR {command[0]} can't be started: {error} (is it installed and executable?)\n")
@@ -44,17 +44,17 @@ def main(arguments: list[str]) -> int:
     threading.Thread(target=program.pass_on, name="stdin", daemon=True).start()
     code = child.wait()
     program.sweep()
-    # it did not end by itself: that it was stopped is what counts. On Windows no code tells the one from the other
+    # the supervisor must see that the command was stopped; on Windows its exit code alone does not show that
     if program.stopped and (code < 0 or sys.platform == "win32"):
         return ExitCode.ORPHAN
     return 128 - code if code < 0 else code
 
 
 class _ForeignProgram:
-    """Passes our standard input on to the child, and ends it.
+    """Passes standard input on to the child, and ends the child.
 
     Attributes:
-        stopped: the child was terminated or killed, since it did not end with its standard input.
+        stopped: whether the child was terminated or killed because it outlived its standard input.
     """
 
     def __init__(self, child: subprocess.Popen[bytes], pipe: int) -> None:
@@ -64,23 +64,23 @@ class _ForeignProgram:
         self.stopped = False
 
     def pass_on(self) -> None:
-        """Everything of our standard input, until its end; then the child is to end."""
+        """Copy standard input to the child until it ends, then end the child."""
         assert self._child.stdin is not None
         with contextlib.suppress(OSError, ValueError):
             while chunk := os.read(self._pipe, _CHUNK):
-                with contextlib.suppress(BrokenPipeError):  # it doesn't read: it may run all the same
+                with contextlib.suppress(BrokenPipeError):  # a command that does not read its input may still run
                     self._child.stdin.write(chunk)
                     self._child.stdin.flush()
         self._end()
 
     def end_soon(self) -> None:
-        """End the child from a signal handler, which must not wait."""
+        """End the child without waiting, as a signal handler must."""
         threading.Thread(target=self._end, name="end", daemon=True).start()
 
     def sweep(self) -> None:
-        """End what the command has started and left behind, if our parent is dead; else that is the parent's to do."""
+        """Kill processes that the command left behind, if the parent is dead; a living parent does that itself."""
         if sys.platform != "win32" and os.getppid() != self._parent and os.getpgrp() == os.getpid():
-            os.killpg(0, signal.SIGKILL)  # us too: nobody is there to be told the exit code
+            os.killpg(0, signal.SIGKILL)  # us too: the parent, who would read the exit code, is dead
 
     def _end(self) -> None:
         assert self._child.stdin is not None

@@ -1,4 +1,4 @@
-"""`python -m afspm.supervisor.host` hosts one process of an experiment, as the line on its standard input says."""
+"""`python -m afspm.supervisor.host` hosts one Python process of an experiment; its launch line is on standard input."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from afspm.transport.process.parent import (
 from afspm.transport.zmq_port import open_port
 from afspm.wire.message_types import register_all
 
-LOADED_WITHIN_S = 300.0  # a large library off a slow disk, the weights of a network
-EXIT_GRACE_S = 1.0  # for exit handlers and threads of libraries, once everything of ours is done
-MOST_FILES = 65_536  # more than anybody needs; some programs that are started by ours walk through all that may be
+LOADED_WITHIN_S = 300.0  # for a large library on a slow disk, the weights of a network
+EXIT_GRACE_S = 1.0  # for exit handlers and threads of libraries
+MOST_FILES = 65_536  # plenty; child programs that loop over all possible descriptors would take long with more
 
 
 def main() -> int:
@@ -63,7 +63,7 @@ def main() -> int:
         return ExitCode.CONFIG
     except StopRequested:
         return ExitCode.ORPHAN
-    except Exception as error:
+    except Exception as error:  # a component may raise anything: logged here, and the exit code has it restarted
         if parent.gone:
             logger.debug("while ending: %s", error, exc_info=True)
             return ExitCode.ORPHAN
@@ -74,7 +74,7 @@ def main() -> int:
 def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
     clock = ExperimentClock.from_dict(launch.clock)
     activity = ProcessActivity(clock)
-    activity.longest_step_s = LOADED_WITHIN_S  # before the first beat: it may be the last until all is loaded
+    activity.longest_step_s = LOADED_WITHIN_S  # before the first heartbeat: imports may block the next ones
     with _beating(launch, activity, logger):
         with activity.step():
             register_all(launch.messages)
@@ -95,7 +95,7 @@ def _host(launch: Launch, logger: logging.Logger, parent: ParentWatch) -> int:
 
 @contextmanager
 def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) -> Iterator[None]:
-    """Heartbeats while in the block. Only an end on purpose is announced: after an error the silence tells."""
+    # only an end on purpose is announced; after an error the supervisor sees the beats stop
     if launch.sockets.heartbeat is None:
         yield
         return
@@ -112,7 +112,7 @@ def _beating(launch: Launch, activity: ProcessActivity, logger: logging.Logger) 
 
 
 def _watched_age_s(activity: ProcessActivity, logger: logging.Logger) -> Callable[[], float]:
-    """Return what tells the age of a step to the heartbeats' thread, and logs where one hangs, before it is killed."""
+    # the thread of the heartbeats calls it: it runs while a step hangs, and can log where before the supervisor kills
     logged_since_s: float | None = None
 
     def age_s() -> float:
@@ -129,7 +129,6 @@ def _watched_age_s(activity: ProcessActivity, logger: logging.Logger) -> Callabl
 
 
 def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[str, ...] | None) -> Port:
-    """Return the port of a component, which also hears what its `Scope` follows."""
     envelopes = wire.messages_of_the_experiment() if launch.envelopes is None else launch.envelopes
     if heard is not None:
         envelopes = heard
@@ -142,7 +141,7 @@ def _open_port(launch: Launch, clock: Clock, parent: ParentWatch, heard: tuple[s
 
 
 def _allow_many_connections() -> None:
-    """Raise the limit of open files: strangers that connect use up a thousand, and then nothing can be written."""
+    # strangers that connect use up the usual thousand open files, and then no file can be written
     try:
         import resource
     except ImportError:  # Windows has no such limit

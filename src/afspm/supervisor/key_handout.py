@@ -1,4 +1,4 @@
-"""Hands each process its own keys alone: those of the file, or a pair that is made for this run."""
+"""Keys for the processes of a run: those of the file, or pairs made for this run. Each process gets only its own."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from afspm.storage.disk import run_bounded
 from afspm.transport import keys
 from afspm.transport.keys import GUEST, Keys
 
+# a hanging disk must not keep the run from starting or ending
 WRITTEN_WITHIN_S = 5.0
 
 
@@ -28,8 +29,8 @@ class KeyHandout:
     """The processes to start, with their keys.
 
     Attributes:
-        guest, supervisor: the keys of those who join the run, and of who reports to its scheduler, as launch lines
-            have them; None: the file says where keys are, or that there are none.
+        guest, supervisor: keys, in the form of launch lines, of programs that join the run and of the supervisor's
+            reporter; None: the file gives a keys folder, or there are no keys.
     """
 
     starts: Sequence[ProcessStart]
@@ -38,7 +39,7 @@ class KeyHandout:
 
     @contextmanager
     def laid_down(self, folder: Path) -> Iterator[None]:
-        """Keep the guests' key in the run's folder while in the block, unless its disk fails."""
+        """Keep the guests' key in the run's folder while in the block; a failing disk is no error."""
         file = folder / STATE_DIR / GUEST_KEYS
         if self.guest is not None:
             text = json.dumps(self.guest).encode()
@@ -52,31 +53,33 @@ class KeyHandout:
 
 
 def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHandout:
-    """Give each process that is to be started its keys.
+    """Give each process to start its keys.
 
     Raises:
-        ConfigError: a key of the file is missing, or others may read it.
+        ConfigError: a key of the file is missing, or readable for other users.
     """
     if experiment.keys_folder is not None:
-        return KeyHandout([_with(start, _of_file(experiment, start), _scheduler(experiment)) for start in starts])
+        return KeyHandout(
+            [_with_keys(start, _keys_of_file(experiment, start), _scheduler(experiment)) for start in starts]
+        )
     security = experiment.resolved.sections.security
     encrypted = {} if security.insecure else _encrypted(experiment, starts)
-    return _made(starts, encrypted, _scheduler(experiment)) if encrypted else KeyHandout(starts)
+    return _with_new_keys(starts, encrypted, _scheduler(experiment)) if encrypted else KeyHandout(starts)
 
 
 def _scheduler(experiment: Experiment) -> str:
     return next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "")
 
 
-def _with(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
-    """Return a start with its keys; `scheduler`: whom alone a translator obeys."""
+def _with_keys(start: ProcessStart, own: Keys | None, scheduler: str) -> ProcessStart:
+    # a translator obeys the scheduler of this name alone
     if own is None:
         return start
     return replace(start, launch=replace(start.launch, keys={**own.as_launch(), "scheduler": scheduler}))
 
 
-def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
-    """Return the keys of a process out of the folder, with those of others only where it has to know them."""
+def _keys_of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
+    # a Python process that binds nothing needs the public keys of its servers alone
     launch = start.launch
     own = keys.from_launch(launch.name, launch.keys)
     if own is None or launch.sockets.publish or launch.sockets.serve or start.command:
@@ -86,10 +89,8 @@ def _of_file(experiment: Experiment, start: ProcessStart) -> Keys | None:
 
 
 def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Return the encrypted addresses and who binds them: all who may connect to them are started here.
-
-    They are those by which requests come, and all that other users of this computer can reach.
-    """
+    # Encrypted are sockets for requests, and publishers that other users of this computer can reach, but only where
+    # every process that connects is started here: no other gets the keys of this run.
     slots = experiment.resolved.net.slots
     here = {start.launch.name for start in starts}
     complete = here >= set(experiment.component_names)
@@ -105,20 +106,19 @@ def _encrypted(experiment: Experiment, starts: Sequence[ProcessStart]) -> dict[s
             found[connectable(start.launch.sockets.serve)] = start.launch.name
     guarding = set(found.values())
     if not guarding.issuperset(start.launch.name for start in schedulers):
-        return found  # the scheduler's subscribers are started elsewhere, and know nothing of these keys
+        return found  # the scheduler's subscribers are started elsewhere, and don't get these keys
     bound = [start.launch.sockets.publish for start in starts] + [start.launch.sockets.serve for start in starts]
     all_ports = not any(keys.is_private(address) for address in bound if address is not None)
     for start in starts:
         publish, name = start.launch.sockets.publish, start.launch.name
-        # a program in another language knows all or nothing; its translators know nothing, unless the file has keys
+        # a program in another language encrypts all its sockets or none; a translator none, unless the file has keys
         can_encrypt = name in guarding or (start.role is Role.COMPONENT and (all_ports or not start.command))
         if publish is not None and not keys.is_private(publish) and can_encrypt:
             found[connectable(publish)] = name
     return found
 
 
-def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], scheduler: str) -> KeyHandout:
-    """New pairs for all that is started, for those who join, and for who reports."""
+def _with_new_keys(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], scheduler: str) -> KeyHandout:
     pairs = {name: keys.pair() for name in [*(start.launch.name for start in starts), SUPERVISOR, GUEST]}
     public = {name: pair[0] for name, pair in pairs.items()}
 
@@ -140,10 +140,12 @@ def _made(starts: Sequence[ProcessStart], encrypted: Mapping[str, str], schedule
         return [scheduler, *(launch.name for launch in found)]
 
     handed = [
-        _with(start, of(start.launch.name, start.launch.sockets, start.role, foreign=bool(start.command)), scheduler)
+        _with_keys(
+            start, of(start.launch.name, start.launch.sockets, start.role, foreign=bool(start.command)), scheduler
+        )
         for start in starts
     ]
     asked = tuple(address for address, owner in encrypted.items() if owner == scheduler)
-    guest = Sockets(subscribe=asked)  # connects to all of them
+    guest = Sockets(subscribe=asked)  # connects to all publishers
     outside = [None if (one := of(name, guest)) is None else one.as_launch() for name in (GUEST, SUPERVISOR)]
     return KeyHandout(handed, *outside)

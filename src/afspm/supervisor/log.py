@@ -1,4 +1,4 @@
-"""One log of a run: the lines of all processes, in the terminal with name and colour, and in log.txt."""
+"""One log of a run: lines of all processes, in log.txt and, with names in colour, in the terminal."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 CLOCK = ExperimentClock.real()
+# lines that wait for a blocked terminal or disk; beyond it the oldest are dropped
 MOST_UNSHOWN = 10_000
 _HANGS = "the disk has not answered for {:.0f} s: log.txt is written once it does, and the run goes on"
 SHOWN_WITHIN_S = 2.0
@@ -33,20 +34,20 @@ _LEVELLED = re.compile(rf"(?P<level>{'|'.join(_LEVELS)})\b:?\s*(?P<text>.*)", re
 
 
 class LineReader:
-    """Tells the level of the lines that one process writes.
+    """Reads the levels of the lines of one process.
 
-    On stderr a line may begin with its level ("WARNING the tip is blunt"), as ours do. Lines without one belong to
-    the line before: a traceback below an ERROR. Before any levelled line they are warnings, since a program that
-    complains before it has a log has reason to. What a component prints to stdout is information.
+    On stderr a line may begin with its level ("WARNING the tip is blunt"), as afspm's own do. Lines without a level
+    belong to the line before: a traceback below an ERROR. Lines before the first level are warnings, since a program
+    that writes to stderr before its log is set up has a reason. Lines on stdout are information.
     """
 
     def __init__(self) -> None:
         self._level: int = logging.WARNING
         self.last_error = ""
-        """The first line of the last error."""
+        """First line of the last error."""
 
     def read(self, stream: Literal["stdout", "stderr"], line: str) -> tuple[int, str]:
-        """Return the level (that of `logging`) and the text of a line."""
+        """Return the level (as in `logging`) and the text of a line."""
         if stream == "stdout":
             return logging.INFO, line
         match = _LEVELLED.match(line)
@@ -59,11 +60,10 @@ class LineReader:
 
 
 class RunLog:
-    """Writes every line to `file`, and those of `level` and above to the terminal; `names` are made equally wide.
+    """Writes every line to `file`, and lines of `level` and above to the terminal; `names` are padded to one width.
 
-    A terminal that has gone away is no reason to end a measurement, nor is one that takes nothing more to stop it, as
-    somebody has marked text in it or pressed Ctrl-S: what can't be written there is still in the file. Nor is a disk
-    that is full, or hangs: each of the two has a thread of its own.
+    Neither a terminal that has gone or blocks (text marked in it, Ctrl-S) nor a disk that is full or hangs may stop a
+    measurement, so each has a thread of its own. A line that one of them loses is still in the other.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class RunLog:
         level: int = logging.INFO,
         names: Iterable[str] = (),
     ) -> None:
-        self._file = _Shown(*_into(file))
+        self._file = _Shown(*_writer_to(file))
         self._clock = clock
         self._wall = ExperimentClock.real()
         self._level = level
@@ -87,7 +87,7 @@ class RunLog:
         self._widest = max(map(len, (LOGGED_AS, *names)))
 
     def write(self, name: str, level: int, text: str) -> None:
-        """Write one line of the process `name`; `level` is that of `logging`."""
+        """Write one line of the process `name`; `level` is a number of `logging`."""
         wall_ns = self._wall.now_ns()
         stamp = f"{day_and_time(wall_ns)}.{wall_ns // 1_000_000 % 1000:03d}{self._experiment_time()}"
         self._file.add(stamp, f"{name:{self._widest}}", level, text)
@@ -102,20 +102,20 @@ class RunLog:
             self._shown.add(time_of_day(wall_ns), f"{name:{self._widest}}", level, text)
 
     def _experiment_time(self) -> str:
-        """Return the time in the experiment, where it is another than the one on the wall."""
+        # empty where the experiment's time is the wall clock's
         now_ns = self._clock.now_ns()
         if abs(now_ns - self._wall.now_ns()) < NS_PER_S:
             return ""
         return f" [{day_and_time(now_ns)}]"
 
     def close(self) -> None:
-        """Write and show what is left, if file and terminal take it."""
+        """Write and show the lines that wait, as far as file and terminal take them."""
         self._shown.close()
         self._file.close()
 
 
 def colour_of(name: str) -> str:
-    """Return the colour of a component's name: the same in every run and on every computer."""
+    """Return the colour of a process name: the same in every run and on every computer."""
     return COLOURS[zlib.crc32(name.encode()) % len(COLOURS)]
 
 
@@ -123,7 +123,7 @@ Show = Callable[[str, str, int, str], None]
 
 
 class _Shown:
-    """Shows lines in a thread of its own, which may have to wait for the terminal, or the disk."""
+    """Writes lines from a thread of its own, which may wait for the terminal or the disk."""
 
     def __init__(self, show: Show, finish: Callable[[], None] = lambda: None) -> None:
         self._show = show
@@ -136,13 +136,13 @@ class _Shown:
         self._thread.start()
 
     def add(self, time: str, name: str, level: int, text: str) -> None:
-        """Append a line; where too many wait, the oldest is dropped."""
+        """Append a line; if the queue is full, the oldest line is dropped."""
         with self._changed:
             self._lines.append((time, name, level, text))
             self._changed.notify()
 
     def close(self) -> None:
-        """Show what waits, if the terminal takes it."""
+        """Write the lines that wait, for SHOWN_WITHIN_S at most."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -153,11 +153,11 @@ class _Shown:
             with contextlib.suppress(OSError, ValueError):
                 self._show(*line)
             self._busy_since_s = None
-        with contextlib.suppress(OSError):  # what waits for room on a full disk is lost with us
+        with contextlib.suppress(OSError):  # lines that wait for room on a full disk are lost at exit
             self._finish()
 
     def hangs(self, longer_than_s: float) -> bool:
-        """Return whether one line takes longer than this."""
+        """Return whether writing one line has taken longer than `longer_than_s`."""
         since_s = self._busy_since_s
         return since_s is not None and CLOCK.monotonic_s() - since_s > longer_than_s
 
@@ -168,15 +168,14 @@ class _Shown:
             return self._lines.popleft() if self._lines else None
 
 
-def _into(path: Path) -> tuple[Show, Callable[[], None]]:
-    """Raises OSError: the file can't be opened."""
+def _writer_to(path: Path) -> tuple[Show, Callable[[], None]]:
     file = path.open("a", encoding="utf-8", errors="replace")
     SYNCER.folder_soon(path.parent)
 
     def show(stamp: str, name: str, level: int, text: str) -> None:
         file.write(f"{stamp} {logging.getLevelName(level):8} {name} {text}\n")
         file.flush()
-        SYNCER.soon(file.fileno())  # a power cut leaves what was before the last moment
+        SYNCER.soon(file.fileno())  # after a power cut only the last moment is missing
 
     return show, file.close
 

@@ -1,8 +1,7 @@
-"""Addresses for the sockets to which the experiment file gives none: unix sockets of one folder, or free ports.
+"""Addresses for sockets that the experiment file leaves open: unix sockets in one folder, or free ports.
 
-Only the user who runs the experiment gets to the folder (mode 0700), whatever the user's umask is. The folder is not
-that of the run: a path of a unix socket has 107 bytes at most, and folders of runs are deep, and at times on a
-network's disk.
+Only the user who runs the experiment can enter the folder (mode 0700, independent of umask). It is not the run's
+folder: the path of a unix socket has at most 107 bytes, and run folders are deep, and sometimes on a network disk.
 """
 
 from __future__ import annotations
@@ -26,27 +25,28 @@ from afspm.basics.errors import ConfigError
 from afspm.transport.network import HAS_PRIVATE_SOCKETS
 
 # Below the range from which systems take the ports of outgoing connections (Linux from 32768, Windows and macOS from
-# 49152). From within it a port would be no choice: while its process is being restarted, a peer that tries again and
-# again may be given that very port by its own system, connect to itself, and keep the process from ever binding it.
+# 49152). A port within that range could be lost: while its process restarts, a peer that reconnects may get that very
+# port as its own outgoing port, connect to itself, and keep the process from binding it.
 LOWEST, HIGHEST = 20_000, 32_000
 TRIES = 200
 CAN_HOLD = sys.platform == "linux"
-"""Elsewhere a port that one process has bound, without listening, can't be bound by another."""
+"""Other systems let no second process bind a port that one process has bound without listening."""
 LONGEST_FOLDER = 90
-"""Bytes of the path of a folder of sockets. macOS allows the least for a socket: 103."""
+"""Limit on the path of a folder of sockets, in bytes. macOS has the lowest limit for a socket's path: 103."""
+# limits the open descriptors of a process that chooses ports for many runs
 _MOST_HELD = 256
 _TCP = re.compile(r"tcp://(\*|[^:/\s]+|\[[0-9A-Fa-f:.]+\]):([1-9]\d*)")
 
-_held: deque[int] = deque()  # files of sockets, for as long as this process lasts
+_held: deque[int] = deque()  # descriptors, open as long as this process lives
 
 
 class FreePorts:
-    """Hands out ports of this computer that nobody listens on, each once.
+    """Hands out free ports of this computer, each once.
 
-    The port is chosen here and bound by the child, so that a restarted child is found where it was. On Linux it is held
-    meanwhile: whoever else chooses ports, experiments beside this one for instance, does not find it free, neither
-    before the child has bound it nor while the child is being restarted. On other systems another program may take it:
-    the child then fails to bind and says so.
+    A port is chosen here and bound by the child, so that a restarted child has the same address. On Linux the port is
+    held meanwhile: other programs that look for free ports, such as a second experiment, skip it before the child has
+    bound it and while the child restarts. On other systems another program may take it; the child then fails to bind
+    and logs so.
     """
 
     def __init__(self, host: str = "127.0.0.1") -> None:
@@ -58,7 +58,7 @@ class FreePorts:
         """Return a port that was free just now.
 
         Raises:
-            OSError: none is to be had.
+            OSError: no port is free.
         """
         for _ in range(TRIES):
             port = self._random.randrange(LOWEST, HIGHEST)
@@ -68,29 +68,29 @@ class FreePorts:
         raise OSError(f"no free port between {LOWEST} and {HIGHEST} on {self._host}")
 
     def address(self) -> str:
-        """Return a free address for a socket, as ZeroMQ writes it."""
+        """Return a free address in ZeroMQ's form."""
         return f"tcp://{self._host}:{self.take()}"
 
 
 class SocketFolder:
-    """Unix sockets in a new folder that its owner alone can enter. Raises OSError if there is no place for one."""
+    """Unix sockets in a new folder that only its owner can enter. Raises OSError if no folder can be made."""
 
     def __init__(self) -> None:
         self.path = _private_folder()
         self._count = 0
 
     def address(self) -> str:
-        """Return an address that nothing is bound to."""
+        """Return an unused address."""
         self._count += 1
         return f"ipc://{self.path}/{self._count}"
 
     def close(self) -> None:
-        """Remove the folder, and what a process that was killed has left in it."""
+        """Remove the folder, with sockets that killed processes have left in it."""
         shutil.rmtree(self.path, ignore_errors=True)
 
 
 def _private_folder() -> Path:
-    """Make it where the system has a place for the sockets of a login session, else among temporary files."""
+    # XDG_RUNTIME_DIR is preferred: it has mode 0700, and the system empties it after the login session.
     tried = [os.environ.get("XDG_RUNTIME_DIR"), tempfile.gettempdir(), "/tmp"]
     for parent in filter(None, tried):
         if len(os.fsencode(parent)) < LONGEST_FOLDER and os.access(parent, os.W_OK | os.X_OK):
@@ -99,7 +99,7 @@ def _private_folder() -> Path:
 
 
 class NewAddresses(NamedTuple):
-    """Functions that return a new address at each call: of a socket without one in the file, or for heartbeats."""
+    """Functions that return a new address at each call: for sockets that the file leaves open, and for heartbeats."""
 
     of_socket: Callable[[], str]
     of_heartbeat: Callable[[], str]
@@ -107,12 +107,12 @@ class NewAddresses(NamedTuple):
 
 @contextmanager
 def new_addresses(*, private: bool, tcp: bool) -> Iterator[NewAddresses]:
-    """Give the addresses of a run, which lead nowhere after the block. Raises ConfigError: they have no place.
+    """Make addresses for a run, valid within the block. Raises ConfigError if there is no place for them.
 
     Args:
-        private: sockets are unix sockets, where the system has them. Heartbeats, which stay on this computer, are as
-            soon as `tcp` is false.
-        tcp: all are ports.
+        private: use unix sockets where the system has them. Heartbeats, which stay on this computer, use them whenever
+            `tcp` is false.
+        tcp: use ports only.
     """
     ports = FreePorts()
     if tcp or not HAS_PRIVATE_SOCKETS:
@@ -130,10 +130,10 @@ def new_addresses(*, private: bool, tcp: bool) -> Iterator[NewAddresses]:
 
 
 def require_free(bound: Mapping[str, str]) -> None:
-    """See that the addresses of an experiment are free before anything is started, and hold them where that can be.
+    """Require that the addresses of an experiment are free, and hold their ports where the system allows.
 
     Args:
-        bound: address -> the name of the process that will bind it here.
+        bound: address -> name of the process that will bind it here.
 
     Raises:
         ConfigError: another program listens at one.
@@ -145,13 +145,13 @@ def require_free(bound: Mapping[str, str]) -> None:
 
 
 def _can_be_bound(host: str, port: int) -> bool:
-    """False only if somebody listens there; all else that is wrong with an address is said by who binds it."""
+    # false for a port in use or reserved; the process that binds the address reports any other error better
     host = {"*": "0.0.0.0", "localhost": LOOPBACK}.get(host, host)
     try:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
             if sys.platform == "win32":
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
-            else:  # connections of an experiment before this one may linger
+            else:  # connections of an earlier experiment may linger in TIME_WAIT
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind((host, port))
             if CAN_HOLD:
@@ -162,7 +162,7 @@ def _can_be_bound(host: str, port: int) -> bool:
 
 
 def _is_free(host: str, port: int) -> bool:
-    """Return whether nobody has bound it; if so it is held from now on, where that can be."""
+    # where possible the port stays bound from here on, so that no other program takes it before our process binds it
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         try:
             probe.bind((host, port))
@@ -174,7 +174,7 @@ def _is_free(host: str, port: int) -> bool:
 
 
 def _hold(bound: socket.socket) -> None:
-    # bound as the only one, and shared only then, with whoever asks for a shared one and listens: our children do
+    # bound exclusively first, and made shareable only then: our children bind it shared and listen
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     _held.append(bound.detach())
     if len(_held) > _MOST_HELD:

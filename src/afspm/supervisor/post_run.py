@@ -1,4 +1,4 @@
-"""After the end of a run: its summary, its report, and the people who are told that it is over."""
+"""After the end of a run: its summary, its report, and the notifications."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ if TYPE_CHECKING:
     from afspm.supervisor.log import RunLog
     from afspm.supervisor.supervisor import RunOutcome
 
+# each of these bounds the wait for a hanging disk, network or program: the terminal returns in any case
 REPORT_WITHIN_S = 120.0
 TOLD_WITHIN_S = 30.0
 COUNTED_WITHIN_S = 20.0
-TABLE = "metadata.csv"  # of the component Metadata
+TABLE = "metadata.csv"  # written by the component Metadata
 
 
 @dataclass(frozen=True)
@@ -58,10 +59,10 @@ def follow(
     *,
     with_report: bool,
 ) -> None:
-    """Tell whoever [notify] names, then say what was measured and write the report, which need the disk and may take
-    long.
+    """Send the notifications of [notify], then log a summary and write the report.
 
-    Of the end of an experiment on several computers that one tells where its scheduler ran.
+    Notifications go first, because the rest needs the disk and may take long. If parts run on several computers, only
+    the one with the scheduler sends them.
     """
     notify = experiment.resolved.sections.notify
     if any(start.role is Role.SCHEDULER for start in starts):
@@ -73,7 +74,7 @@ def follow(
 
 
 def summary(outcome: RunOutcome, folder: Path) -> list[str]:
-    """Return the summary: why it ended, what ran, what had to be restarted or was given up, where everything is."""
+    """Return the summary: why the run ended, processes that ran, restarts, processes given up, and the folder."""
     told = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
@@ -84,7 +85,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
         if report.given_up:
             told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:
-        told += run_bounded(lambda: _recorded(folder) or _tabled(folder / TABLE), COUNTED_WITHIN_S)
+        told += run_bounded(lambda: _counts_of_record(folder) or _counts_of_table(folder / TABLE), COUNTED_WITHIN_S)
     except DiskTimeout as error:
         told.append(f"what was measured can't be counted: {error}")
     told.append(f"everything is in {folder}")
@@ -93,8 +94,7 @@ def summary(outcome: RunOutcome, folder: Path) -> list[str]:
     return told
 
 
-def _recorded(folder: Path) -> list[str]:
-    """Return what the record counts, where there is one."""
+def _counts_of_record(folder: Path) -> list[str]:
     try:
         with open_run(folder) as run:
             whole = sum(not row.interrupted for row in run.scans)
@@ -104,8 +104,8 @@ def _recorded(folder: Path) -> list[str]:
     return [_measured(whole, spectra) + (f"; {interrupted} interrupted" if interrupted else "")]
 
 
-def _tabled(table: Path) -> list[str]:
-    """Return what the table of measurements counts, where the experiment kept one; a scan's channels are one scan."""
+def _counts_of_table(table: Path) -> list[str]:
+    # the table has a row a channel; the channels of one scan count as one scan
     try:
         with table.open(encoding="utf-8", newline="") as file:
             rows = {(row.get("measurement"), row.get("time")) for row in csv.DictReader(file)}
@@ -124,10 +124,9 @@ def _times(count: int) -> str:
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a run that has a record, in a process of its own, which can neither harm the run nor hold it
-    up for long."""
+    """Write the report of a recorded run, in a process of its own that can neither harm nor delay the run."""
     if not (folder / JOURNAL_FILE).is_file():
-        return  # nothing was recorded
+        return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
     command = [*python_command("afspm.record.report"), str(folder)]
     environment = {**os.environ, **python_environment(), "MPLBACKEND": "agg"}
@@ -156,7 +155,7 @@ def report(folder: Path, log: RunLog) -> None:
 
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
-    """Tell people that a run is over, and how. What fails is tried again, for half a minute."""
+    """Send the notification that a run has ended. Failed deliveries are repeated for half a minute."""
     is_lost = ended.outcome.why in (EndReason.LOST, EndReason.PLANS_LOST)
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:

@@ -1,8 +1,9 @@
-"""One child process: started, fed its launch line, read, waited for and killed. Every platform difference is here."""
+"""One child process: start, launch line, output, exit, kill. Every difference between platforms is here."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.interpreter import python_command, python_environment
@@ -20,11 +21,14 @@ from afspm.experiment import ProcessStart
 from afspm.model import Role
 from afspm.supervisor.child_output import ChildOutput, OutputDropped, OutputLine, Stream
 from afspm.supervisor.supervision.supervisor_events import Exited
-from afspm.supervisor.windows_job import WindowsJob
 
-LONGEST_LINE = 1 << 16  # a child that prints without end of line must not fill our memory
+LONGEST_LINE = 1 << 16  # a child that prints no line ends must not fill our memory
 FED_S = 0.2  # a pipe takes a launch line at once, unless it is long and the child does not read
-LAST_WORDS_S = 3.0  # how long its output may still be read after an exit; a grandchild that left can hold the pipe open
+LAST_WORDS_S = 3.0  # limit on reading its output after its exit: a detached grandchild can keep the pipe open
+
+_EXTENDED_LIMITS = 9  # JobObjectExtendedLimitInformation
+_KILL_ON_CLOSE = 0x2000  # JOB_OBJECT_LIMIT_KILL_ON_JOB_CLOSE
+_KILLED = 1
 
 ChildEvent = OutputLine | OutputDropped | Exited
 HOST = "afspm.supervisor.host"
@@ -33,16 +37,16 @@ GUARD = "afspm.supervisor.foreign"
 
 @dataclass(frozen=True)
 class Task:
-    """One process to start, to watch, and to start again.
+    """One process to start, watch and restart.
 
     Attributes:
-        launch: the line for its standard input; the heartbeat's address is the supervisor's to add.
-        command: the program and its arguments.
-        role: what it is in the experiment; without scheduler or translator nothing can go on.
-        folder: where to start it; None: where we are.
-        environment: what it gets besides our own environment.
-        hidden: what it does not get of that.
-        beats: whether it sends heartbeats; what doesn't is only known by its exit.
+        launch: line for its standard input; the supervisor adds the address for heartbeats.
+        command: program and arguments.
+        role: scheduler, translator or component; the experiment can't go on without the first two.
+        folder: working directory; None: the supervisor's.
+        environment: variables in addition to the supervisor's.
+        hidden: variables of the supervisor that the process does not get.
+        beats: whether it sends heartbeats; without them only its exit shows that it is dead.
     """
 
     launch: Launch
@@ -61,13 +65,13 @@ class Task:
 
     @property
     def essential(self) -> bool:
-        """True where the experiment can't go on without it."""
+        """Whether the experiment can't go on without the process."""
         return self.role is not Role.COMPONENT
 
 
 def from_start(start: ProcessStart) -> Task:
-    """Return the task of a process: Python classes run in our host, other languages under our guard."""
-    # modules are those beside the experiment file, and never what happens to lie where the run was started
+    """Return the task of a process: Python classes run in `host`, other languages under `foreign`."""
+    # modules come from beside the experiment file, never from the directory where the run was started
     ours = (*python_command(GUARD), "--", *start.command) if start.command else python_command(HOST)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
     return Task(
@@ -84,15 +88,15 @@ def from_start(start: ProcessStart) -> Task:
 
 
 class ChildProcess:
-    """A running child. Its output and its exit are told to `tell`, from threads of this object.
+    """A running child. Calls `tell` with its output and its exit, from threads of this object.
 
-    The child lives in a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing
-    takes what the child itself has started along. Its stdin stays open until `close_stdin`: the end of it means to the
-    child that its parent wants it to stop, or is dead (then the system closes it).
+    The child has a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing includes
+    the child's own children. Its standard input stays open until `close_stdin`; when it ends, the parent wants the
+    child to stop, or is dead (then the system closes it).
 
     Args:
-        has_tip: it may have a tip to see to when we are killed.
-        may_begin: awaited before the launch line is given to it; None: it may at once.
+        has_tip: whether the child may have to retract a tip after the supervisor was killed.
+        may_begin: event to wait for before the launch line is sent; None: send it at once.
 
     Raises:
         AfspmError: the program can't be started.
@@ -108,7 +112,7 @@ class ChildProcess:
     ) -> None:
         self.name = name = task.name
         self._may_begin = may_begin
-        self._tell = tell
+        self._report = tell
         ours = {key: value for key, value in os.environ.items() if key not in task.hidden}
         try:
             self._popen = _start(task.command, {**ours, **task.environment}, task.folder)
@@ -117,14 +121,14 @@ class ChildProcess:
                 f"{task.command[0]} can't be started: {error}", where=name, hint="is it installed and executable?"
             ) from error
         self.pid = self._popen.pid
-        self._job = WindowsJob(self._popen, has_tip=has_tip)
+        self._job = _WindowsJob(self._popen, has_tip=has_tip)
         self._fed = threading.Event()
         readers = [self._reader("stdout", self._popen.stdout), self._reader("stderr", self._popen.stderr)]
         feeding = (task.launch.to_json(), readers)
         threading.Thread(target=self._feed_and_wait, args=feeding, name=f"{name}-wait", daemon=True).start()
 
     def close_stdin(self) -> None:
-        """Ask the child to end. One that hasn't even taken its launch line is killed instead."""
+        """Ask the child to end. A child that has not read its launch line yet is killed."""
         if not self._fed.wait(FED_S):
             self.kill()
         elif self._popen.stdin is not None:
@@ -132,7 +136,7 @@ class ChildProcess:
                 self._popen.stdin.close()
 
     def kill(self) -> None:
-        """End the child and everything in its process group, now. A child that is gone already is left in peace."""
+        """Kill the child and its process group now; does nothing after its exit."""
         if sys.platform == "win32":
             with contextlib.suppress(OSError):
                 self._popen.kill()
@@ -146,17 +150,17 @@ class ChildProcess:
         assert self._popen.stdin is not None
         if self._may_begin is not None:
             self._may_begin.wait()
-        with contextlib.suppress(OSError, ValueError):  # gone already: its exit says so
+        with contextlib.suppress(OSError, ValueError):  # it has exited already, which is reported below
             self._popen.stdin.write(first_line.encode() + b"\n")
             self._popen.stdin.flush()
         self._fed.set()
         code = self._popen.wait()
-        self.kill()  # what the child started and left behind must not live on beside its successor
+        self.kill()  # processes that the child left behind must not run beside its successor
         self._job.close()
         for reader in readers:
             reader.join(LAST_WORDS_S)
         self.close_stdin()
-        self._tell(Exited(self.name, self.pid, code))
+        self._report(Exited(self.name, self.pid, code))
 
     def _reader(self, stream: Stream, pipe: IO[bytes] | None) -> threading.Thread:
         thread = threading.Thread(target=self._read, args=(stream, pipe), name=f"{self.name}-{stream}", daemon=True)
@@ -165,7 +169,7 @@ class ChildProcess:
 
     def _read(self, stream: Stream, pipe: IO[bytes] | None) -> None:
         assert pipe is not None
-        output = ChildOutput(self.name, self.pid, stream, self._tell)
+        output = ChildOutput(self.name, self.pid, stream, self._report)
         with contextlib.suppress(OSError, ValueError), pipe:
             while line := pipe.readline(LONGEST_LINE):
                 output.take(line)
@@ -181,6 +185,57 @@ def _start(command: Sequence[str], environment: Mapping[str, str], folder: Path 
         cwd=folder,
         env={"PYTHONUNBUFFERED": "1", "PYTHONUTF8": "1", **environment},
         start_new_session=sys.platform != "win32",
-        # on Windows what ends the console (Ctrl-Break, or closing its window) must not reach what sees to a tip
+        # on Windows Ctrl-Break or closing the console must not kill a child that retracts a tip
         creationflags=getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0) | getattr(subprocess, "CREATE_NO_WINDOW", 0),
     )
+
+
+class _JobLimits(ctypes.Structure):
+    """JOBOBJECT_EXTENDED_LIMIT_INFORMATION; only its flags are set."""
+
+    _fields_ = (
+        ("per_process_user_time", ctypes.c_int64),
+        ("per_job_user_time", ctypes.c_int64),
+        ("flags", ctypes.c_uint32),
+        ("minimum_working_set", ctypes.c_size_t),
+        ("maximum_working_set", ctypes.c_size_t),
+        ("active_processes", ctypes.c_uint32),
+        ("affinity", ctypes.c_size_t),
+        ("priority", ctypes.c_uint32),
+        ("scheduling", ctypes.c_uint32),
+        ("counters", ctypes.c_uint64 * 6),
+        ("memory", ctypes.c_size_t * 4),
+    )
+
+
+class _WindowsJob:
+    """Windows job object of a child and its own children; elsewhere `reaper` does its work.
+
+    Args:
+        has_tip: whether the child retracts a tip first: it then ends by itself, not with the supervisor.
+    """
+
+    def __init__(self, child: subprocess.Popen[bytes], *, has_tip: bool) -> None:
+        self._handle = 0
+        self._kernel: Any = None
+        if sys.platform != "win32":
+            return
+        kernel = ctypes.WinDLL("kernel32", use_last_error=True)
+        kernel.CreateJobObjectW.restype = ctypes.c_void_p
+        self._kernel = kernel
+        self._handle = kernel.CreateJobObjectW(None, None) or 0
+        limits = _JobLimits(flags=0 if has_tip else _KILL_ON_CLOSE)
+        job = ctypes.c_void_p(self._handle)
+        kernel.SetInformationJobObject(job, _EXTENDED_LIMITS, ctypes.byref(limits), ctypes.sizeof(limits))
+        kernel.AssignProcessToJobObject(job, ctypes.c_void_p(int(child._handle)))
+
+    def kill(self) -> None:
+        if self._handle:
+            self._kernel.TerminateJobObject(ctypes.c_void_p(self._handle), _KILLED)
+
+    def close(self) -> None:
+        """Close the job; processes left in it end, unless one of them has a tip."""
+        if self._handle:
+            handle, self._handle = self._handle, 0
+            with contextlib.suppress(OSError):
+                self._kernel.CloseHandle(ctypes.c_void_p(handle))

@@ -1,7 +1,7 @@
-"""Ends what a supervisor leaves behind when it is killed: a process of its own, which waits for the supervisor's end.
+"""Kills processes that a killed supervisor leaves behind. Runs as a process that waits for the supervisor's end.
 
-A process that the supervisor has started sees the end of its standard input and ends by itself. One that can't see it
-(a library holds Python's lock), or that has started others, is ended from here, some seconds later.
+A child normally ends by itself at the end of its standard input. A child that can't notice it (a library holds Python's
+lock), or has children of its own, is killed from here some seconds later.
 """
 
 from __future__ import annotations
@@ -13,24 +13,27 @@ import subprocess
 import sys
 from pathlib import Path
 
-if __name__ != "__main__":  # else it is run by itself, without the packages that would have to be loaded first
+if __name__ != "__main__":  # as a script it starts without site packages, to be ready fast
     from afspm.transport.process.parent import END_WITHIN_S, TIP_WITHIN_S
 
 GRACE_S = 1.0
-"""Beyond the time that a process has to end by itself."""
+"""Added to the time that a process has to end by itself."""
 
 
 CLOSED_WITHIN_S = 1.0
 
 
 class Reaper:
-    """Knows the processes of one supervisor that live. On Windows a job object does this, see `jobs`."""
+    """Sends the living process groups of a supervisor to the reaper process.
+
+    Windows has a job object instead, see `process`.
+    """
 
     def __init__(self) -> None:
         self._popen: subprocess.Popen[bytes] | None = None
 
     def begin(self) -> None:
-        """Start it; without it (too many processes, say) all else goes on."""
+        """Start the reaper process. If that fails (too many processes), the run goes on without it."""
         if sys.platform == "win32":
             return
         with contextlib.suppress(OSError):
@@ -39,26 +42,26 @@ class Reaper:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # what ends the whole terminal must not end this first
+                start_new_session=True,  # closing the terminal must not end the reaper first
             )
 
     def watch(self, pid: int, *, has_tip: bool) -> None:
-        """Name a process group that is to end with the supervisor; one with a tip to see to has longer for that."""
-        self._tell(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
+        """Register a process group to kill after the supervisor's end; later if it may have a tip to retract."""
+        self._send(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
 
     def forget(self, pid: int) -> None:
-        """Strike out a process that is gone: its number may be given to another."""
-        self._tell(f"{pid} 0")
+        """Unregister an ended process group: the system may reuse its number."""
+        self._send(f"{pid} 0")
 
     def close(self) -> None:
-        """Close its input: it ends what is left now."""
+        """Close the reaper's input: it kills the groups still registered."""
         if self._popen is not None and self._popen.stdin is not None:
             with contextlib.suppress(OSError):
                 self._popen.stdin.close()
-            with contextlib.suppress(subprocess.TimeoutExpired):  # something can't be killed
+            with contextlib.suppress(subprocess.TimeoutExpired):  # a process can't be killed
                 self._popen.wait(CLOSED_WITHIN_S)
 
-    def _tell(self, line: str) -> None:
+    def _send(self, line: str) -> None:
         if self._popen is not None and self._popen.stdin is not None:
             with contextlib.suppress(OSError, ValueError):
                 self._popen.stdin.write(line.encode() + b"\n")
@@ -66,7 +69,7 @@ class Reaper:
 
 
 def main() -> None:
-    """Wait for the end of standard input, then for each process group that is left until its time is up."""
+    """Wait for the end of standard input, then kill each registered group once its time is up."""
     assert sys.platform != "win32"
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -1,4 +1,4 @@
-"""A recorded run is published again, with a folder of its own by which it is found like a running experiment."""
+"""Replay: a recorded run published again, from a folder that programs find as if the experiment ran."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from afspm.transport.process import signals
 from afspm.transport.rate_limited_log import RateLimitedLog
 
 BEFORE_S = 1.0
-"""Real: those who join at once find the beginning still to come."""
+"""Real time before the first packet, so that programs that join at once miss none."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +37,11 @@ class ReplayOptions:
     """Options of a replay.
 
     Attributes:
-        speed: experiment seconds in a real second; None: as it was recorded.
+        speed: experiment seconds in a real second; None: as recorded.
         only: names of messages; empty: all.
         publish, serve: addresses; None: those of the recorded experiment file, else free ones.
-        stay: when all is published.
-        runs: the folder of run folders.
+        stay: whether to serve late joiners after the last packet.
+        runs: folder for the run folder.
     """
 
     speed: float | None = None
@@ -53,7 +53,7 @@ class ReplayOptions:
 
 
 def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> int:
-    """Publish a recorded run again until its end, or Ctrl-C; returns how many packets were published.
+    """Publish a recorded run again until its end or Ctrl-C; return the number of packets published.
 
     Raises:
         FileError: there is no record, or it is damaged.
@@ -66,7 +66,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
         left_out: set[str] = set()
 
         def leave_out(why: str) -> None:
-            if why not in left_out:  # once, not with each channel
+            if why not in left_out:  # log each reason once, not for each channel
                 tell(f"left out: {why}")
             left_out.add(why)
 
@@ -91,7 +91,7 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
 
 
 def _check(only: Sequence[str], run: Run) -> None:
-    # messages of its own are known by the record: their module is not imported, as it may be that of somebody else
+    # the record describes the user's own messages; importing their module would run code of a stranger's record
     for name in only:
         if name not in wire.known_messages() and next(run.packets(messages=(name,)), None) is None:
             raise ConfigError(f"there is no message {name!r}", where="--only", hint="e.g. Scan2d,ControlState")
@@ -106,12 +106,11 @@ def _clock(run: Run, speed: float | None, first_ns: int) -> ExperimentClock:
 
 def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
     ports = FreePorts()
-    said = _said(run)
+    said = _addresses_of_file(run)
     return options.publish or said[0] or ports.address(), options.serve or said[1] or ports.address()
 
 
-def _said(run: Run) -> tuple[str | None, str | None]:
-    """Return where the scheduler was, as far as the experiment file says so."""
+def _addresses_of_file(run: Run) -> tuple[str | None, str | None]:
     try:
         tables = [table for table in run.experiment.values() if isinstance(table, dict)]
     except (FileError, tomllib.TOMLDecodeError):
@@ -124,7 +123,6 @@ def _said(run: Run) -> tuple[str | None, str | None]:
 
 
 def _guest(run: Run) -> Launch:
-    """Return the launch line of whoever joins."""
     recorded = run.facts.get(GUEST)
     guest = Launch.from_json(json.dumps(recorded)) if isinstance(recorded, dict) else Launch("guest")
     return replace(guest, keys=None, run="", simulated=run.simulated, sample_coordinates=run.frame is Frame.SAMPLE)
@@ -132,7 +130,6 @@ def _guest(run: Run) -> Launch:
 
 @contextmanager
 def _folder(run: Run, runs: Path, guest: Launch, clock: ExperimentClock, publish: str, serve: str) -> Iterator[Path]:
-    """A run folder, by which the replay is found; when the block is left it says that it is over."""
     folder = run_folder.create(runs, f"replay-{run.folder.name}", now())
     sockets = Sockets(subscribe=(publish,), control=serve)
     joined = replace(

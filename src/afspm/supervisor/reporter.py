@@ -1,6 +1,6 @@
-"""Reports states of processes and log lines to the scheduler, and receives its orders.
+"""Reports process states and log lines to the scheduler, and receives the scheduler's orders.
 
-In a thread of its own: the supervisor hands over and goes on, whether the scheduler is there, slow or dead.
+It runs in a thread of its own, so that a slow or dead scheduler never delays the supervisor.
 """
 
 from __future__ import annotations
@@ -56,17 +56,18 @@ LINES_PERIOD_S = 0.2
 RESEND_AFTER_S = 5.0
 """Real time after which a report without an answer is sent again."""
 MOST_LINES = 5000
-"""Lines that wait for a scheduler that is not there; of more the oldest are dropped."""
+"""Limit on lines that wait for a missing scheduler; the oldest are dropped."""
 LONGEST_LINE = 2000
 """Characters."""
 _BATCH_BYTES = LONGEST_ANNOUNCEMENT // 4
 _CLOSE_WITHIN_S = 1.0
+# each reason is logged once; ever new reasons must not fill the memory
 _MOST_FAILURES = 100
 
 
 @dataclass(frozen=True, slots=True)
 class ReportFailed:
-    """The scheduler does not take reports."""
+    """The scheduler does not accept reports."""
 
     text: str
 
@@ -76,11 +77,11 @@ _REQUESTS = {AskUse: CLOCK_REQUEST, EndExperiment: int(ControlRequest.END_EXPERI
 
 
 class ReportQueue:
-    """The newest states, and the lines, that are still to be reported. Thread-safe.
+    """Newest states, and lines, still to be reported. Thread-safe.
 
     Args:
         clock: of the experiment.
-        name: under which dropped lines are noted.
+        name: sender of the line that reports dropped lines.
     """
 
     def __init__(self, clock: Clock, name: str) -> None:
@@ -96,7 +97,7 @@ class ReportQueue:
         self._states, self._has_changed = states, self._has_changed or changed
 
     def put_line(self, name: str, level: str, text: str) -> bool:
-        """Append a line; returns whether it is the only one."""
+        """Append a line; return whether the queue was empty."""
         line = LogLine(self._clock.now_ns(), name, level, text[:LONGEST_LINE])
         with self._lock:
             if len(self._lines) >= MOST_LINES:
@@ -106,7 +107,7 @@ class ReportQueue:
             return len(self._lines) == 1
 
     def take(self, supervisor: str) -> ProcessStates | LogLines | None:
-        """Return what is due; None: nothing is yet."""
+        """Return the next report that is due; None if there is none yet."""
         now_s = self._clock.monotonic_s()
         if self._states and (self._has_changed or now_s >= self._states_s + STATES_PERIOD_S):
             self._has_changed, self._states_s = False, now_s
@@ -117,7 +118,7 @@ class ReportQueue:
         return None
 
     def take_lines(self) -> tuple[LogLine, ...]:
-        """Return as many lines as the scheduler takes at a time."""
+        """Return as many lines as the scheduler accepts in one report."""
         batch, size = [], 0
         with self._lock:
             if self._dropped:
@@ -130,7 +131,6 @@ class ReportQueue:
         return tuple(batch)
 
     def due_s(self) -> float:
-        """Return when something is due, in real monotonic time."""
         if self._has_changed:
             return -math.inf
         states_s = self._states_s if self._states else self._clock.monotonic_s()
@@ -142,9 +142,9 @@ class Reporter:
     """Reports states and lines to the scheduler, from `start` to `close`, in a thread of its own.
 
     Args:
-        launch: how the scheduler is asked; its name is "supervisor:" and what tells this supervisor from others.
+        launch: launch line for requests to the scheduler; its name is "supervisor:" and the name of this supervisor.
         clock: of the experiment.
-        supervisor: what tells this supervisor from others.
+        supervisor: name that distinguishes this supervisor from others.
 
     Attributes:
         post: called with events, in the reporter's thread.
@@ -161,30 +161,29 @@ class Reporter:
         self._failures: set[str] = set()
         self._asked: deque[int] = deque()
 
-    # --- of the supervisor, any thread ---
+    # --- called by the supervisor, from any thread ---
 
     def start(self) -> None:
-        """Begin to report."""
         self._thread.start()
 
     def states(self, states: tuple[ProcessState, ...], *, changed: bool) -> None:
-        """Take the states of all processes; report them at once if they have `changed`."""
+        """Queue the states of all processes; report them at once if they have `changed`."""
         self._queue.put_states(states, changed=changed)
         if changed:
             self._wake()
 
     def line(self, name: str, level: int, text: str) -> None:
-        """Take a line of a process, or of the supervisor itself; `level` is that of `logging`."""
+        """Queue a line of a process or of the supervisor; `level` is a number of `logging`."""
         if level > logging.DEBUG and self._queue.put_line(name, logging.getLevelName(level), text):
             self._wake()
 
     def ask(self, wanted: AskUse | EndExperiment) -> None:
-        """Ask the scheduler, before the next report."""
+        """Send the scheduler a request, before the next report."""
         self._asked.append(_REQUESTS[type(wanted)])
         self._wake()
 
     def close(self) -> None:
-        """Report no more. Takes a second at most."""
+        """Stop reporting. Takes a second at most."""
         self._is_closing = True
         self._wake()
         if self._thread.is_alive():
@@ -194,14 +193,14 @@ class Reporter:
         if (port := self._port) is not None:
             port.wake_up()
 
-    # --- of its own thread ---
+    # --- in the reporter's thread ---
 
     def _run(self) -> None:
         try:
             port = open_port(self._launch, ExperimentClock.real())
         except AfspmError as error:
             self._fail(str(error))
-            self.post(SchedulerAnswered())  # or not: there is no asking
+            self.post(SchedulerAnswered())  # components must not wait for a scheduler that can't be asked
             return
         try:
             self._port = port
@@ -213,7 +212,6 @@ class Reporter:
             port.close()
 
     def _send(self, port: ZmqPort) -> None:
-        """Send the open request again, or the next one, if it is time for either."""
         request, now_s = self._request, self._clock.monotonic_s()
         if not request.connected or (request.sent and now_s < request.sent_s + RESEND_AFTER_S):
             return
@@ -236,7 +234,7 @@ class Reporter:
     def _receive(self, incoming: Incoming) -> None:
         request = self._request
         if isinstance(incoming, ControlConnected):
-            request.connected, request.sent_s = True, -math.inf  # what was sent may be lost
+            request.connected, request.sent_s = True, -math.inf  # the request may be lost with the old connection
         elif isinstance(incoming, ControlDisconnected):
             request.connected = False
         elif isinstance(incoming, ReplyReceived) and request.sent and incoming.response.id == request.sent.id:
@@ -274,7 +272,7 @@ class Reporter:
 
 
 class _OpenRequest:
-    """The request that waits for its answer; there is one at a time."""
+    """The request whose answer is awaited; there is at most one."""
 
     def __init__(self, name: str, run: str) -> None:
         self.connected = self.answered = False
@@ -288,7 +286,7 @@ class _OpenRequest:
 
 
 def _in_use(response: Response) -> str | None:
-    """Return by whom the microscope is in use; empty: it is not; None: a scheduler that can't say."""
+    # empty: not in use; None: an older scheduler, which has no such answer
     try:
         told = json.loads(response.payload) if response.ok else {}
         return str(told["in_use"])
@@ -306,31 +304,30 @@ def reporter_of(
     run: str = "",
     keys: Mapping[str, object] | None = None,
 ) -> Reporter | None:
-    """Return a reporter for what is started here; None where the scheduler can't be asked, or may not be ours.
+    """Return a reporter for the processes started here; None if the scheduler can't be asked, or may not be afspm's.
 
     Args:
-        keys: that were made for it; None: the file says where they are, or there are none.
+        keys: made for the reporter; None: the file gives a keys folder, or there are no keys.
     """
     scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
     here = computer_name()
     if scheduler is None:
         launch = experiment.asking([start.launch.name for start in starts])
         launch = launch and replace(launch, run=run)
-        here = f"{here}-{os.getpid()}"  # there may be several parts on one computer
+        here = f"{here}-{os.getpid()}"  # several parts may run on one computer
     else:
-        launch = _local(scheduler)
+        launch = _local_launch(scheduler)
     if launch is None:
         return None
     return Reporter(replace(launch, name=f"{SUPERVISOR}:{here}", keys=keys or launch.keys), clock, here)
 
 
 def computer_name() -> str:
-    """Return the name of this computer, as supervisors tell it."""
+    """Return the name of this computer for the names of supervisors: letters, digits, ".", "_" and "-"."""
     return re.sub(r"[^\w.-]+", "-", platform.node())[:_LONGEST_COMPUTER_NAME] or "computer"
 
 
-def _local(scheduler: ProcessStart) -> Launch | None:
-    """Return how a scheduler is asked that is started here."""
+def _local_launch(scheduler: ProcessStart) -> Launch | None:
     launch = scheduler.launch
     if scheduler.command or launch.sockets.serve is None:
         return None

@@ -1,4 +1,4 @@
-"""A run that was killed, or stopped, goes on in its folder: `afspm run --resume`."""
+"""`afspm run --resume`: a run that was killed or stopped goes on in its folder."""
 
 from __future__ import annotations
 
@@ -33,10 +33,11 @@ from afspm.supervisor.supervision.run_end import EndReason
 _OVER = {reason.name.lower() for reason in EndReason if reason.is_final}
 _LOOPBACK = re.compile(r"tcp://(127\.0\.0\.1|localhost|\*|0\.0\.0\.0):(\d+)")
 ZMTP = b"\xff"
-"""What a socket of ZeroMQ says first."""
+"""First byte that a ZeroMQ socket sends."""
+# orphans end within seconds; the reaper kills the rest
 GONE_WITHIN_S = 10.0
 STEP_NS = 1_000_000
-"""By so much the time goes on between two lives of a run, so that nothing new happens at a time that has been."""
+"""Simulated time between two lives of a run, so that no new packet has the time of an old one."""
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class ResumableRun:
     """A run that can go on.
 
     Attributes:
-        homes: the folders of the files that the experiment was made of.
-        added: names of components that it did not have so far.
+        homes: folders of the files that the experiment was made of.
+        added: names of components that the run did not have before.
     """
 
     folder: Path
@@ -56,25 +57,25 @@ class ResumableRun:
     added: tuple[str, ...] = ()
 
     def with_overlay(self, file: Path) -> ResumableRun:
-        """Return the same run, which goes on with what the file adds."""
+        """Return the same run with the additions of an overlay file."""
         experiment = load_expanded(self.folder / EXPERIMENT_FILE, self.homes, file)
         before = self.experiment.component_names
         added = [name for name in experiment.component_names if name not in before]
         return replace(self, experiment=experiment, added=(*self.added, *added))
 
     def options(self, options: RunOptions) -> RunOptions:
-        """Return the options with the processes that it had on this computer, and those that were added now."""
-        names = self.experiment.component_names  # without what was added in an earlier life
+        """Return the options restricted to the processes that ran on this computer, and those added now."""
+        names = self.experiment.component_names  # without components added by an overlay at an earlier resume
         only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
         return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
 
 
 def find(where: Path) -> ResumableRun:
-    """Return the run that is meant by its folder, that of all runs (the newest), or the experiment file.
+    """Return the run at `where`: its folder, the folder of all runs (the newest), or its experiment file.
 
     Raises:
-        FileError: there is no run, or what is needed of it can't be read.
-        ConfigError: it has ended, or the experiment file that names it was edited since it was begun.
+        FileError: there is no run, or one of its files can't be read.
+        ConfigError: the run has ended, or its experiment file was edited since its start.
     """
     folder = find_run(where).resolve()
     facts = read_run_json(folder)
@@ -94,9 +95,9 @@ def find(where: Path) -> ResumableRun:
 
 
 def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = None) -> FinishedRun:
-    """Go on with a run until it ends, where every process finds what it remembers. Raises as `run.run`, and
+    """Go on with a run until it ends; every process finds its saved memory. Raises as `run.run`, and
 
-    FileError: it is still going on.
+    FileError: the run is still going on.
     """
     experiment, folder, facts = found.experiment, found.folder, found.facts
     options = found.options(options)
@@ -104,7 +105,9 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
     with lock_run(folder):
         _wait_until_gone(facts, folder)
         starts = running.dry_run(experiment, options)
-        common = running.common_identity(experiment, starts, _own(experiment, options, found), options, terminal)
+        common = running.common_identity(
+            experiment, starts, _resumed_identity(experiment, options, found), options, terminal
+        )
         if facts.get(RUN) and common.run != facts[RUN]:
             what = "the scheduler has begun another run meanwhile"
             raise ConfigError(what, where=str(folder), hint="begin a new run here, too: `afspm run FILE --only …`")
@@ -113,11 +116,9 @@ def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = N
         return running.go(experiment, options, common, folder, found.name, terminal, names)
 
 
-def _own(experiment: Experiment, options: RunOptions, found: ResumableRun) -> RunIdentity:
-    """Return what this part had before, with real time, or the simulated time after the last that anybody has seen.
-
-    Where parts run on other computers, to which time has gone on, it has gone on here.
-    """
+def _resumed_identity(experiment: Experiment, options: RunOptions, found: ResumableRun) -> RunIdentity:
+    # Simulated time goes on after the last time in the record. If only some processes are resumed, those on other
+    # computers have kept the old clock, so it is kept here.
     facts = found.facts
     simulated = bool(facts.get("simulated")) or experiment.simulated(options.only, options.without)
     if not simulated:
@@ -136,7 +137,7 @@ def _clock_after(facts: Plain, folder: Path) -> ExperimentClock:
 
 
 def last_seen_ns(folder: Path) -> int:
-    """Return the last experiment time that anything in the run's folder knows of; 0 if nothing does."""
+    """Return the latest experiment time in the files of a run's folder; 0 if there is none."""
     seen = [0]
     state = folder / STATE_DIR
     seen += [entry.packet.time_ns or 0 for entry in logged_packets(log_folder(state))]
@@ -149,7 +150,7 @@ def last_seen_ns(folder: Path) -> int:
         for values in (kept, translator):
             if isinstance(values, dict):
                 seen += [values[name] for name in ("last_ns", "seen_ns") if isinstance(values.get(name), int)]
-    with suppress(FileError, sqlite3.DatabaseError):  # damaged: the recorder puts it aside, and the others know as well
+    with suppress(FileError, sqlite3.DatabaseError):  # damaged: the recorder moves it aside
         journal = open_to_read(folder)
         with closing(journal):
             newest = journal.execute("SELECT coalesce(max(time_ns), 0) FROM packets WHERE source = ''")
@@ -158,11 +159,7 @@ def last_seen_ns(folder: Path) -> int:
 
 
 def _wait_until_gone(facts: Plain, folder: Path) -> None:
-    """Wait until processes that lost their parent have ended: two of one name must not share a folder.
-
-    Raises:
-        FileError: somebody stays.
-    """
+    # processes that lost their parent end by themselves, within seconds; two of one name must not share a folder
     until_s = ExperimentClock.real().monotonic_s() + GONE_WITHIN_S
     ports = {
         int(match[2]): name
@@ -172,7 +169,7 @@ def _wait_until_gone(facts: Plain, folder: Path) -> None:
     }
     if not ports:
         return
-    with ThreadPoolExecutor(len(ports)) as pool:  # Windows takes two seconds to say of one that nobody is there
+    with ThreadPoolExecutor(len(ports)) as pool:  # on Windows a refused connection takes two seconds
         for name, is_gone in zip(ports.values(), pool.map(lambda port: _is_gone(port, until_s), ports), strict=True):
             if not is_gone:
                 hint = "end it, then resume the run"
@@ -180,13 +177,13 @@ def _wait_until_gone(facts: Plain, folder: Path) -> None:
 
 
 def _is_gone(port: int, until_s: float) -> bool:
-    """Return whether nobody listens on a port any more; a connection that is closed says so."""
+    # a listener that ends closes the connection, which is noticed at once
     clock = ExperimentClock.real()
     while (left_s := until_s - clock.monotonic_s()) > 0.0:
         try:
             with socket.create_connection(("127.0.0.1", port), timeout=left_s) as peer:
                 if peer.recv(1) not in (b"", ZMTP):
-                    return True  # somebody else has the port by now
+                    return True  # another program has the port by now
                 while peer.recv(1024):
                     peer.settimeout(max(0.001, until_s - clock.monotonic_s()))
         except TimeoutError:
@@ -197,16 +194,16 @@ def _is_gone(port: int, until_s: float) -> bool:
 
 
 def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> None:
-    """Refuse to go on with the run in `folder` if that would not be by the files as they are: limits, for instance.
+    """Refuse to resume the run in `folder` if its experiment files have changed: limits, for instance.
 
     Args:
-        files: those that it was begun with.
-        begun: what they said then.
+        files: files that the run was started with.
+        begun: the experiment as it was at the start.
 
     Raises:
-        ConfigError: they say something else now.
+        ConfigError: the files now make another experiment.
     """
-    differs = differing(_whole(begun), _whole(load(*files)))
+    differs = differing(_expanded(begun), _expanded(load(*files)))
     if differs:
         named = " ".join(map(quoted, files))
         raise ConfigError(
@@ -217,14 +214,14 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
         )
 
 
-def _whole(experiment: Experiment) -> dict[str, object]:
-    """Return what is in force, defaults too, whoever wrote it down."""
+def _expanded(experiment: Experiment) -> dict[str, object]:
+    # both files expanded, so that a default written out by hand counts as no difference
     experiment.resolved  # noqa: B018  (adds what the file leaves open)
     return tomllib.loads(experiment.expanded(secrets=False))
 
 
 def differing(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
-    """Return where two experiments differ: each section with its keys."""
+    """Return the differences of two experiments: each section with its keys."""
     found = []
     for name in {**before, **now}:
         then, later = before.get(name), now.get(name)

@@ -1,4 +1,4 @@
-"""A whole run of an experiment: checked, its folder made, started, watched, and summed up."""
+"""A whole run of an experiment: check, folder, start, supervision, summary."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.basics.errors import ConfigError
 from afspm.basics.formatting import counted
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
-from afspm.experiment import Experiment, ProcessStart, Role, run_metadata
+from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
@@ -37,9 +37,10 @@ from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.transport.heartbeat import HeartbeatListener
 
 TAKES_WHO_COMES = ""
-"""The identity of a run of a real microscope's translator alone, which obeys the scheduler that comes."""
+"""Identity of a run of a real microscope's translator alone: it obeys whichever scheduler connects."""
 RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
 
+# a hanging disk must not keep the supervisor from ending
 WRITTEN_WITHIN_S = 5.0
 
 
@@ -48,15 +49,15 @@ CLOCK_FILE = "clock"
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a run that the experiment file is not about.
+    """Options of a run that are not in the experiment file.
 
     Attributes:
         runs: the folder of run folders.
         only, without: names of processes to start, or not to start, on this computer.
         speed: experiment seconds in a real second, instead of the file's; for simulated microscopes only.
-        report: whether the report is written when it has ended.
-        metadata: over what the file says in [metadata].
-        log_level: of `logging`; what is shown in the terminal, and what the processes write at all.
+        report: whether to write the report at the end.
+        metadata: entries that override [metadata] of the file.
+        log_level: of `logging`, for the terminal and for what processes write at all.
     """
 
     runs: Path = Path("runs")
@@ -70,7 +71,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run that is over."""
+    """A run that has ended."""
 
     folder: Path
     outcome: RunOutcome
@@ -81,11 +82,11 @@ def run(experiment: Experiment, options: RunOptions = RunOptions(), terminal: Te
 
     Raises:
         ConfigError: the experiment file has errors, or the options don't fit it; nothing was started.
-        FileError: there is no place for the run folder; nothing was started.
+        FileError: the run folder can't be made; nothing was started.
     """
     experiment.require_valid(options.only, options.without)
-    own = _own(experiment, options)
-    # whatever is wrong is told before a folder is made
+    own = _own_identity(experiment, options)
+    # errors are raised before the folder is made
     first = _starts(experiment, options, own, FreePorts().address)
     key_handout.hand_over(experiment, first)
     names = [start.launch.name for start in first]
@@ -106,7 +107,7 @@ def go(
     terminal: TextIO | None,
     names: Sequence[str],
 ) -> FinishedRun:
-    """Run an experiment in a folder that is there, and locked, until it ends.
+    """Run an experiment in an existing, locked folder until it ends.
 
     Args:
         name: of the experiment; names: of its processes.
@@ -122,7 +123,7 @@ def go(
         before = run_json_or_empty(folder)  # empty unless the run is resumed
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
-        facts[METADATA] = before.get(METADATA) or run_metadata.of_run(experiment.resolved) | dict(options.metadata)
+        facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
         if before.get(ENDED) and REAL_S in before:
             facts[REAL_S] = before[REAL_S]
         run_folder.write_run(folder, facts)
@@ -140,14 +141,14 @@ def go(
             outcome = supervisor.run()
         try:
             ending = {**facts, ENDED: outcome.text, HOW: outcome.why.name.lower()}
-            if not before or REAL_S in facts:  # else a part was cut off, for an unknown time
+            if not before or REAL_S in facts:  # without REAL_S an earlier part was cut off at an unknown time
                 so_far_s = before.get(REAL_S, 0.0)
                 ending[REAL_S] = round(so_far_s + outcome.duration_s, 1)
             run_bounded(lambda: run_folder.write_run(folder, ending), WRITTEN_WITHIN_S)
-        except OSError as error:  # a full disk must not keep people from being told of the end
+        except OSError as error:  # a full disk must not prevent the notification of the end
             log.write(LOGGED_AS, logging.ERROR, f"how it ended is not in run.json: {error}")
         if outcome.why.is_final:
-            with suppress(OSError):  # what stays is only space
+            with suppress(OSError):  # leftover files only take space
                 run_bounded(lambda: discard_if_recorded(log_folder(folder / STATE_DIR)), WRITTEN_WITHIN_S)
         ended = EndedRun(name, folder, outcome, common.simulated)
         post_run.follow(experiment, ended, starts, clock, log, with_report=options.report)
@@ -155,7 +156,6 @@ def go(
 
 
 def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
-    """Return the addresses that are bound here, with the names of their processes."""
     return {
         address: start.launch.name
         for start in starts
@@ -165,9 +165,9 @@ def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
-    """Return what else run.json says, so that the run can be resumed with that file alone.
+    """Return the entries of run.json from which the run can be resumed, without any other file.
 
-    There the recorder and others that go where the scheduler is are named like all the rest, and so are chosen by name.
+    The recorder and other implied processes are named there like all others, and so are chosen by name.
     """
     here = [start.launch.name for start in starts]
     elsewhere = [name for name in experiment.component_names if name not in here]
@@ -179,13 +179,13 @@ def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], opti
 
 
 def dry_run(experiment: Experiment, options: RunOptions = RunOptions()) -> list[ProcessStart]:
-    """Return what `run` would start, and nothing else. Raises as `run` does."""
+    """Return the processes that `run` would start, and start none. Raises as `run` does."""
     experiment.require_valid(options.only, options.without)
-    return _starts(experiment, options, _own(experiment, options), FreePorts().address)
+    return _starts(experiment, options, _own_identity(experiment, options), FreePorts().address)
 
 
 def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) -> dict[str, object]:
-    """Return what run.json says: who is where, and with what launch line a script can join (`afspm.connect`)."""
+    """Return the contents of run.json: processes, addresses, and the launch line for guests (`afspm.connect`)."""
     facts: dict[str, object] = {
         "name": name,
         RUN: common.run,
@@ -206,7 +206,6 @@ def run_facts(name: str, starts: Sequence[ProcessStart], common: RunIdentity) ->
 
 
 def _example_of_a_guest(starts: Sequence[ProcessStart]) -> Launch | None:
-    """The launch line of somebody who is connected as a guest would be; None where that can't be known."""
     by_role = {start.role: start.launch for start in reversed(starts)}
     scheduler = by_role.get(Role.SCHEDULER)
     if scheduler is None or scheduler.sockets.publish is None or scheduler.sockets.serve is None:
@@ -214,7 +213,7 @@ def _example_of_a_guest(starts: Sequence[ProcessStart]) -> Launch | None:
         return component if component and component.sockets.subscribe and component.sockets.control else None
     sockets = Sockets(subscribe=(connectable(scheduler.sockets.publish),), control=connectable(scheduler.sockets.serve))
     keys = scheduler.keys
-    if keys is not None and "folder" in keys:  # the scheduler itself need not know whose key to expect there: its own
+    if keys is not None and "folder" in keys:  # the scheduler's own key is expected there
         keys = {**keys, **dict.fromkeys((*sockets.subscribe, str(sockets.control)), scheduler.name)}
     return replace(scheduler, sockets=sockets, keys=keys)
 
@@ -242,12 +241,11 @@ def _starts(
     return starts
 
 
-def _own(experiment: Experiment, options: RunOptions) -> RunIdentity:
-    """Return what this part of the experiment would have by itself."""
+def _own_identity(experiment: Experiment, options: RunOptions) -> RunIdentity:
     simulated = experiment.simulated(options.only, options.without)
     clock, speed = experiment.clock(), options.speed
     if speed is not None and not experiment.resolved.simulated:
-        raise ConfigError("a real microscope has real time", where="--speed", hint="leave --speed away")
+        raise ConfigError("a real microscope has real time", where="--speed", hint="omit --speed")
     if speed is not None:
         clock = replace(clock, speed=speed)
     return RunIdentity(clock, run_identity.new_identity(), simulated)
@@ -260,10 +258,11 @@ def common_identity(
     options: RunOptions,
     terminal: TextIO | None,
 ) -> RunIdentity:
-    """Return what the whole experiment has, of which perhaps only a part is started here: it is the scheduler's.
+    """Return the identity of the whole experiment: the scheduler's, if only other parts are started here.
 
     Raises:
-        ConfigError: the file's time is a simulation's, and here it is not certain that the microscope is simulated.
+        ConfigError: time is simulated, but the microscope is not certain to be; or the speed differs from the
+            scheduler's.
     """
     roles = {start.launch.name: start.role for start in starts}
     launch = None if Role.SCHEDULER in roles.values() else experiment.asking(list(roles))
@@ -294,7 +293,7 @@ def _require_real_time(clock: ExperimentClock, experiment: Experiment) -> None:
 
 
 def now() -> datetime:
-    """Return real time, with the zone of this computer."""
+    """Return real time, in this computer's time zone."""
     return datetime.fromtimestamp(ExperimentClock.real().now_s()).astimezone()
 
 

@@ -1,4 +1,4 @@
-"""The folder that an experiment leaves behind: what was asked for, what happened, and all that was measured."""
+"""The folder that a run leaves behind: experiment file, log, and everything measured."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ MOST_RUNS_A_SECOND = 1000
 
 
 def create(runs: Path, experiment: str, started: datetime) -> Path:
-    """Return a new, empty run folder `runs/<experiment>-<time>/`, absolute; `runs/latest` then leads to it.
+    """Make the run folder `runs/<experiment>-<time>/` and return it, absolute; `runs/latest` then leads to it.
 
     Raises:
         FileError: the folder can't be made.
@@ -42,17 +42,17 @@ def create(runs: Path, experiment: str, started: datetime) -> Path:
 
 
 def write_run(folder: Path, facts: Mapping[str, object]) -> None:
-    """Write run.json, which `afspm.connect` reads to find the running experiment."""
+    """Write run.json, from which `afspm.connect` finds the running experiment."""
     _replace(folder / RUN_FILE, json.dumps(facts, indent=2, ensure_ascii=False) + "\n")
 
 
 def write_experiment(folder: Path, text: str) -> None:
-    """Write the experiment file as it was expanded: nothing left to defaults, the whole run in one file."""
+    """Write the expanded experiment file: one file, with every default filled in."""
     _replace(folder / EXPERIMENT_FILE, text)
 
 
 def _new_folder(runs: Path, stamp: str) -> Path:
-    for number in range(1, MOST_RUNS_A_SECOND):  # several may start in the same second
+    for number in range(1, MOST_RUNS_A_SECOND):  # several runs may start in the same second
         folder = runs / (stamp if number == 1 else f"{stamp}-{number}")
         with contextlib.suppress(FileExistsError):
             folder.mkdir()
@@ -61,16 +61,14 @@ def _new_folder(runs: Path, stamp: str) -> Path:
 
 
 def _point_to(runs: Path, name: str) -> None:
-    """Make the newest run found in the folder of all runs: by a link, or a file where links can't be made."""
     aside = runs / f".{LATEST_LINK}-{name}"
     try:
         aside.symlink_to(name, target_is_directory=True)
         aside.replace(runs / LATEST_LINK)
-    except OSError:  # Windows lets only some users make links
+    except OSError:  # on Windows only some users may create links
         aside.unlink(missing_ok=True)
         _replace(runs / LATEST_FILE, name + "\n")
 
 
 def _replace(file: Path, text: str) -> None:
-    """Write so that a reader sees the old or the new text, never half of it; after a power cut, too."""
     replace_file(file, [text.encode()])

@@ -1,4 +1,4 @@
-"""The clock and identity that all parts of a run share; a part without the scheduler asks that for them."""
+"""Clock and identity that all parts of a run share; a part without the scheduler asks the scheduler for them."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from afspm.transport.zmq_port import open_port
 
 AGAIN_S = 1.0
 REFUSED_S = 10.0
-"""Real time for which a refusal may pass: the scheduler still holds the connection of a host that lost its power."""
-_SAME_S = 1e-3  # two processes of one computer agree on real time to that
+"""Real time for which a refusal may be temporary: the scheduler still has the connection of a host that lost power."""
+_SAME_S = 1e-3  # clocks of two processes of one computer differ by less
 
 
 @dataclass(frozen=True)
 class RunIdentity:
-    """The identity and clock of a run, the same on all of its computers.
+    """Identity and clock of a run, the same on all of its computers.
 
     Attributes:
-        run: the identity of the run, random; empty: it is not known here.
-        simulated: True only if the microscope is simulated for certain.
+        run: random identity of the run; empty: not known here.
+        simulated: True only if the microscope is certain to be simulated.
     """
 
     clock: ExperimentClock
@@ -37,15 +37,14 @@ class RunIdentity:
 
 
 def new_identity() -> str:
-    """Return an identity that no other run has."""
     return os.urandom(8).hex()
 
 
 def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
-    """Ask the scheduler that `launch` leads to, which is waited for. One that knows no time goes by real time.
+    """Wait for the scheduler at `launch`, and return its identity. A scheduler without a clock uses real time.
 
     Raises:
-        ConfigError: it does not tell.
+        ConfigError: the scheduler does not answer this request.
     """
     wall = ExperimentClock.real()
     port = open_port(launch, wall)
@@ -68,7 +67,7 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
                     tell(f"{response.reason}: the experiment goes by real time")
                     return RunIdentity(wall, "", simulated=False)
                 if response.ok or now_s >= refused_s + REFUSED_S:
-                    return _read(response, asked_s, wall.now_s(), str(launch.sockets.control))
+                    return _identity_in(response, asked_s, wall.now_s(), str(launch.sockets.control))
                 if refused_s == math.inf:
                     refused_s = now_s
                     tell(f"the scheduler refuses: {response.reason}; asking again for {REFUSED_S:.0f} s")
@@ -79,10 +78,9 @@ def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
         port.close()
 
 
-def _read(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
-    """Return what was told between two moments of real time, with the clock as it is to be read on this computer."""
+def _identity_in(response: Response, asked_s: float, answered_s: float, where: str) -> RunIdentity:
     if not response.ok:
-        raise ConfigError(f"the scheduler does not tell the time: {response.reason}", where=where)
+        raise ConfigError(f"the scheduler does not answer with its time: {response.reason}", where=where)
     try:
         told = json.loads(response.payload)
         run, simulated = str(told.pop("run", "")), told.pop("simulated", False) is True
@@ -95,5 +93,5 @@ def _read(response: Response, asked_s: float, answered_s: float, where: str) -> 
     real_s = (asked_s + answered_s) / 2
     shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed
     if abs(now_s - shown_s) <= ((answered_s - asked_s) / 2 + _SAME_S) * clock.speed:
-        return RunIdentity(clock, run, simulated)  # the same clock on the wall: exactly the same time
+        return RunIdentity(clock, run, simulated)  # same wall clock: take the scheduler's clock unchanged
     return RunIdentity(ExperimentClock(real_s, now_s, clock.speed), run, simulated)

@@ -1,6 +1,6 @@
-"""The supervisor: one poller on heartbeats, exits, output, signals and the next deadline.
+"""The supervisor: one poller for heartbeats, exits, output, signals and the next deadline.
 
-`supervision.SupervisorCore` decides what to do about it; here it is done.
+`supervision.SupervisorCore` decides; the effects are carried out here.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ from afspm.transport.process import signals
 from afspm.transport.process.fault_file import take_fault
 
 REPORT_PERIOD_S = 0.1
-"""Real time between two looks at the states of processes, for the reporter."""
+"""Real time between two updates of the reporter's process states."""
 
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """The outcome of a run; `duration_s` in real time, up to its end, without what components finish then."""
+    """Outcome of a run; `duration_s` is real time up to its end, without the time that components need to finish."""
 
     why: EndReason
     text: str
@@ -73,12 +73,11 @@ class RunOutcome:
 
     @property
     def exit_code(self) -> int:
-        """Of `afspm run`."""
         return self.why.exit_code
 
 
 class Supervisor:
-    """Runs tasks until the experiment ends, everything is done, something essential is lost, or it is stopped."""
+    """Runs tasks until the experiment ends, all are done, an essential process is lost, or a person stops it."""
 
     def __init__(
         self,
@@ -105,7 +104,7 @@ class Supervisor:
         self._processes: dict[str, ChildProcess] = {}
         self._lines = {task.name: LineReader() for task in tasks}
         self._monitors: dict[str, ActivityMonitor] = {}
-        # without a reporter nobody can tell whether the scheduler answers
+        # without a reporter the scheduler's answer can't be seen
         awaits_scheduler = reporter is not None and any(task.role is Role.SCHEDULER for task in tasks)
         self._may_begin = threading.Event()
         if not awaits_scheduler:
@@ -121,7 +120,7 @@ class Supervisor:
         return replace(task, launch=replace(launch, beat_token=token, sockets=sockets, keys=own))
 
     def run(self) -> RunOutcome:
-        """Start everything; returns when nothing of it runs any more."""
+        """Start all processes, and return when none of them runs any more."""
         began_s = self._clock.monotonic_s()
         self._reaper.begin()
         if self._reporter is not None:
@@ -136,7 +135,7 @@ class Supervisor:
                     self._look()
                     self._step(TimePassed())
                     self._report()
-        finally:  # also when an error of ours ends it: nothing may be left behind
+        finally:  # also after an error in this loop: no process may be left behind
             for process in self._processes.values():
                 process.kill()
             if self._reporter is not None:
@@ -158,10 +157,9 @@ class Supervisor:
         self._wakeup.post(EndSignal(number))
 
     def _wait(self) -> None:
-        """Wait for whatever comes first, and take all of it in."""
         for beat in self._beats.poll(self._timeout_s()):
             self._step(Beaten(beat.name, beat))
-        # a person who wants it to end does not wait behind what the processes print
+        # Ctrl-C must not wait behind the output of the processes
         for event in sorted(self._wakeup.take(), key=lambda event: not isinstance(event, EndSignal)):
             match event:
                 case OutputLine():
@@ -178,7 +176,6 @@ class Supervisor:
                     self._log.write(LOGGED_AS, logging.WARNING, event.text)
 
     def _timeout_s(self) -> float | None:
-        """Return the time until there is something to do if nothing happens; None: for ever."""
         deadlines = [self._core.deadline_s(), *(monitor.again_s for monitor in self._monitors.values())]
         if self._reporter is not None:
             deadlines.append(self._reported_s + REPORT_PERIOD_S)
@@ -196,7 +193,6 @@ class Supervisor:
             self._step(replace(exited, last_error=self._lines[exited.name].last_error, fault=fault))
 
     def _look(self) -> None:
-        """Look at the clock on the wall, and from outside at processes whose beat is late, or that are to end."""
         if warning := self._clock_check.warning():
             self._log.write(LOGGED_AS, logging.WARNING, warning)
         now_s = self._clock.monotonic_s()
@@ -208,7 +204,6 @@ class Supervisor:
             self._step(ActivitySeen(name, monitor.work(now_s), monitor.processor_s))
 
     def _report(self) -> None:
-        """Hand the states of all processes to the reporter, now and then."""
         now_s = self._clock.monotonic_s()
         if self._reporter is None or now_s < self._reported_s + REPORT_PERIOD_S:
             return
@@ -265,19 +260,19 @@ TOLERANCE_S = 5.0
 
 
 class ClockCheck:
-    """Warns once if the two differ; simulated time that passes faster never agrees with the wall."""
+    """Warns once if experiment time and wall clock differ; time that is simulated at another speed is not checked."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock
         self._is_done = clock.speed != 1.0
 
     def warning(self) -> str:
-        """Compare them now; returns what to warn of, mostly nothing."""
+        """Compare the clocks now; return the warning, usually empty."""
         if self._is_done or abs(ahead_s := self._clock.wall_ahead_s()) < TOLERANCE_S:
             return ""
         self._is_done = True
         way = "ahead of" if ahead_s > 0.0 else "behind"
         return (
-            f"the computer's clock is {duration_text(abs(ahead_s))} {way} that of the run: it was set, or the "
+            f"the computer's clock is {duration_text(abs(ahead_s))} {way} the run's clock: it was set, or the "
             "computer slept; the record keeps the run's own time"
         )

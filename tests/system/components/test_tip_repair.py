@@ -1,4 +1,4 @@
-"""The sample of the paper's control transfer, shortened to one change of the tip, with real processes."""
+"""The paper's sample of control transfer, with one change of the tip, through real processes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def record_of(night: Path) -> NightRecord:
     return NightRecord.from_lines(file.read_text(encoding="utf-8").splitlines())
 
 
-def test_control_goes_to_the_corrector_and_back(night: Path) -> None:
+def test_corrector_gets_control_and_returns_it(night: Path) -> None:
     record = record_of(night)
     (flagged,) = record.problem_spans(Problem.TIP_SHAPE_CHANGED)
     (repair,) = record.control_spans("tip_corrector")
@@ -56,13 +56,13 @@ def test_control_goes_to_the_corrector_and_back(night: Path) -> None:
     assert before.end_ns is not None
     assert flagged.end_ns is not None
     assert before.end_ns <= flagged.start_ns <= repair.start_ns
-    # removing the flag takes control from the one who solved the problem
+    # clearing the flag takes control from the component that solved the problem
     assert repair.end_ns == flagged.end_ns
     assert flagged.end_ns <= after.start_ns
     assert record.problems == [Problem.TIP_SHAPE_CHANGED]
 
 
-def test_the_flag_comes_with_the_change_and_goes_with_the_cure(night: Path) -> None:
+def test_flag_is_set_at_the_tip_change_and_cleared_by_the_repair(night: Path) -> None:
     truth = [json.loads(line) for line in (night / "truth.jsonl").read_text(encoding="utf-8").splitlines()]
     start_s = truth[0]["time_s"]
     cures = [e["time_s"] for e in truth if e.get("outcome") == "cured"]
@@ -73,7 +73,7 @@ def test_the_flag_comes_with_the_change_and_goes_with_the_cure(night: Path) -> N
     assert 0.0 < flagged.end_ns / 1e9 - cures[-1] < 1500.0
 
 
-def test_every_scan_asked_for_is_in_the_table_once(night: Path) -> None:
+def test_each_requested_scan_is_in_the_table_once(night: Path) -> None:
     with (night / "metadata.csv").open(newline="", encoding="utf-8") as file:
         heights = [row for row in csv.DictReader(file) if row["channel"] == "Height"]
     said = TAKEN.findall((night / "log.txt").read_text(encoding="utf-8"))

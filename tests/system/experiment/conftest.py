@@ -9,7 +9,7 @@ from tests.system.experiment.experiment_lab import EXPERIMENT, SPEED, WITNESS, A
 
 @pytest.fixture
 def afspm_run(tmp_path: Path) -> Iterator[Run]:
-    """Starts `afspm run` with these arguments, in `where`; killed after the test."""
+    """Start `afspm run` with these arguments, in `where`; kill it after the test."""
     runs: list[AfspmRun] = []
 
     def start(*arguments: str, where: Path = tmp_path) -> AfspmRun:
@@ -23,7 +23,7 @@ def afspm_run(tmp_path: Path) -> Iterator[Run]:
 
 @pytest.fixture
 def run(afspm_run: Run, tmp_path: Path) -> Run:
-    """Starts `afspm run` of EXPERIMENT, `more` and a second file laid over it, in `where`."""
+    """Start `afspm run` of EXPERIMENT with the addition `more` and an overlay, in `where`."""
 
     def start(
         *options: str,

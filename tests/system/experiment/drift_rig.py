@@ -1,4 +1,4 @@
-"""Experiments under a Drift Compensated Scheduler, and what was true of them."""
+"""Experiments under a Drift Compensated Scheduler, with the simulated truth."""
 
 from __future__ import annotations
 
@@ -119,12 +119,12 @@ class Fails(Drifts):
 
 @dataclass
 class Surveyed:
-    """Where things were, in m; the sample's coordinates are the tip's in the middle of the first scan.
+    """Published and true places, in m; sample coordinates equal the tip's in the middle of the first scan.
 
     Attributes:
-        said_m, true_m: (n, 2) centres of the scans as they were published, and as they were.
-        corners_said_m, corners_true_m: (n, 4, 2) the same of their corners.
-        spectra_said_m, spectra_true_m: the same of the spectra.
+        said_m, true_m: (n, 2) published and true centres of the scans.
+        corners_said_m, corners_true_m: (n, 4, 2) the same for their corners.
+        spectra_said_m, spectra_true_m: the same for the spectra.
         drift_m: (n, 2) of the sample under the centres of the scans.
     """
 
@@ -139,9 +139,10 @@ class Surveyed:
 
 @dataclass(frozen=True)
 class Lay:
-    """How the sample lay under the tip, by truth.jsonl: x_tip = about + turn * (x_sample - about) + drift, as x + iy.
+    """True place of the sample under the tip, by truth.jsonl: x_tip = about + turn * (x_sample - about) + drift, as x +
+    iy.
 
-    The drift is less what the controller follows by itself.
+    The drift excludes the part that the controller compensates itself.
     """
 
     about_m: complex
@@ -150,7 +151,7 @@ class Lay:
 
     @classmethod
     def of(cls, event: dict[str, Any]) -> Lay:
-        """In the middle of a scan, or at the end of a spectrum."""
+        """Return it for the middle of a scan, or the end of a spectrum."""
         if "scan" in event:
             scan = event["scan"]
             start, end = (
@@ -167,7 +168,7 @@ class Lay:
         return cls(complex(*turn["about_m"]), cmath.rect(turn["scale"], turn["angle_rad"]), complex(*seen_m[:2]))
 
     def to_tip_of(self, first: Lay, xy_m: np.ndarray) -> np.ndarray:
-        """Where in the tip coordinates of a first scan is what is at positions (..., 2) now."""
+        """Return the tip coordinates, at the time of the first scan, of features at positions (..., 2) now."""
         x_m, y_m = np.moveaxis(np.asarray(xy_m), -1, 0)
         on_sample = self.about_m + (x_m + 1j * y_m - self.about_m - self.drift_m) / self.turn
         at_first = first.about_m + first.turn * (on_sample - first.about_m) + first.drift_m
@@ -175,7 +176,7 @@ class Lay:
 
 
 def surveyed(run: AfspmRun) -> Surveyed:
-    """What the surveyor was told, beside the truth."""
+    """Return the places published for the surveyor's scans, and the true ones."""
     noted = [json.loads(line) for line in (run.folder / "surveyed.jsonl").read_text().splitlines()]
     events = [json.loads(line) for line in (run.folder / "truth.jsonl").read_text().splitlines()]
     lay = {event["file"]: Lay.of(event) for event in events if "file" in event}
@@ -199,13 +200,13 @@ def surveyed(run: AfspmRun) -> Surveyed:
 
 
 def table(run: AfspmRun) -> list[dict[str, str]]:
-    """The rows of drift_correction.csv."""
+    """Return the rows of drift_correction.csv."""
     with (run.folder / "drift_correction.csv").open(newline="") as file:
         return list(csv.DictReader(file))
 
 
 def worker_of(run: AfspmRun) -> int:
-    """The process id of the scheduler's worker."""
+    """Return the process id of the scheduler's worker."""
     scheduler = run.pid("scheduler")
     children = Path(f"/proc/{scheduler}/task/{scheduler}/children")
     if not children.exists():
@@ -217,7 +218,7 @@ def worker_of(run: AfspmRun) -> int:
 
 
 class Rig:
-    """Starts experiments in a folder, and kills them in the end."""
+    """Starts experiments in a folder, and kills them after the test."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -231,7 +232,7 @@ class Rig:
         sample: str = "velocity_m_per_s = [0.25e-9, -0.15e-9, 0.0]",
         pause_s: float = 180.0,
     ) -> AfspmRun:
-        """What a busy computer is late by, in real time, the sample has drifted on by at the speed of the clock."""
+        """Start an experiment. While processes are late on a busy computer, the sample drifts on with the clock."""
         (self._folder / "surveyor.py").write_text(SURVEYOR, encoding="utf-8")
         settings = {"drift": drift, "scans": scans, "speed": speed, "sample": sample, "pause_s": pause_s}
         file = self._folder / "experiment.toml"

@@ -1,4 +1,4 @@
-"""What the tests of whole experiments share: `afspm run` as a process of its own, and what it leaves behind."""
+"""Shared by tests of whole experiments: `afspm run` as a process of its own, and its run folder."""
 
 from __future__ import annotations
 
@@ -112,20 +112,20 @@ class Late(Component):
 
 
 class AfspmRun(AfspmProcess):
-    """`afspm run` at work, and what it leaves behind."""
+    """A running `afspm run`, and its run folder."""
 
     def facts(self) -> dict[str, Any]:
         facts: dict[str, Any] = json.loads((self.folder / "run.json").read_text(encoding="utf-8"))
         return facts
 
     def witnessed(self) -> Counter[tuple[str, ...]]:
-        """Each (channel, time, file) that the witness got, with how often."""
+        """Return each (channel, time, file) that the witness received, with its number of times."""
         text = (self.folder / "witnessed.txt").read_text(encoding="utf-8")
         return Counter(tuple(line.split("|")) for line in text.splitlines())
 
 
 def require_each_row_once(run: AfspmRun, scans: int) -> None:
-    """The table of measurements has one row for each channel of each scan."""
+    """Require one row of the table of measurements for each channel of each scan."""
     with (run.folder / "metadata.csv").open(encoding="utf-8", newline="") as file:
         measured = [row for row in csv.DictReader(file) if row["measurement"] != "note"]
     rows = Counter((row["channel"], row["time"]) for row in measured)
@@ -134,7 +134,7 @@ def require_each_row_once(run: AfspmRun, scans: int) -> None:
 
 
 def require_each_once(run: AfspmRun, scans: int) -> None:
-    """Every scan asked for was measured once, saved once, and seen once by a subscriber."""
+    """Require that every requested scan was measured, saved, and received by a subscriber once."""
     saved = sorted(file.name for file in (run.folder / "scans").glob("scan-*.nc"))
     seen = run.witnessed()
     channels = {channel for channel, _, _ in seen}
@@ -147,7 +147,7 @@ def require_each_once(run: AfspmRun, scans: int) -> None:
 
 
 def require_recorded_once(folder: Path, channels: set[str], saved: list[str], told: str = "") -> None:
-    """Every scan is in the record once, with all its channels, and its file there is the only one."""
+    """Require every scan in the record once, with all its channels and one file."""
     with afspm.open_run(folder) as record:
         rows = record.scans.where(lambda row: not row.interrupted)
         assert [Path(row.filename).name for row in rows] == saved, told

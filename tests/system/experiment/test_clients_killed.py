@@ -1,4 +1,4 @@
-"""Clients in other languages take a keyed scan once, whatever is killed meanwhile; `make test-clients` builds them."""
+"""Clients in other languages take a keyed scan once, whichever process is killed; `make test-clients` builds them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SLOWER = '[clock]\nspeed = 60.0\n[microscope]\ninitial = { scan-speed = "0.5 um/
 
 
 def wait_until_it_scans(folder: Path) -> None:
-    """Look on until a scan is under way."""
+    """Wait until a scan is under way."""
     with afspm.connect(folder, "onlooker") as scope:
         assert scope.wait_until(lambda: scope.state is ScopeState.SCANNING, timeout_s=DEADLINE_S)
 

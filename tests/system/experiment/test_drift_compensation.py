@@ -1,4 +1,4 @@
-"""Real processes on a sample that drifts: who thinks in sample coordinates sees it stand still."""
+"""Real processes on a drifting sample: components in sample coordinates see it stand still."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def require_it_stood_still(found: Surveyed, scans: int) -> None:
     assert (away_m(found.spectra_true_m[2:], np.array([0.2e-6, 0.1e-6])) < PLACED_M).all(), found
 
 
-def test_a_sample_that_drifts_stands_still_for_components(rig: Rig) -> None:
+def test_components_see_a_drifting_sample_stand_still(rig: Rig) -> None:
     run = rig.start('rescan = { rule = "never" }', scans=5)
     assert run.end() == 0, run.output
     require_it_stood_still(surveyed(run), 5)
@@ -52,7 +52,7 @@ def test_a_sample_that_drifts_stands_still_for_components(rig: Rig) -> None:
     np.testing.assert_allclose(rate, [0.25e-9, -0.15e-9], atol=0.02e-9)
 
 
-def test_killed_in_the_middle_the_scheduler_and_its_worker_know_where_the_sample_is(rig: Rig) -> None:
+def test_scheduler_and_worker_keep_the_drift_mapping_over_a_kill(rig: Rig) -> None:
     run = rig.start('rescan = { rule = "never" }', scans=5)
     run.wait_for("surveyor .*round 1 is done")
     kill(worker_of(run))
@@ -63,10 +63,10 @@ def test_killed_in_the_middle_the_scheduler_and_its_worker_know_where_the_sample
     require_it_stood_still(surveyed(run), 5)
     rows = table(run)
     assert [row["matched"] for row in rows] == ["yes"] * len(rows), rows
-    assert len({row["filename"] for row in rows}) == len(rows)  # no scan was told twice
+    assert len({row["filename"] for row in rows}) == len(rows)  # no scan was published twice
 
 
-def test_without_correction_drift_is_told_and_seen(rig: Rig) -> None:
+def test_drift_is_visible_without_correction(rig: Rig) -> None:
     run = rig.start("correct = false", scans=3, speed=QUICK)
     assert run.end() == 0, run.output
     found = surveyed(run)
@@ -77,7 +77,7 @@ def test_without_correction_drift_is_told_and_seen(rig: Rig) -> None:
     assert {row["correcting"] for row in rows} == {"no"}
 
 
-def test_at_the_start_a_scan_up_and_one_down_tell_the_velocity(rig: Rig) -> None:
+def test_first_scans_up_and_down_give_the_drift_velocity(rig: Rig) -> None:
     run = rig.start('rescan = { rule = "never" }', scans=3)
     assert run.end() == 0, run.output
     run.wait_for("rescanner is in control to solve thermal-drift")
@@ -88,7 +88,7 @@ def test_at_the_start_a_scan_up_and_one_down_tell_the_velocity(rig: Rig) -> None
     assert len(table(run)) == 4
 
 
-def test_a_scan_that_lies_too_far_off_is_taken_again(rig: Rig) -> None:
+def test_scan_with_too_large_an_offset_is_repeated(rig: Rig) -> None:
     run = rig.start('at_start = "nothing", rescan = { tolerance = "40 nm" }', scans=2)
     assert run.end() == 0, run.output
     run.wait_for("rescanner .*the same region again: it is .* nm off")
@@ -100,7 +100,7 @@ def test_a_scan_that_lies_too_far_off_is_taken_again(rig: Rig) -> None:
     assert away_m(*np.array(misplaced)[:, None])[0] < PLACED_M
 
 
-def test_a_controller_that_is_given_the_rate_keeps_the_tip_on_the_sample_by_itself(rig: Rig) -> None:
+def test_controller_with_the_drift_rate_compensates_by_itself(rig: Rig) -> None:
     rates = 'compensate = { x = "x-drift-rate-x", y = "x-drift-rate-y" }'
     run = rig.start(f'{rates}, rescan = {{ rule = "never" }}', scans=6)
     assert run.end() == 0, run.output
@@ -112,7 +112,7 @@ def test_a_controller_that_is_given_the_rate_keeps_the_tip_on_the_sample_by_itse
     assert (away_m(found.drift_m[5:], found.drift_m[4:5]) < 10e-9).all(), found
 
 
-def test_a_user_s_own_estimator_that_fails_or_hangs_costs_no_scan(rig: Rig) -> None:
+def test_failing_or_hanging_user_estimator_loses_no_scan(rig: Rig) -> None:
     # long enough for a busy computer to start a worker, and short enough on the sample to go on as predicted
     options = (
         'estimator = "surveyor.Fails", longest_registration = "9 s", rescan = { rule = "never" }, at_start = "nothing"'
@@ -132,8 +132,8 @@ def test_a_user_s_own_estimator_that_fails_or_hangs_costs_no_scan(rig: Rig) -> N
 
 
 @pytest.mark.parametrize("transform", ["translation", "similarity"])
-def test_on_a_sample_that_turns_and_expands_a_similarity_keeps_corners_in_place(rig: Rig, transform: str) -> None:
-    """It turns about a place two frames away. Where a frame is placed lags by one interval; what is known does not."""
+def test_similarity_keeps_corners_in_place_on_a_rotating_and_expanding_sample(rig: Rig, transform: str) -> None:
+    """It rotates about a place two frames away. The placing of a frame lags by one interval; the mapping does not."""
     tracker = f'{{ class = "bank", transform = "{transform}", compared = 2 }}'
     sample = "rotation_rad_per_s = 1.8e-6, expansion_per_s = 0.7e-6, about_m = [-1.6e-6, -1.2e-6]"
     options = f'tracker = {tracker}, rescan = {{ rule = "never" }}'

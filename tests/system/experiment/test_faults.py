@@ -1,4 +1,4 @@
-"""Processes of a running experiment are killed and frozen, and it ends complete all the same."""
+"""Processes of a running experiment are killed and frozen, and its results are complete."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ test_center = ["0 um", "4 um"]
 component = true
 class = "Metadata"
 """
-# where the processor time of others is not told, a frozen step is known by its declared longest time alone
+# without the processor time of other processes a frozen step is detected by its limit alone
 FROZEN = "no heartbeat|it is frozen" if sys.platform == "win32" else "no heartbeat"
 # the series last: what else is still being restarted has caught up when it has taken its last scan
 EACH = ("recorder", "metadata", "tip_classifier", "tip_corrector", "microscope", "scheduler", "series")
 
 
-def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run) -> None:
+def test_each_scan_is_taken_once_when_each_process_is_killed_in_turn(run: Run) -> None:
     """While scanning, and between scans."""
     one = run(more=MORE + QUICK, scans=40)
     one.wait_for("scan 1 of 40")
@@ -55,7 +55,7 @@ def test_each_process_is_killed_in_turn_and_every_scan_is_there_once(run: Run) -
         one.wait_for(f"{name} was restarted twice")
 
 
-def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> None:
+def test_each_scan_is_taken_once_when_a_frozen_process_is_replaced(run: Run) -> None:
     one = run(more=QUICK, scans=10)
     one.wait_for("scan 2 of 10")
     for name in ("microscope", "scheduler", "series"):
@@ -67,7 +67,7 @@ def test_a_frozen_process_is_replaced_and_every_scan_is_there_once(run: Run) -> 
     require_each_once(one, 10)
 
 
-def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Run) -> None:
+def test_each_scan_is_taken_once_when_all_processes_are_killed_at_once(run: Run) -> None:
     one = run(more=MORE + QUICK, scans=5)
     one.wait_for("scan 2 of 5")
     one.wait_for_next(" witness ", "state SCANNING")
@@ -78,7 +78,7 @@ def test_all_but_the_witness_killed_at_once_and_every_scan_is_there_once(run: Ru
     require_each_row_once(one, 5)
 
 
-def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) -> None:
+def test_process_that_dies_or_freezes_at_the_end_is_restarted_to_finish(run: Run) -> None:
     faults = {"dies": AfspmRun.kill, "freezes": AfspmRun.freeze}
     finishers = (f'[{name}]\ncomponent = true\nclass = "witness.Finisher"\n' for name in faults)
     one = run(more=QUICK + "".join(finishers))
@@ -95,10 +95,8 @@ def test_what_dies_or_freezes_at_the_end_is_started_again_to_finish(run: Run) ->
     require_each_once(one, 4)
 
 
-def test_what_freezes_over_the_last_scan_still_gets_it_when_it_is_started_again_after_the_end(
-    run: Run, tmp_path: Path
-) -> None:
-    """With the settings that everybody has: the scheduler is to be there longer than it takes to find it frozen."""
+def test_process_frozen_at_the_last_scan_receives_that_scan_after_its_restart(run: Run, tmp_path: Path) -> None:
+    """With default settings: the scheduler must stay longer than it takes to detect a frozen process."""
     more = f"""
 [late]
 component = true
@@ -112,7 +110,7 @@ begun = '{tmp_path / "late has begun.txt"}'
     assert (one.folder / "late has them all.txt").exists(), one.output
 
 
-def test_a_component_that_always_crashes_does_not_keep_the_rest_from_ending(run: Run) -> None:
+def test_experiment_ends_although_a_component_always_crashes(run: Run) -> None:
     more = """
 [hopeless]
 component = true
@@ -141,7 +139,7 @@ class Survey(Component):
 
 
 @can_interrupt
-def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run, tmp_path: Path) -> None:
+def test_script_with_the_same_fault_twice_is_not_restarted_again(run: Run, tmp_path: Path) -> None:
     (tmp_path / "survey.py").write_text(SURVEY, encoding="utf-8")
     one = run(more='[survey]\ncomponent = true\nclass = "survey.Survey"\n', scans=1000)
     one.wait_for(
@@ -157,7 +155,7 @@ def test_a_script_that_fails_twice_alike_does_not_measure_a_third_time(run: Run,
     one.end()
 
 
-def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
+def test_run_without_a_translator_ends_and_logs_why(run: Run) -> None:
     one: AfspmRun = run(more="[restart]\nbudget = 0\n", scans=1000)
     one.wait_for("scan 1 of 1000")
     one.kill("microscope")
@@ -166,7 +164,7 @@ def test_without_a_microscope_the_run_ends_and_says_so(run: Run) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
-def test_an_experiment_whose_disk_hangs_is_steered_and_ended(
+def test_experiment_with_a_hanging_disk_can_be_steered_and_ended(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     runs, hook = tmp_path / "runs", Path(__file__).parents[2] / "support" / "hanging_disk"

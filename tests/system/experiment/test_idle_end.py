@@ -1,4 +1,4 @@
-"""A run in which nothing that acts is left ends, with an exit code of its own."""
+"""A run without any plan left ends, with an exit code of its own."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def notified(file: Path) -> list[str]:
     return [json.loads(line)["what"] for line in file.read_text(encoding="utf-8").splitlines()]
 
 
-def test_a_run_whose_series_is_done_ends_as_if_it_had_been_ended(run: Run, tmp_path: Path) -> None:
+def test_run_with_a_finished_series_ends_like_an_announced_end(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     calls = tmp_path / "calls.jsonl"
     one: AfspmRun = run("--without", "witness", more=DRAWN + NOTIFY.format(file=str(calls)), scans=2)
@@ -48,7 +48,7 @@ def test_a_run_whose_series_is_done_ends_as_if_it_had_been_ended(run: Run, tmp_p
     assert not re.search(r"(ERROR|CRITICAL) ", one.output), one.output
 
 
-def test_a_run_whose_only_plan_was_given_up_ends_and_is_resumed(run: Run, afspm_run: Run, tmp_path: Path) -> None:
+def test_run_with_its_only_plan_given_up_ends_and_can_be_resumed(run: Run, afspm_run: Run, tmp_path: Path) -> None:
     (tmp_path / "rough.py").write_text(ROUGH, encoding="utf-8")
     calls = tmp_path / "calls.jsonl"
     over = '[series]\nclass = "rough.Rough"\n' + NOTIFY.format(file=str(calls))

@@ -1,4 +1,4 @@
-"""Without keys in the file each process has its own all the same: roles hold on one computer."""
+"""Each process has keys of its own even if the file has none: roles hold on one computer."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ end_experiment = ["witness"]
 """
 
 
-def test_a_component_without_the_role_can_not_take_the_name_of_one_that_has_it(run: Run, tmp_path: Any) -> None:
+def test_component_without_a_role_can_not_take_the_name_of_one_with_the_role(run: Run, tmp_path: Any) -> None:
     (tmp_path / "thief.py").write_text(THIEF, encoding="utf-8")
     one = run(more=MORE)
     for claimed in ("witness", "terminal"):
@@ -68,7 +68,7 @@ def test_a_component_without_the_role_can_not_take_the_name_of_one_that_has_it(r
 
 
 @pytest.mark.parametrize("open_to_all", [False, True])
-def test_a_program_without_keys_joins_where_the_file_says_so(run: Run, open_to_all: bool) -> None:
+def test_program_without_keys_joins_if_the_file_allows_it(run: Run, open_to_all: bool) -> None:
     one = run(scans=1000, more="[security]\ninsecure = true\n" if open_to_all else "")
     one.wait_for("scan 1 of 1000")
     control = guest_of(one.folder, "bare").sockets.control

@@ -1,4 +1,4 @@
-"""A simulated night on a slow computer: nothing that it was to show is lost, since its clock waits."""
+"""A simulated night on a slow computer loses nothing, since its clock waits."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ end_when_done = true
 
 
 @pytest.mark.parametrize("waits", [True, False])
-def test_scans_are_missed_only_where_the_clock_does_not_wait(afspm_run: Run, tmp_path: Path, waits: bool) -> None:
+def test_scans_are_missed_only_if_the_clock_does_not_wait(afspm_run: Run, tmp_path: Path, waits: bool) -> None:
     file = tmp_path / "night.toml"
     file.write_text(NIGHT.format(waits=str(waits).lower()), encoding="utf-8")
     one = afspm_run(str(file), "--runs", str(tmp_path / "runs"))
@@ -76,7 +76,7 @@ class Judge(Component):
 """
 
 
-def test_a_tip_change_that_is_seen_after_the_end_is_in_the_report(afspm_run: Run, tmp_path: Path) -> None:
+def test_tip_change_detected_after_the_end_is_in_the_report(afspm_run: Run, tmp_path: Path) -> None:
     (tmp_path / "judge.py").write_text(JUDGE, encoding="utf-8")
     file = tmp_path / "night.toml"
     file.write_text(JUDGED.format(waits="true"), encoding="utf-8")

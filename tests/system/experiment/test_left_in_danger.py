@@ -1,5 +1,4 @@
-"""A component dies with the feedback off, or the run: the tip is retracted, and nobody measures until somebody has seen
-to it."""
+"""A component, or the run, dies with the feedback off: the tip is retracted, and measurements wait for a person."""
 
 from __future__ import annotations
 
@@ -77,11 +76,11 @@ RETRACTED = "the feedback off: the tip was retracted"
 
 
 def engaged(run: AfspmRun) -> bool:
-    """Whether the translator left the tip at the surface."""
+    """Return whether the translator left the tip at the surface."""
     return bool(Memory(run.folder / "state" / "microscope.json")["microscope"]["values"]["x-engaged"])
 
 
-def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_it_was_seen_to(
+def test_tip_left_in_danger_is_retracted_and_blocks_measurements_until_cleared(
     run: Callable[..., AfspmRun], tmp_path: Path
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
@@ -101,7 +100,7 @@ def test_a_tip_that_was_left_in_danger_is_retracted_and_nobody_measures_before_i
 
 
 @pytest.mark.parametrize(("killed", "retract"), [pytest.param(False, False, marks=can_interrupt), (True, True)])
-def test_when_a_run_ends_with_the_feedback_off_the_tip_is_retracted_unless_the_file_says_otherwise(
+def test_tip_is_retracted_at_an_end_with_feedback_off_unless_the_file_forbids_it(
     run: Callable[..., AfspmRun], tmp_path: Path, killed: bool, retract: bool
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")
@@ -114,13 +113,13 @@ def test_when_a_run_ends_with_the_feedback_off_the_tip_is_retracted_unless_the_f
         interrupt(one.process)
     wait_until_gone(translator, 10.0)
     assert engaged(one) is not retract
-    if not killed:  # there is nobody any more to tell it to
+    if not killed:  # no scheduler is left for the report
         assert one.end() == 130, one.output
         assert RETRACTED not in one.output
 
 
 @can_interrupt
-def test_with_the_tip_retracted_by_ctrl_c_a_run_is_resumed_when_that_was_seen_to(
+def test_run_with_the_tip_retracted_by_ctrl_c_resumes_once_the_flag_is_cleared(
     run: Callable[..., AfspmRun], afspm_run: Callable[..., AfspmRun], tmp_path: Path
 ) -> None:
     (tmp_path / "danger.py").write_text(MODULE, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Requests that are sent without waiting for answers, through real processes: the tip stays in `[limits] region`."""
+"""Requests sent without waiting for answers, through real processes: the tip stays in `[limits] region`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A controller crashes in the middle of a scan: that is a malfunction, and the night goes on when it is back."""
+"""A controller crashes during a scan: a malfunction is flagged, and the night goes on after its return."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ history = {{ Scan2d = 20 }}
 
 @pytest.fixture(params=TIMED)
 def run(request: pytest.FixtureRequest, tmp_path: Path, stranger: Any) -> Iterator[AfspmRun]:
-    """The file names a controller that is not this run's emulator, and that must not hear of it."""
+    """The file also names a controller outside this run, which must receive nothing."""
     (tmp_path / "witness.py").write_text(WITNESS, encoding="utf-8")
     address = MAKERS[request.param].address.format(port=stranger.port)
     (tmp_path / "overlay.toml").write_text(OVERLAY.format(address=address), encoding="utf-8")
@@ -54,7 +54,7 @@ def run(request: pytest.FixtureRequest, tmp_path: Path, stranger: Any) -> Iterat
     one.close()
 
 
-def test_a_controller_that_is_killed_while_it_scans_is_a_malfunction_until_it_is_back(run: AfspmRun) -> None:
+def test_controller_killed_during_a_scan_is_a_malfunction_until_its_return(run: AfspmRun) -> None:
     run.wait_for("details .*scan 1 of 3 at")
     run.wait_for_next(" witness ", "state SCANNING")
     cleared_before = run.output.count("cleared device-malfunction")

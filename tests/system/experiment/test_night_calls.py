@@ -1,4 +1,4 @@
-"""A whole experiment calls when it needs somebody, tells of its end, and leaves its report."""
+"""A whole experiment sends notifications of problems and of its end, and leaves its report."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Flags(Component):
 
 @pytest.fixture
 def hook(monkeypatch: pytest.MonkeyPatch) -> Iterator[queue.Queue[dict[str, Any]]]:
-    """What is posted to the webhook."""
+    """Bodies of POST requests to the webhook."""
     posted: queue.Queue[dict[str, Any]] = queue.Queue()
 
     class Handler(BaseHTTPRequestHandler):
@@ -75,7 +75,9 @@ def hook(monkeypatch: pytest.MonkeyPatch) -> Iterator[queue.Queue[dict[str, Any]
     server.server_close()
 
 
-def test_people_are_called_and_find_a_report(run: Run, tmp_path: Path, hook: queue.Queue[dict[str, Any]]) -> None:
+def test_notification_arrives_and_leads_to_a_report(
+    run: Run, tmp_path: Path, hook: queue.Queue[dict[str, Any]]
+) -> None:
     (tmp_path / "trouble.py").write_text(TROUBLE, encoding="utf-8")
     one = run("--report", more=MORE)
     called = {(notice := hook.get(timeout=DEADLINE_S))["what"]: notice for _ in range(2)}

@@ -1,4 +1,4 @@
-"""`afspm run`: an experiment from its file to its folder, and how it is stopped."""
+"""`afspm run`: an experiment from its file to its folder, and how to stop it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_an_experiment_ends_by_itself_and_leaves_its_folder(run: Run, tmp_path: 
     assert (folder / "journal.sqlite").is_file()
 
 
-def test_errors_in_the_file_are_told_and_nothing_starts(run: Run, tmp_path: Path) -> None:
+def test_file_with_errors_starts_nothing_and_prints_them(run: Run, tmp_path: Path) -> None:
     one = run(more="[another]\ncomponent = true\nclass = 'ScanSerie'\n")
     assert one.end() == 1
     one.wait_for(r"experiment.toml:\d+: error", "'ScanSerie'")
@@ -41,21 +41,21 @@ def test_errors_in_the_file_are_told_and_nothing_starts(run: Run, tmp_path: Path
     assert not (tmp_path / "runs").exists()
 
 
-def test_an_unknown_name_is_told_and_nothing_starts(run: Run, tmp_path: Path) -> None:
+def test_unknown_process_name_starts_nothing_and_is_printed(run: Run, tmp_path: Path) -> None:
     one = run("--without", "witnes")
     assert one.end() == 1
     one.wait_for("witness")
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_dry_run_says_what_it_would_start(run: Run, tmp_path: Path) -> None:
+def test_dry_run_lists_the_processes_to_start(run: Run, tmp_path: Path) -> None:
     one = run("--dry-run", "--without", "witness,series")
     assert one.end() == 0
     assert [line.split(" ")[0] for line in one.lines if "(" in line] == ["microscope", "scheduler", "recorder"]
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_problem_ends_the_experiment_where_the_file_says_so(run: Run) -> None:
+def test_problem_in_end_on_ends_the_experiment(run: Run) -> None:
     one = run(more='[control]\nend_on = ["tip-shape-changed"]\n', scans=1000)
     one.wait_for("scan 1 of 1000")
     with afspm.connect(one.folder, "person") as scope, suppress(ExperimentEnded):  # which may come before the answer
@@ -111,9 +111,7 @@ def test_an_experiment_can_be_started_in_two_parts(run: Run) -> None:
     assert decides.facts()["clock"] == acts.facts()["clock"], "each part has a time of its own"
 
 
-def test_the_second_file_wins_and_modules_beside_the_file_are_meant_not_those_where_it_was_started(
-    run: Run, tmp_path: Path
-) -> None:
+def test_overlay_wins_and_modules_beside_the_file_win_over_the_working_directory(run: Run, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     for name in ("witness", "queue"):  # one of the experiment's, one that Python itself needs
@@ -125,7 +123,7 @@ def test_the_second_file_wins_and_modules_beside_the_file_are_meant_not_those_wh
 
 @can_interrupt
 def test_ctrl_c_ends_all_cleanly(run: Run) -> None:
-    """How long that takes, the benchmarks say."""
+    """The benchmarks measure how long that takes."""
     one = run(scans=1000)
     one.wait_for("scan 1 of 1000")
     interrupt(one.process)

@@ -1,6 +1,6 @@
-"""Every sample runs as it is, to its end; here with fewer pixels and less to do.
+"""Every sample runs unchanged to its end; here with fewer pixels and scans.
 
-Those of tip repair and of the makers' controllers run elsewhere.
+The samples of tip repair and of makers' controllers run in other tests.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ SAYS = {
 
 
 def to_its_end(afspm_run: Run, tmp_path: Path, files: tuple[str, ...], quicker: str, *options: str) -> AfspmRun:
-    """Run a sample, at free ports, with less to do; it ends without an error."""
+    """Run a reduced sample at free ports; it ends without an error."""
     samples, second, ports = [EXPERIMENTS / file for file in files], tmp_path / "quicker.toml", FreePorts()
     used = ADDRESS.findall(samples[0].read_text(encoding="utf-8"))
     second.write_text("".join(f'{use} = "{ports.address()}"\n' for use in used) + quicker, encoding="utf-8")
@@ -94,7 +94,7 @@ SHORT_SERIES = '[experiment]\nevery = "6 min"\nscans = 7\n'
     ],
     ids=["drift_night", "drift_night-paper", "published"],
 )
-def test_a_night_of_drift_runs_and_the_frame_follows_the_sample(
+def test_drift_night_runs_and_its_frame_follows_the_sample(
     afspm_run: Run, tmp_path: Path, files: tuple[str, ...], quicker: str
 ) -> None:
     if "drift_night/paper.toml" in files:

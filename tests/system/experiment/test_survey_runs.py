@@ -1,4 +1,4 @@
-"""A survey of particles through real processes: killed, resumed, kept waiting by a problem, on a sample that drifts."""
+"""A survey of particles through real processes: killed, resumed, delayed by a problem, on a drifting sample."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FEWER = """
 count = 4
 zoom_pixels = [64, 64]
 """
-# what is killed and started again must not cost so much simulated time that the sample has drifted away
+# a restart must not take so much simulated time that the sample drifts away
 SLOWER = "[clock]\nspeed = 100.0\n[microscope]\ndrift = { velocity_m_per_s = [5e-12, -3e-12, 0.0] }\n"
 BY_HAND = '[control]\nsolved_by_hand = ["tip-shape-changed", "device-malfunction"]\n'
 FAST_DRIFT = "[microscope]\ndrift = { velocity_m_per_s = [150e-12, -100e-12, 0.0] }\n"
@@ -45,7 +45,7 @@ def outcomes(folder: Path) -> list[str]:
 
 
 def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
-    """The survey, each zoom and each curve was taken once, and the table and the picture are there."""
+    """Require the survey, each zoom and each curve once, the table and the picture."""
     with afspm.open_run(one.folder) as record:
         scans = [row for row in record.scans if not row.interrupted and row.holder != "rescanner"]
         spectra = list(record.spectra)
@@ -53,14 +53,16 @@ def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
     wanted = ["survey", *(f"zoom-{number}" for number in numbers)]
     wanted += [f"curve-{name}-{number}" for name in ("top", "beside") for number in numbers]
     assert (len(scans), len(spectra)) == (1 + targets, 2 * targets), said or one.output
-    keys = Counter(row.key for row in [*scans, *spectra] if row.key)  # that of the last before a kill may be lost
+    keys = Counter(
+        row.key for row in [*scans, *spectra] if row.key
+    )  # the key of the last one before a kill may be lost
     assert set(keys) <= set(wanted)
     assert set(keys.values()) == {1}, one.output
     assert outcomes(one.folder) == ["measured"] * targets
     assert (one.folder / "targets.png").stat().st_size > 50_000
 
 
-def test_killed_and_kept_waiting_by_a_changed_tip_it_measures_each_target_once(afspm_run: Run, tmp_path: Path) -> None:
+def test_survey_measures_each_target_once_over_kills_and_tip_repairs(afspm_run: Run, tmp_path: Path) -> None:
     one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + BY_HAND), "--runs", str(tmp_path / "runs"))
     one.wait_for("survey .*4 targets found")
     one.kill("survey")
@@ -77,7 +79,7 @@ def test_killed_and_kept_waiting_by_a_changed_tip_it_measures_each_target_once(a
     require_each_once(one, 4)
 
 
-def test_a_killed_run_is_resumed_and_measures_only_what_is_left(afspm_run: Run, tmp_path: Path) -> None:
+def test_resumed_survey_measures_only_the_remaining_targets(afspm_run: Run, tmp_path: Path) -> None:
     first = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER), "--runs", str(tmp_path / "runs"))
     first.wait_for("target 2 of 4 .*measured")
     first.process.kill()
@@ -104,7 +106,7 @@ def test_targets_stay_in_the_middle_of_their_zooms_while_the_sample_drifts(afspm
     assert not re.search(" ERROR ", one.output), one.output
 
 
-def test_the_script_of_the_tutorial_does_the_same_in_under_thirty_lines(afspm_run: Run, tmp_path: Path) -> None:
+def test_tutorial_script_does_the_same_in_under_thirty_lines(afspm_run: Run, tmp_path: Path) -> None:
     (script,) = re.findall(r"```python\n(# by_hand.py\n.*?)```", TUTORIAL.read_text(encoding="utf-8"), re.DOTALL)
     assert script.count("\n") < 30
     (tmp_path / "by_hand.py").write_text(script.replace("(wide, 10,", "(wide, 2,"), encoding="utf-8")
@@ -123,7 +125,7 @@ def test_the_script_of_the_tutorial_does_the_same_in_under_thirty_lines(afspm_ru
         assert own == ["survey", "zoom-1", "zoom-2"]
 
 
-def test_zooms_outside_the_limits_are_told_as_refused_and_an_early_end_leaves_table_and_picture(
+def test_zooms_outside_limits_are_refused_in_the_table_and_an_early_end_leaves_table_and_picture(
     afspm_run: Run, tmp_path: Path
 ) -> None:
     narrow = '[limits]\nregion = { x = ["-2.5 um", "2.5 um"], y = ["-2.5 um", "2.5 um"] }\n'
@@ -138,7 +140,7 @@ def test_zooms_outside_the_limits_are_told_as_refused_and_an_early_end_leaves_ta
     assert (one.folder / "targets.png").stat().st_size > 50_000
 
 
-def test_when_the_tip_gets_bad_the_survey_ends_with_what_it_has(afspm_run: Run, tmp_path: Path) -> None:
+def test_survey_with_a_bad_tip_ends_with_its_results_so_far(afspm_run: Run, tmp_path: Path) -> None:
     ends = '[control]\nend_on = ["tip-shape-changed"]\n'
     one = afspm_run(str(SAMPLE), overlay(tmp_path, FEWER + SLOWER + ends), "--runs", str(tmp_path / "runs"))
     one.wait_for("target 2 of 4 .*measured")

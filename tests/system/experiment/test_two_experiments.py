@@ -1,4 +1,4 @@
-"""Two experiments with the same addresses: the second starts nothing, and nobody joins the wrong one."""
+"""Two experiments with the same addresses: the second starts nothing, and no component joins the wrong one."""
 
 from __future__ import annotations
 
@@ -31,13 +31,15 @@ def addresses() -> str:
 
 
 def refused(second: AfspmRun) -> str:
-    """What is said by a run that ends without having started anything."""
+    """Return the output of a run that ends without starting a process."""
     assert second.end() == 1
     assert "started, process" not in second.output
     return " ".join(second.output.split())
 
 
-def test_the_second_experiment_ends_at_once_and_says_why_and_the_first_goes_on(run: Run, tmp_path: Path) -> None:
+def test_second_experiment_on_the_same_ports_ends_at_once_and_leaves_the_first_running(
+    run: Run, tmp_path: Path
+) -> None:
     where = addresses()
     first = run(over=where, scans=30)
     first.wait_for("series .*scan 1")
@@ -48,14 +50,14 @@ def test_the_second_experiment_ends_at_once_and_says_why_and_the_first_goes_on(r
     assert set(first.witnessed().values()) == {1}
 
 
-def test_a_port_of_any_other_program_ends_the_run_too(run: Run) -> None:
+def test_port_of_another_program_ends_the_run_too(run: Run) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         over = f'[scheduler]\nrouter = "tcp://127.0.0.1:{other.getsockname()[1]}"\n'
         assert "[scheduler] another program listens at" in refused(run(over=over))
 
 
-def test_who_means_another_run_is_refused_by_this_one(run: Run, tmp_path: Path) -> None:
-    """A notebook whose run has ended finds another experiment at the address that it knows."""
+def test_request_for_another_run_is_refused(run: Run, tmp_path: Path) -> None:
+    """A notebook whose run has ended finds another experiment at the same address."""
     first = run(over=addresses(), scans=6)
     first.wait_for("series .*scan 1")
     facts = first.facts()

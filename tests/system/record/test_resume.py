@@ -172,4 +172,4 @@ def test_resume_at_another_speed_is_refused(tmp_path: Path) -> None:
     process = afspm_run(tmp_path, "--resume", "runs", "--speed", "2")
     told = process.communicate(timeout=DEADLINE_S)[0]
     assert process.returncode != 0
-    assert "a run is resumed as it was begun" in told
+    assert "a run is resumed as it was started" in told

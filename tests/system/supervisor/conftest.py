@@ -18,7 +18,7 @@ from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
 @pytest.fixture
 def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
-    """Starts a supervisor of these tasks; it is stopped after the test."""
+    """Start a supervisor of these tasks; it is stopped after the test."""
     running: list[Running] = []
     logs: list[RunLog] = []
 
@@ -54,7 +54,7 @@ def run_tasks(tmp_path: Path) -> Iterator[RunTasks]:
 
 @pytest.fixture
 def calls() -> Iterator[socket.socket]:
-    """A server that a peer with `call` connects to: the connection is open as long as the peer lives."""
+    """A server for peers with `call`: a connection stays open as long as its peer lives."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(DEADLINE_S)
         yield server

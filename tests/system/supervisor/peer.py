@@ -1,4 +1,4 @@
-"""A process for the tests of the supervisor: it beats as ours do, and behaves as its settings say."""
+"""A process for tests of the supervisor: it sends heartbeats, and behaves as its settings say."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def say(text: str) -> None:
 
 
 def wait_for_a_beat(beats: HeartbeatSender, beats_sent: threading.Semaphore) -> None:
-    """Of those that are heard the first is out when the second is made."""
+    """Wait for two heartbeats: the first has been sent when the second is made."""
     beats.heard.wait()
     while beats_sent.acquire(blocking=False):
         pass
@@ -87,7 +87,7 @@ def wait_for_a_beat(beats: HeartbeatSender, beats_sent: threading.Semaphore) -> 
 
 
 def grip(for_s: float) -> None:
-    """Compute for so long, of processor time, in one call."""
+    """Compute in one call for a span of processor time."""
     began_s = time.process_time()
     sum(range(10**6))
     say("holds on")

@@ -1,4 +1,4 @@
-"""What the tests of the supervisor share."""
+"""Shared by tests of the supervisor."""
 
 from __future__ import annotations
 
@@ -46,13 +46,13 @@ class Terminal(io.TextIOBase):
         return len(text)
 
     def close_for_waiters(self) -> None:
-        """No more lines will come: whoever waits for one need not wait any longer."""
+        """Release all waiters: no more lines will come."""
         with self._written:
             self._over = True
             self._written.notify_all()
 
     def wait_for(self, *wanted: str, count: int = 1) -> str:
-        """The line that has all of `wanted` in it, the `count`-th of that kind; fails after the deadline."""
+        """Return the `count`-th line that has all of `wanted` in it; fail after the deadline."""
 
         def found() -> list[str]:
             return [line for line in self.lines if all(text in line for text in wanted)]
@@ -74,7 +74,7 @@ class Running:
     outcomes: list[RunOutcome] = field(default_factory=list)
 
     def pid(self, name: str, life: int = 1) -> int:
-        """The process id of a task's n-th process."""
+        """Return the process id of a task's n-th process."""
         return int(self.terminal.wait_for(f" {name} ", "started, process", count=life).rsplit(" ", 1)[1])
 
     def stop(self) -> RunOutcome:
@@ -91,6 +91,6 @@ RunTasks = Callable[..., Running]
 
 
 def peer(name: str, role: Role = Role.COMPONENT, **settings: Any) -> Task:
-    """A task that runs peer.py."""
+    """Return a task that runs peer.py."""
     launch = Launch(name=name, settings=settings, beat_period_s=BEAT_S)
     return Task(launch, (sys.executable, str(PEER)), role)

@@ -1,4 +1,4 @@
-"""A child process: its output, its exit and its end are told, whatever it does."""
+"""A child process: output, exit and end are reported in every case."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ def test_the_launch_line_arrives_and_the_answer_comes_back(start: Start, events:
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 0)
 
 
-def test_the_last_words_come_before_the_exit(start: Start, events: Queue[ChildEvent]) -> None:
+def test_last_output_comes_before_the_exit(start: Start, events: Queue[ChildEvent]) -> None:
     child = start("import sys; print('it broke', file=sys.stderr); sys.exit(3)")
     assert events.get(timeout=DEADLINE_S) == OutputLine("child", child.pid, "stderr", "it broke")
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, 3)
 
 
-def test_bytes_that_are_no_text_are_shown_as_well_as_can_be(start: Start, events: Queue[ChildEvent]) -> None:
+def test_invalid_utf8_output_is_shown_with_replacements(start: Start, events: Queue[ChildEvent]) -> None:
     start(r"import sys; sys.stdout.buffer.write(b'caf\xe9\n')")
     printed = events.get(timeout=DEADLINE_S)
     assert isinstance(printed, OutputLine)
@@ -82,7 +82,7 @@ def test_a_child_that_does_not_read_its_launch_line_does_not_block_us(events: Qu
     assert exited.code != 0
 
 
-def test_killing_takes_what_the_child_has_started_along(start: Start, events: Queue[ChildEvent]) -> None:
+def test_killing_a_child_kills_its_own_children(start: Start, events: Queue[ChildEvent]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(DEADLINE_S)
         port = server.getsockname()[1]
@@ -105,7 +105,7 @@ def test_a_frozen_child_can_be_killed(start: Start, events: Queue[ChildEvent]) -
     assert events.get(timeout=DEADLINE_S) == Exited("child", child.pid, KILLED)
 
 
-def test_a_program_that_is_not_there_is_named(events: Queue[ChildEvent]) -> None:
+def test_missing_program_is_named(events: Queue[ChildEvent]) -> None:
     with pytest.raises(AfspmError, match="no-such-program"):
         ChildProcess(Task(Launch("child"), ("no-such-program",)), events.put)
 
@@ -120,7 +120,7 @@ def test_a_child_does_not_hold_the_stdin_of_another_open(start: Start, events: Q
     assert events.get(timeout=DEADLINE_S) == Exited("child", first.pid, 0)
 
 
-def test_output_is_not_held_back(start: Start, events: Queue[ChildEvent]) -> None:
+def test_output_arrives_without_delay(start: Start, events: Queue[ChildEvent]) -> None:
     start("import sys; print('at once'); sys.stdin.read()")
     printed = events.get(timeout=DEADLINE_S)
     assert isinstance(printed, OutputLine)
@@ -128,7 +128,7 @@ def test_output_is_not_held_back(start: Start, events: Queue[ChildEvent]) -> Non
 
 
 @not_on_wine("200,000 writes to a pipe take minutes")
-def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, events: Queue[ChildEvent]) -> None:
+def test_endless_output_of_a_child_is_not_kept_in_memory(start: Start, events: Queue[ChildEvent]) -> None:
     start("for i in range(200_000): print('waiting', i)\nraise SystemExit('no stage')")
     got = [events.get(timeout=DEADLINE_S)]
     while not isinstance(got[-1], Exited):
@@ -141,7 +141,7 @@ def test_a_child_that_prints_without_end_is_not_kept_in_memory(start: Start, eve
     assert left_out + len(printed) == 200_001
 
 
-def test_a_secret_of_others_is_not_in_its_environment(
+def test_child_environment_lacks_secrets_of_other_processes(
     start: Start, events: Queue[ChildEvent], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NIGHT_HOOK", "secret")
@@ -174,7 +174,7 @@ threading.Event().wait()
 
 @pytest.mark.parametrize("what", ["holds", "leaves"])
 def test_nothing_outlives_a_supervisor_that_was_killed(what: str) -> None:
-    """One that holds Python's lock does not see it; one that sees it leaves a child behind."""
+    """One child holds Python's lock and can't see the end; another ends but leaves a child behind."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(DEADLINE_S)
         port = str(server.getsockname()[1])

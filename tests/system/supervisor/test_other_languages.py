@@ -1,4 +1,4 @@
-"""Commands of other languages end with the guard that runs them, however that ends, and so does what they start."""
+"""Commands in other languages, and their children, end with the guard that runs them, however the guard ends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from afspm.basics.launch import Launch
 from afspm.supervisor.process import GUARD, ChildEvent, ChildProcess, Task
 from afspm.supervisor.supervision.supervisor_events import Exited
 
-# a command that listens to nobody, with a child of its own that doesn't either; each calls us for as long as it lives
+# a command that ignores its input, with a child that does, too; each keeps a connection while it lives
 DEAF = "import socket; socket.create_connection(('127.0.0.1', {port})).recv(1)"
 FAMILY = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', {child!r}]); {child}"
 SUPERVISOR = (
@@ -27,7 +27,7 @@ SUPERVISOR = (
 
 
 class Family:
-    """A guarded command and its child, as seen from here: by the connection that each of them holds."""
+    """A guarded command and its child; the connection of each shows that it lives."""
 
     def __init__(self, server: socket.socket) -> None:
         self._server = server
@@ -52,7 +52,7 @@ def family(calls: socket.socket) -> Family:
     return Family(calls)
 
 
-def test_when_the_guard_is_asked_to_end(family: Family) -> None:
+def test_command_ends_when_its_guard_gets_sigterm(family: Family) -> None:
     events: Queue[ChildEvent] = Queue()
     guard = ChildProcess(Task(Launch("foreign"), tuple(family.command)), events.put)
     family.wait_there()
@@ -61,7 +61,7 @@ def test_when_the_guard_is_asked_to_end(family: Family) -> None:
     assert events.get(timeout=DEADLINE_S) == Exited("foreign", guard.pid, 81)
 
 
-def test_when_the_guard_is_killed(family: Family) -> None:
+def test_command_ends_when_its_guard_is_killed(family: Family) -> None:
     events: Queue[ChildEvent] = Queue()
     guard = ChildProcess(Task(Launch("foreign"), tuple(family.command)), events.put)
     family.wait_there()
@@ -71,7 +71,7 @@ def test_when_the_guard_is_killed(family: Family) -> None:
 
 
 @pytest.mark.skipif(WINDOWS, reason="a job object of the real supervisor does that there")
-def test_when_the_supervisor_is_killed(family: Family) -> None:
+def test_command_ends_when_the_supervisor_is_killed(family: Family) -> None:
     code = SUPERVISOR.format(command=family.command)
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE) as supervisor:
         family.wait_there()

@@ -1,4 +1,4 @@
-"""A supervisor that tells a real scheduler how it is with its processes, and carries out its orders."""
+"""A supervisor reports its processes to a real scheduler, and carries out its orders."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Condition = ProcessCondition
 
 
 class Listener:
-    """Hears all that is published of processes, lines and entries, and asks as "dashboard:Ada"."""
+    """Subscribes to process states, log lines and entries, and sends requests as "dashboard:Ada"."""
 
     def __init__(self, network: Network, publish: str, serve: str) -> None:
         envelopes = ["ProcessStates", "LogLines", "JournalEntries"]
@@ -53,7 +53,7 @@ class Listener:
         self._answers: dict[str, Response] = {}
 
     def until(self, condition: Callable[[], Any]) -> Any:
-        """Listen until the condition is true; returns its value."""
+        """Listen until the condition is true, and return its value."""
         deadline_s = CLOCK.monotonic_s() + DEADLINE_S
         while not (value := condition()):
             assert CLOCK.monotonic_s() < deadline_s, f"it did not happen: {self.lines} {self.entries}"
@@ -85,7 +85,7 @@ class Listener:
         return answer
 
     def alive(self, name: str, starts: int) -> ProcessState:
-        """Wait until a process, started so often, is up."""
+        """Wait until the n-th start of a process is alive."""
 
         def found() -> ProcessState | None:
             up = [s for s in self.processes.get(name, []) if s.condition in (Condition.ALIVE, Condition.BUSY)]
@@ -96,7 +96,7 @@ class Listener:
 
 
 class Rig:
-    """A scheduler and two components under a supervisor, and somebody who listens."""
+    """A scheduler and two components under a supervisor, and a listener."""
 
     def __init__(self, folder: Path, run_tasks: RunTasks, *, locked: bool) -> None:
         ports = FreePorts()
@@ -163,7 +163,7 @@ def test_processes_lines_and_refusals_are_published_and_orders_are_carried_out(r
     assert (two.starts, two.ordered) == (2, 1)
 
 
-def test_a_scheduler_that_was_killed_is_told_again_and_has_what_it_had(tmp_path: Path, run_tasks: RunTasks) -> None:
+def test_restarted_scheduler_gets_all_states_again_and_keeps_its_own(tmp_path: Path, run_tasks: RunTasks) -> None:
     rig = Rig(tmp_path, run_tasks, locked=False)
     listener = rig.listener
     try:
@@ -183,7 +183,7 @@ def test_a_scheduler_that_was_killed_is_told_again_and_has_what_it_had(tmp_path:
         listener.port.close()
 
 
-def test_a_supervisor_whose_scheduler_is_not_there_works_and_ends_as_ever(run_tasks: RunTasks) -> None:
+def test_supervisor_works_and_ends_without_a_scheduler(run_tasks: RunTasks) -> None:
     nowhere = Launch("supervisor:lab", sockets=Sockets(control=FreePorts().address()))
     crashing = peer("one", first="crash")
     running = run_tasks(crashing, peer("two"), reporter=Reporter(nowhere, CLOCK, "lab"))
@@ -199,7 +199,7 @@ def test_components_begin_once_their_own_scheduler_has_answered(run_tasks: RunTa
     running = run_tasks(*tasks, reporter=Reporter(asking, CLOCK, "lab"))
     running.terminal.wait_for(" microscope ", "life 1")
     kill(running.pid("microscope"))
-    running.terminal.wait_for(" microscope ", "life 1", count=2)  # whoever was started with it has long had time
+    running.terminal.wait_for(" microscope ", "life 1", count=2)  # all others, started at the same time, are ready
     assert not any(" one " in line and "life 1" in line for line in running.terminal.lines)
     port = ZmqServerPort(Network(), CLOCK, serve=address, publish=None)
     try:
@@ -212,7 +212,7 @@ def test_components_begin_once_their_own_scheduler_has_answered(run_tasks: RunTa
         port.close()
 
 
-def test_a_key_that_is_missing_is_told_and_nothing_else_is_the_matter(tmp_path: Path, run_tasks: RunTasks) -> None:
+def test_missing_key_is_logged_and_disturbs_nothing_else(tmp_path: Path, run_tasks: RunTasks) -> None:
     keys.generate(tmp_path / "keys", ["scheduler"])
     address = FreePorts().address()
     entries = {"folder": str(tmp_path / "keys"), address: "scheduler"}

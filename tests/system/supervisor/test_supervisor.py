@@ -1,4 +1,4 @@
-"""What the supervisor does about real processes that end, crash, freeze, are busy, or don't want to end."""
+"""The supervisor with real processes that end, crash, freeze, are busy, or refuse to end."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ look_only = pytest.mark.skipif(
 )
 
 
-def test_when_all_are_done_the_run_ends_well(run_tasks: RunTasks) -> None:
+def test_run_with_all_processes_done_ends_with_success(run_tasks: RunTasks) -> None:
     outcome = run_tasks(peer("a", first="exit", code=0), peer("b", first="exit", code=0)).outcome()
     assert outcome.why is EndReason.ALL_DONE
     assert outcome.exit_code == 0
     assert [report.starts for report in outcome.reports] == [1, 1]
 
 
-def test_a_crashed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) -> None:
+def test_crashed_process_is_restarted(run_tasks: RunTasks, tmp_path: Path) -> None:
     running = run_tasks(peer("a", first="crash", lives=str(tmp_path / "lives")))
     running.terminal.wait_for(" a ", "ERROR it breaks")
     running.terminal.wait_for(" a ", "life 2")
     assert running.stop().reports[0].starts == 2
 
 
-def test_a_translator_that_ends_without_a_word_has_crashed_whatever_its_exit_code(
+def test_translator_that_ends_unannounced_counts_as_crashed_with_any_exit_code(
     run_tasks: RunTasks, tmp_path: Path
 ) -> None:
     lives = str(tmp_path / "lives")
@@ -47,7 +47,7 @@ def test_a_translator_that_ends_without_a_word_has_crashed_whatever_its_exit_cod
     assert (outcome.why, outcome.reports[0].starts) == (EndReason.STOPPED, 2)
 
 
-def test_a_killed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) -> None:
+def test_killed_process_is_restarted(run_tasks: RunTasks, tmp_path: Path) -> None:
     running = run_tasks(peer("a", lives=str(tmp_path / "lives")))
     running.terminal.wait_for(" a ", "life 1")
     kill(running.pid("a"))
@@ -55,7 +55,7 @@ def test_a_killed_process_is_started_again(run_tasks: RunTasks, tmp_path: Path) 
     running.terminal.wait_for(" a ", "life 2")
 
 
-def test_a_frozen_process_is_killed_and_started_again(run_tasks: RunTasks) -> None:
+def test_frozen_process_is_killed_and_restarted(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("a"))
     running.terminal.wait_for(" a ", "is up")
     freeze(running.pid("a"))
@@ -63,14 +63,14 @@ def test_a_frozen_process_is_killed_and_started_again(run_tasks: RunTasks) -> No
     running.terminal.wait_for(" a ", "is up", count=2)
 
 
-def test_one_that_is_busy_within_what_it_declared_is_left_alone(run_tasks: RunTasks) -> None:
+def test_process_busy_within_its_step_limit_keeps_running(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("a", first="busy", busy_s=2.0, longest_step_s=60.0))
     running.terminal.wait_for(" a ", "no longer busy")
     assert running.stop().reports[0].starts == 1
 
 
 @look_only
-def test_one_that_holds_pythons_lock_does_not_beat_and_is_left_alone(run_tasks: RunTasks) -> None:
+def test_process_that_holds_pythons_lock_within_its_step_limit_keeps_running(run_tasks: RunTasks) -> None:
     silence_s = QUICK.liveness.silence_s
     running = run_tasks(peer("a", first="grip", busy_s=1.5 * silence_s, longest_step_s=60.0))
     running.terminal.wait_for(" a ", "has let go")
@@ -78,7 +78,7 @@ def test_one_that_holds_pythons_lock_does_not_beat_and_is_left_alone(run_tasks: 
 
 
 @look_only
-def test_one_that_holds_pythons_lock_longer_than_it_declared_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
+def test_process_that_holds_pythons_lock_beyond_its_step_limit_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
     lives = str(tmp_path / "lives")
     running = run_tasks(peer("a", first="grip", busy_s=600.0, longest_step_s=2.0, lives=lives))
     running.terminal.wait_for(" a ", "frozen")
@@ -86,9 +86,7 @@ def test_one_that_holds_pythons_lock_longer_than_it_declared_is_killed(run_tasks
 
 
 @pytest.mark.parametrize("first", ["grip", "stuck"])
-def test_one_that_holds_pythons_lock_and_stands_still_is_killed(
-    run_tasks: RunTasks, tmp_path: Path, first: str
-) -> None:
+def test_idle_process_that_holds_pythons_lock_is_killed(run_tasks: RunTasks, tmp_path: Path, first: str) -> None:
     running = run_tasks(peer("a", first=first, busy_s=600.0, longest_step_s=600.0, lives=str(tmp_path / "lives")))
     if first == "grip":
         running.terminal.wait_for(" a ", "holds on")
@@ -97,14 +95,14 @@ def test_one_that_holds_pythons_lock_and_stands_still_is_killed(
     running.terminal.wait_for(" a ", "life 2")
 
 
-def test_one_that_is_busy_longer_than_it_declared_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
+def test_process_busy_beyond_its_step_limit_is_killed(run_tasks: RunTasks, tmp_path: Path) -> None:
     lives = str(tmp_path / "lives")
     running = run_tasks(peer("a", first="busy", busy_s=600.0, longest_step_s=0.3, lives=lives))
     running.terminal.wait_for(" a ", "frozen")
     running.terminal.wait_for(" a ", "life 2")
 
 
-def test_what_always_crashes_is_given_up_and_the_rest_goes_on(run_tasks: RunTasks) -> None:
+def test_process_that_always_crashes_is_given_up_and_others_go_on(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("bad", first="crash"), peer("good"))
     running.terminal.wait_for("CRITICAL", "gave up bad", "the rest goes on")
     assert running.thread.is_alive()
@@ -115,25 +113,25 @@ def test_what_always_crashes_is_given_up_and_the_rest_goes_on(run_tasks: RunTask
 
 
 @pytest.mark.parametrize("role", [Role.SCHEDULER, Role.TRANSLATOR])
-def test_without_scheduler_or_translator_the_run_ends_and_says_so(run_tasks: RunTasks, role: Role) -> None:
+def test_run_without_scheduler_or_translator_ends_and_logs_why(run_tasks: RunTasks, role: Role) -> None:
     outcome = run_tasks(peer("vital", role, first="crash"), peer("other")).outcome()
     assert outcome.why is EndReason.LOST
     assert outcome.exit_code == 1
     assert "vital" in outcome.text
 
 
-def test_when_nothing_could_be_kept_running_the_run_is_lost(run_tasks: RunTasks) -> None:
+def test_run_with_all_processes_given_up_is_lost(run_tasks: RunTasks) -> None:
     assert run_tasks(peer("only", first="crash")).outcome().exit_code == 1
 
 
-def test_wrong_settings_are_not_tried_again(run_tasks: RunTasks) -> None:
+def test_process_with_wrong_settings_is_not_restarted(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("a", first="exit", code=78), peer("b"))
     running.terminal.wait_for("CRITICAL", "gave up a")
     report = running.stop().reports[0]
     assert (report.starts, report.given_up) == (1, True)
 
 
-def test_a_program_that_is_not_there_does_not_end_the_rest(run_tasks: RunTasks) -> None:
+def test_missing_program_does_not_end_the_run(run_tasks: RunTasks) -> None:
     missing = replace(peer("missing"), command=("no-such-program",))
     running = run_tasks(missing, peer("good"))
     running.terminal.wait_for("CRITICAL", "gave up missing")
@@ -141,7 +139,7 @@ def test_a_program_that_is_not_there_does_not_end_the_rest(run_tasks: RunTasks) 
     assert not running.stop().reports[1].given_up
 
 
-def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -> None:
+def test_end_of_the_experiment_also_ends_processes_that_ignore_it(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("ends", first="exit", code=80), peer("waits"), peer("deaf", first="deaf"))
     outcome = running.outcome()
     assert outcome.why is EndReason.EXPERIMENT_ENDED
@@ -154,7 +152,7 @@ def test_the_end_of_the_experiment_ends_all_even_the_deaf(run_tasks: RunTasks) -
     ("how", "busy_s", "last_words"),
     [("busy", 4.0, "no longer busy"), pytest.param("grip", 2.5, "has let go", marks=look_only)],
 )
-def test_at_the_end_of_the_experiment_one_that_is_busy_may_finish(
+def test_busy_process_may_finish_after_the_end_of_the_experiment(
     run_tasks: RunTasks, how: str, busy_s: float, last_words: str
 ) -> None:
     busy = peer("busy", first=how, busy_s=busy_s, longest_step_s=60.0)
@@ -169,14 +167,14 @@ def test_a_scheduler_that_is_done_ends_the_experiment(run_tasks: RunTasks) -> No
     assert outcome.why is EndReason.EXPERIMENT_ENDED
 
 
-def test_a_component_that_is_done_does_not(run_tasks: RunTasks) -> None:
+def test_component_that_is_done_does_not_end_the_experiment(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("done", first="exit", code=0), peer("waits"))
     running.terminal.wait_for(" done ", "done")
     assert running.stop().why is EndReason.STOPPED
 
 
-def test_who_does_not_end_when_asked_is_killed_and_the_others_end_by_themselves(run_tasks: RunTasks) -> None:
-    """How long that takes, the benchmarks say."""
+def test_process_that_ignores_the_end_is_killed_and_others_end_by_themselves(run_tasks: RunTasks) -> None:
+    """The benchmarks measure how long that takes."""
     running = run_tasks(peer("waits"), peer("deaf", first="deaf"))
     running.terminal.wait_for(" waits ", "life 1")
     running.terminal.wait_for(" deaf ", "life 1")
@@ -187,7 +185,7 @@ def test_who_does_not_end_when_asked_is_killed_and_the_others_end_by_themselves(
     assert deaf.last_exit != "ended as it was asked to"
 
 
-def test_a_translator_that_sees_to_the_tip_is_not_killed_meanwhile(run_tasks: RunTasks) -> None:
+def test_translator_that_retracts_the_tip_is_not_killed_meanwhile(run_tasks: RunTasks) -> None:
     scope = peer("scope", Role.TRANSLATOR, first="busy", busy_s=4.0, longest_step_s=60.0)
     running = run_tasks(scope, peer("other", first="busy", busy_s=600.0, longest_step_s=900.0))
     for name in ("scope", "other"):
@@ -199,7 +197,7 @@ def test_a_translator_that_sees_to_the_tip_is_not_killed_meanwhile(run_tasks: Ru
     assert not any(" scope " in line and "killed" in line for line in running.terminal.lines)
 
 
-def test_a_second_wish_to_stop_is_not_made_to_wait(run_tasks: RunTasks) -> None:
+def test_second_stop_kills_at_once(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("deaf", first="deaf"))
     running.terminal.wait_for(" deaf ", "life 1")
     clock = ExperimentClock.real()
@@ -210,7 +208,7 @@ def test_a_second_wish_to_stop_is_not_made_to_wait(run_tasks: RunTasks) -> None:
 
 
 @not_on_wine("one that prints without end leaves the others hardly any time")
-def test_a_wish_to_stop_does_not_wait_behind_what_a_process_prints(run_tasks: RunTasks) -> None:
+def test_stop_does_not_wait_behind_the_output_of_a_process(run_tasks: RunTasks) -> None:
     code = "import itertools, sys\nfor i in itertools.count(): print('waiting', i)"
     running = run_tasks(peer("quiet"), Task(peer("loud").launch, (sys.executable, "-c", code), beats=False))
     running.terminal.wait_for(" quiet ", "life 1")
@@ -227,7 +225,7 @@ def test_nothing_is_restarted_while_the_run_ends(run_tasks: RunTasks, tmp_path: 
     assert (tmp_path / "lives").read_text() == "1"
 
 
-def test_what_a_program_of_another_kind_writes_is_in_the_log(run_tasks: RunTasks) -> None:
+def test_output_of_a_program_in_another_language_is_in_the_log(run_tasks: RunTasks) -> None:
     code = "import sys; print('to stdout'); print('to stderr', file=sys.stderr)"
     task = Task(peer("script").launch, (sys.executable, "-c", code))
     running = run_tasks(task)
@@ -237,8 +235,8 @@ def test_what_a_program_of_another_kind_writes_is_in_the_log(run_tasks: RunTasks
     assert running.outcome().duration_s < DEADLINE_S
 
 
-def test_a_program_that_sends_no_heartbeats_is_not_waited_for(run_tasks: RunTasks) -> None:
-    """It lives on when all that do would have been killed for their silence."""
+def test_program_without_heartbeats_is_not_killed_for_silence(run_tasks: RunTasks) -> None:
+    """The same program, declared to send heartbeats, is killed for its silence."""
     silent = "import sys; sys.stdin.readline(); print('here', flush=True); sys.stdin.read()"
     deaf = replace(peer("program"), command=(sys.executable, "-c", silent), beats=False)
     policy = replace(QUICK, liveness=replace(QUICK.liveness, start_s=0.5))
@@ -248,7 +246,7 @@ def test_a_program_that_sends_no_heartbeats_is_not_waited_for(run_tasks: RunTask
     assert reports["program"] == 1
 
 
-def test_a_scheduler_that_somebody_asks_to_end_is_started_again(run_tasks: RunTasks) -> None:
+def test_scheduler_stopped_by_another_program_is_restarted(run_tasks: RunTasks) -> None:
     running = run_tasks(peer("scheduler", Role.SCHEDULER, first="exit", code=int(ExitCode.ORPHAN)))
     running.terminal.wait_for(" scheduler ", "restarting")
     assert running.stop().why is EndReason.STOPPED

@@ -1,4 +1,4 @@
-"""The questions of `afspm commission` in the terminal: an answer that is none is refused in words, and not for ever."""
+"""Questions of `afspm commission` in the terminal: an invalid answer is refused, a limited number of times."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WAYS = ["up", "down", "unseen"]
 
 @pytest.fixture
 def typed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """The lines that are typed, in their order; then the input ends."""
+    """Type these lines in order; then the input ends."""
     lines: list[str] = []
 
     def line(prompt: str) -> str:

@@ -1,4 +1,4 @@
-"""What the commands of the terminal say where nothing runs."""
+"""Messages of the terminal's commands if no experiment runs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from afspm.record.run_lock import cut_off_message, describe_state, lock_run
 @pytest.mark.parametrize("runs", [False, True], ids=["cut off", "it runs"])
 @pytest.mark.parametrize("keys", ["null", '{"folder": "keys"}'])
 @pytest.mark.parametrize("command", [looking, acting])
-def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_be_wrong(
+def test_message_on_a_run_that_was_cut_off_names_resume_and_on_a_running_one_the_likely_fault(
     command: Callable[[Path], AbstractContextManager[object]],
     keys: str,
     runs: bool,
@@ -48,7 +48,7 @@ def test_a_run_that_was_cut_off_says_how_it_goes_on_and_one_that_runs_what_may_b
     assert ("lacks the public key of terminal" in said) is (runs and keys != "null")
 
 
-def test_a_run_of_another_computer_is_not_said_to_be_cut_off(
+def test_run_of_another_computer_is_not_called_cut_off(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def nobody(*_: object) -> None:
@@ -67,7 +67,7 @@ def test_a_run_of_another_computer_is_not_said_to_be_cut_off(
     assert "night-1 was started on lab-7, and does not answer to this computer" in capsys.readouterr().err
 
 
-def test_a_run_that_has_ended_is_named_from_its_folder_too(
+def test_ended_run_is_named_from_its_folder_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "night-1"
@@ -80,7 +80,7 @@ def test_a_run_that_has_ended_is_named_from_its_folder_too(
     assert "night-1 has ended (the experiment has ended)" in capsys.readouterr().err
 
 
-def test_what_is_no_terminal_gets_a_line_for_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_output_to_a_file_is_not_wrapped(capsys: pytest.CaptureFixture[str]) -> None:
     text = 100 * "word "
     plain_console().print(text)
     assert capsys.readouterr().out == text + "\n"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.cli.metadata_questions import ask
+from afspm.cli.run import ask_metadata
 from afspm.experiment import load
 
 FILE = """
@@ -24,14 +24,14 @@ class = "Scheduler"
 """
 
 
-def test_what_is_known_is_offered_and_what_is_wrong_asked_again(
+def test_questions_offer_known_values_and_repeat_after_invalid_ones(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "e.toml"
     file.write_text(FILE, encoding="utf-8")
     answers = ["", "A. Student", "0000-0002-1825-0098", "0000-0002-1825-0097", "", ""]
     monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(answers) + "\n"))
-    assert ask(load(file)) == {
+    assert ask_metadata(load(file)) == {
         "sample": "Au(111)",
         "person": "A. Student",
         "orcid": "https://orcid.org/0000-0002-1825-0097",

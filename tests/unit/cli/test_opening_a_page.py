@@ -1,4 +1,4 @@
-"""`afspm dashboard` says at once what it does: its page takes seconds to load."""
+"""`afspm dashboard` prints at once what it opens, since its page takes seconds to load."""
 
 from __future__ import annotations
 

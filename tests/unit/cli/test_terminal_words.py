@@ -1,4 +1,4 @@
-"""What the terminal says of a running experiment."""
+"""Text of `afspm status` on a running experiment."""
 
 from __future__ import annotations
 
@@ -80,24 +80,24 @@ def shown(overview: Overview, about: RunDescription = ABOUT, width: int = 140, s
         "lost the tip [/x]",
     ],
 )
-def test_what_is_so_is_said(night: Overview, said: str) -> None:
+def test_status_shows_control_microscope_and_problems(night: Overview, said: str) -> None:
     assert said in shown(night)
 
 
-def test_a_replay_is_called_one(night: Overview) -> None:
+def test_status_of_a_replay_names_it(night: Overview) -> None:
     about = replace(ABOUT, replay_of="runs/night-0")
     assert "REPLAY" in shown(night, about)
     assert StatusText(night, about, START).as_json()["replay_of"] == "runs/night-0"
     assert "REPLAY" not in shown(night)
 
 
-def test_what_takes_longer_than_it_said_does_not_promise_its_end(night: Overview) -> None:
+def test_overdue_progress_shows_no_remaining_time(night: Overview) -> None:
     night.take("Progress", model.Progress(START + 121 * S, "series", 1, 5, 10.0), START + 121 * S)
     assert "20 % longer than expected" in shown(night)
     assert "0 s left" not in shown(night).replace("50 s left", "")
 
 
-def test_who_is_not_told_of_while_others_are_is_not_well(night: Overview) -> None:
+def test_process_missing_from_the_states_is_not_shown_as_well(night: Overview) -> None:
     elsewhere = process("scheduler", ProcessCondition.ALIVE)
     for after_s in (121, 121 + 7 * 60):  # at 60 times real time
         now_ns = START + after_s * S
@@ -123,7 +123,7 @@ def test_without_block_characters_bars_are_plain(night: Overview) -> None:
     assert bar(0.5, fancy=False, width=4) == "[##..]"
 
 
-def test_what_is_refused_again_and_again_is_said_once(night: Overview) -> None:
+def test_repeated_refusal_is_shown_once(night: Overview) -> None:
     for k in range(5):
         entry = model.JournalEntry(START + (130 + k) * S, "request", "series", "asks for control", 6, "flagged: …")
         night.take("JournalEntries", model.JournalEntries((entry,)), START + (130 + k) * S)
@@ -148,22 +148,22 @@ def test_notes_are_listed_with_their_scan(night: Overview) -> None:
     ]  # fmt: skip
 
 
-def test_silence_is_said_as_such(night: Overview) -> None:
+def test_status_shows_silence(night: Overview) -> None:
     assert "no news for 30 s" in shown(night, silent_s=30.0)
     assert "no news" not in shown(night, silent_s=2.0)
 
 
-def test_manual_is_said_with_since_when(night: Overview) -> None:
+def test_status_shows_since_when_mode_is_manual(night: Overview) -> None:
     night.take("ControlState", ControlState(ControlMode.MANUAL, None, (1,)), START + 130 * S)
     assert "MANUAL for 30 s" in shown(night)
 
 
-def test_nothing_known_is_said_as_such() -> None:
+def test_status_without_packets_shows_that_nothing_is_known() -> None:
     assert "not known yet" in shown(Overview())
     assert "has not reported yet" in shown(Overview())
 
 
-def test_json_says_the_same(night: Overview) -> None:
+def test_json_has_the_same_facts_as_the_text(night: Overview) -> None:
     told = json.loads(json.dumps(StatusText(night, ABOUT, START + 160 * S).as_json()))
     assert (told["mode"], told["holder"], told["simulated"]) == ("AUTOMATED", "series", True)
     assert [(one["name"], one["by"]) for one in told["problems"]] == [("tip-shape-changed", "judge")]

@@ -26,17 +26,17 @@ TUTORIAL = Path(__file__).parents[3] / "docs" / "tutorials" / "particle-survey.m
 
 
 class DriftingLab(Lab):
-    """A microscope over a sample that drifts, and a scheduler that maps each region to the tip and back.
+    """A microscope over a drifting sample, and a scheduler that maps each region to the tip and back.
 
     The first scan is taken in both directions, as the Rescanner does.
 
     Args:
         folder: for the experiment file of the tutorial.
-        estimator: registers scans; by default the ready-made one, whose errors are raised.
+        estimator: registers scans; by default the built-in one, whose errors are raised.
 
     Attributes:
-        told: what was published of each scan.
-        off_m: how far from its place each scan was published.
+        registrations: forecasts published for each scan.
+        off_m: distance of each published scan from its true place.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class DriftingLab(Lab):
         self.world = World.from_settings({name: simulator[name] for name in ("surface", "drift")}, seed, 0.0)
         self.channels = ("Height",)
         self.values["scan-speed"] = "10"
-        self.told: list[Registered] = []
+        self.registrations: list[Registered] = []
         self.off_m: list[float] = []
         following = tracker("bank", unguarded() if estimator is None else estimator)
         self._tracker = following
@@ -61,14 +61,14 @@ class DriftingLab(Lab):
         )
 
     def survey(self, **settings: Any) -> Survey:
-        """The survey of the tutorial, with other settings where they are given."""
+        """Return the tutorial's survey, with these settings replaced."""
         return Survey(**{**self.survey_settings, **settings})
 
     def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
-        if not self.told:
+        if not self.registrations:
             self._register(region, shape, upwards=False)
         scan, said = self._register(region, shape, upwards=True)
-        file = f"scan-{len(self.told)}.nc"
+        file = f"scan-{len(self.registrations)}.nc"
         payload = DriftWireCodec().encode_mapping(said, file, scan.region.center_m, correcting=True)
         self.publish(wire.decode("DriftMapping", payload))
         there = said.mapping.to_sample(scan.region)
@@ -76,7 +76,7 @@ class DriftingLab(Lab):
 
     def _register(self, region: Region, shape: tuple[int, int], *, upwards: bool) -> tuple[DriftScan, Registered]:
         line_s = 2.0 * region.size_m[0] / (10e-6 if region.size_m[0] > 1e-6 else 2e-6)
-        start_s = (self._end_s + 60.0 if self.told else 10.0) + line_s  # two curves are taken after each
+        start_s = (self._end_s + 60.0 if self.registrations else 10.0) + line_s  # two curves are taken after each
         middle_s = start_s + shape[0] * line_s / 2
         wanted = Region(region.center_m, region.size_m, region.angle_rad, Frame.SAMPLE)
         tip = self._tracker.forecast.at(middle_s).mapping.to_tip(wanted)
@@ -84,10 +84,10 @@ class DriftingLab(Lab):
         _, values = taken.channels()["Height"]
         scan = DriftScan(values, tip, taken.start_s, taken.end_s, upwards, f"{start_s:g}")
         said = self._estimation.register(scan.key, scan)
-        self.told.append(said)
+        self.registrations.append(said)
         truth_m = np.array(tip.center_m) - self.world.drift_m(scan.mid_s)[:2]
         off_m = np.array(said.mapping.to_sample(tip).center_m) - truth_m
-        self._first_off_m = off_m if len(self.told) == 1 else self._first_off_m
+        self._first_off_m = off_m if len(self.registrations) == 1 else self._first_off_m
         self.off_m.append(float(np.hypot(*(off_m - self._first_off_m))))
         self._end_s = taken.end_s
         return scan, said

@@ -15,10 +15,10 @@ WIDTH_M = 70e-9
 
 
 class ParticleLab(Lab):
-    """Scans show `PARTICLES`; zooms about places with an x above `limit_m` are refused.
+    """Scans show `PARTICLES`; zooms about places with x above `limit_m` are refused.
 
     Attributes:
-        regions: of the scans that were finished.
+        regions: of the finished scans.
         spots: of the spectra.
     """
 

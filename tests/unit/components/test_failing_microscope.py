@@ -1,4 +1,4 @@
-"""A microscope that never measures what it is asked for ends in a flag, and not in scans without end."""
+"""A microscope whose scans never match the request ends in a flag, not in endless scans."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ FAR_AWAY = Region((1.0, 1.0), SIZE)
 
 
 class FailingLab(Lab):
-    """Publishes, for every scan, what `measured` makes of its region."""
+    """Publishes for every scan the result of `measured` for its region."""
 
     def __init__(self, measured: Callable[[Region], tuple[Region, tuple[int, int]] | None]) -> None:
         super().__init__("series")
@@ -47,7 +47,7 @@ def series() -> ScanSeries:
     ],
     ids=["one pixel", "one row", "none", "far away", "elsewhere"],
 )
-def test_scans_that_are_not_what_was_asked_for_end_in_a_flag_and_a_reason(
+def test_scans_that_differ_from_the_request_end_in_a_flag_with_a_reason(
     measured: Callable[[Region], tuple[Region, tuple[int, int]] | None],
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,

@@ -1,4 +1,4 @@
-"""How well the feedback follows, in the laboratory in memory: what is told, flagged, and refused."""
+"""Quality of the feedback in the in-memory laboratory: shares, flags, and refusals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HEIGHT = 1e-6 * np.random.default_rng(1).normal(size=(10, 10)).cumsum(axis=1)
 def night(
     shares: list[float], unit: str = "V", on: bool = True, cleared_s: float | None = None, solver: str = ""
 ) -> Lab:
-    """Scans with these shares of pixels half above the setpoint, one every 100 s; the setpoint is in V."""
+    """Take scans with these shares of pixels half above the setpoint, one every 100 s; the setpoint is in V."""
     lab = Lab("feedback_analysis")
     lab.values[names.ZCTRL_SETPOINT] = str(SETPOINT)
     lab.publish(Feedback(on=on, setpoint=SETPOINT))
@@ -44,12 +44,12 @@ def night(
 
 
 def told(lab: Lab) -> list[tuple[float, float]]:
-    """Shares over and under the threshold, of each scan."""
+    """Return the shares over and under the threshold, of each scan."""
     found = [wire.decode(MESSAGE, payload) for envelope, payload in lab.published if envelope == MESSAGE]
     return [(one.proportionOverThreshold, one.proportionUnderThreshold) for one in found]
 
 
-def test_the_shares_of_each_scan_are_told() -> None:
+def test_shares_of_each_scan_are_published() -> None:
     assert np.array(told(night([GOOD, BAD]))) == pytest.approx(np.array([(GOOD, 0.0), (BAD, 0.0)]))
 
 
@@ -70,27 +70,27 @@ def test_several_bad_scans_in_a_row_are_flagged_and_a_good_one_clears_it(shares:
 
 
 def test_a_channel_of_another_kind_than_the_setpoint_is_not_compared(caplog: pytest.LogCaptureFixture) -> None:
-    """An amplitude in m, where the setpoint is in V: all of it would seem to be wrong."""
+    """An amplitude in m with a setpoint in V: every pixel would seem wrong."""
     lab = night([GOOD] * 3, unit="m")
     assert told(lab) == []
     assert not lab.control.published().problems
     assert "Amplitude can't be compared with the setpoint" in caplog.text
 
 
-def test_what_was_cleared_and_is_no_better_is_flagged_again_only_after_a_good_scan() -> None:
-    """A tuner that found nothing lets the experiment go on: the two must not go round in circles."""
+def test_problem_cleared_without_improvement_is_flagged_again_only_after_a_good_scan() -> None:
+    """A tuner without success lets the experiment go on; flag and repair must not alternate for ever."""
     assert not night([BAD] * 6, cleared_s=250.0).control.published().problems
     again = night([BAD] * 3 + [GOOD] + [BAD] * 2, cleared_s=250.0).control.published().problems
     assert again == (Problem.FEEDBACK_NON_OPTIMAL,)
 
 
-def test_with_the_feedback_off_nothing_is_judged() -> None:
+def test_scans_with_the_feedback_off_are_not_judged() -> None:
     lab = night([BAD] * 3, on=False)
     assert told(lab) == []
     assert not lab.control.published().problems
 
 
-def test_who_solves_it_decides_when_it_is_solved() -> None:
-    """The first gain that is good is not yet the one that is kept."""
+def test_component_that_solves_the_problem_decides_when_to_clear_it() -> None:
+    """The first good gain is not yet the one to keep."""
     lab = night([BAD, BAD, GOOD, GOOD], solver="tuner")
     assert lab.control.published().problems == (Problem.FEEDBACK_NON_OPTIMAL,)

@@ -1,4 +1,4 @@
-"""What a scan tells of the feedback, and which gain is found: on every simulated surface, over five decades of gain."""
+"""Quality of the feedback from a scan, and the gain found: on every simulated surface, over five decades of gain."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ TOO_HIGH = (9500.0, 20_000.0, 50_000.0, 500_000.0)
 
 @dataclass(frozen=True)
 class Sample:
-    """A surface, how it is measured, and how fast."""
+    """A surface, its mode of measurement, and the speed."""
 
     surface: Any
     size_m: float
@@ -71,7 +71,7 @@ FLAT = {
 
 
 def scanned(sample: Sample, gain: float) -> tuple[Scan, Scan]:
-    """The error signal and the height of one scan."""
+    """Return the error signal and the height of one scan."""
     region = Region((0.0, 0.0), (sample.size_m, sample.size_m))
     feedback = {"mode": sample.mode, "setpoint": sample.setpoint}
     world = World.from_settings({"surface": sample.surface, "feedback": feedback, **sample.more}, seed=3, start_s=0.0)
@@ -91,25 +91,25 @@ def following(name: str, gain: float) -> FeedbackQuality:
 
 @pytest.mark.parametrize("gain", TOO_LOW)
 @pytest.mark.parametrize("sample", SAMPLES)
-def test_a_gain_a_hundred_times_too_low_is_seen_on_every_surface(sample: str, gain: float) -> None:
+def test_gain_a_hundred_times_too_low_is_detected_on_every_surface(sample: str, gain: float) -> None:
     assert following(sample, gain) is FeedbackQuality.TOO_SLOW
 
 
 @pytest.mark.parametrize("gain", FINE)
 @pytest.mark.parametrize("sample", [*SAMPLES, *FLAT])
-def test_usual_gains_follow(sample: str, gain: float) -> None:
+def test_usual_gains_count_as_good(sample: str, gain: float) -> None:
     assert following(sample, gain).is_good
 
 
 @pytest.mark.parametrize("gain", TOO_HIGH)
 @pytest.mark.parametrize("sample", [*SAMPLES, *FLAT])
-def test_an_oscillation_is_seen_and_not_taken_for_slow(sample: str, gain: float) -> None:
+def test_oscillation_is_detected_and_not_taken_for_slow(sample: str, gain: float) -> None:
     assert following(sample, gain) is FeedbackQuality.OSCILLATES
 
 
 @pytest.mark.parametrize("gain", [*TOO_LOW, 50.0])
 @pytest.mark.parametrize("sample", FLAT)
-def test_where_there_is_nothing_to_follow_no_gain_is_too_low(sample: str, gain: float) -> None:
+def test_no_gain_is_too_low_on_a_flat_surface(sample: str, gain: float) -> None:
     assert following(sample, gain).is_good
 
 
@@ -120,7 +120,7 @@ def found(
     highest: float = 1e6,
     most_tries: int = 14,
 ) -> tuple[float | None, list[float]]:
-    """The gain that is kept, and all that were tried."""
+    """Return the gain to keep, and all gains that were tried."""
     search = gain_search(start, 2.0, lowest, highest, most_tries)
     tried = [next(search)]
     try:
@@ -170,7 +170,7 @@ def test_a_gain_just_below_the_oscillation_is_kept_only_if_no_lower_one_is_as_go
     assert found(by(60.0, 110.0), 200.0)[0] == 100.0
 
 
-def test_a_gain_that_barely_follows_is_kept_where_there_is_none_better() -> None:
+def test_barely_good_gain_is_kept_if_none_is_better() -> None:
     assert found(by(10.0, 70.0, well=(1e8, 1e9)), 4.0)[0] == 64.0
     assert found(by(10.0, 1e9, well=(100.0, 1e9)), 4.0)[0] == 128.0
 
@@ -180,7 +180,7 @@ def test_a_gain_that_barely_follows_is_kept_where_there_is_none_better() -> None
     [by(1e9, 1e10), by(0.0, 0.1), by(100.0, 100.1), lambda gain: None],
     ids=["slow", "fast", "gap", "refused"],
 )
-def test_where_no_gain_is_good_the_search_ends_with_none_and_stays_in_its_bounds(
+def test_search_without_a_good_gain_ends_with_none_within_its_bounds(
     follows: Callable[[float], FeedbackQuality | None],
 ) -> None:
     kept, tried = found(follows, 30.0, lowest=8.0, highest=500.0)
@@ -201,7 +201,7 @@ def rows(values: np.ndarray) -> Iterator[np.ndarray]:
     yield np.concatenate([values, np.full((5, values.shape[1]), np.nan)])
 
 
-def test_rows_that_were_not_taken_say_nothing() -> None:
+def test_missing_rows_are_ignored() -> None:
     signal, height = scanned(SAMPLES["particles"], 15.0)
     whole, broken_off = (
         feedback_error(relative_error(one, 0.7, exponential=False), 0.1, two, 42e-9)
@@ -211,7 +211,7 @@ def test_rows_that_were_not_taken_say_nothing() -> None:
 
 
 @pytest.mark.parametrize(("threshold", "sensitivity"), [(0.0, None), (-1.0, None), (None, 0.0)])
-def test_settings_without_sense_are_refused(threshold: float | None, sensitivity: float | None) -> None:
+def test_invalid_settings_are_refused(threshold: float | None, sensitivity: float | None) -> None:
     with pytest.raises(ConfigError):
         FeedbackSignal(threshold, sensitivity)
 

@@ -1,4 +1,4 @@
-"""The search for a better gain in the laboratory in memory."""
+"""Search for a better gain in the in-memory laboratory."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ HEIGHT = 1e-6 * np.random.default_rng(1).normal(size=(10, 10)).cumsum(axis=1)
 
 
 class Rig(Lab):
-    """Its amplitude is as `amplitude` says of the integral gain in force."""
+    """A laboratory whose amplitude follows from the integral gain by `amplitude`."""
 
     def __init__(self, amplitude: Callable[[float], np.ndarray], setpoint: float = SETPOINT, on: bool = True) -> None:
         super().__init__("tuner")
@@ -44,7 +44,7 @@ class Rig(Lab):
 
     @property
     def gains(self) -> list[float]:
-        """All that were set, in their order."""
+        """Gains that were set, in order."""
         asked = [r.subject for r in self.requests if r.kind == ControlRequest.SET_ZCTRL_PARAMS]
         return [feedback.integral_gain for feedback in asked]
 
@@ -74,7 +74,7 @@ def tuned(lab: Rig) -> Rig:
 
 
 def off_by(share: float) -> np.ndarray:
-    """Of 100 pixels so many off the setpoint by half of it."""
+    """Return 100 pixels; this share of them deviates from the setpoint by half of it."""
     values = np.full((10, 10), SETPOINT)
     values.flat[: round(100 * share)] = 1.5 * SETPOINT
     return values
@@ -86,7 +86,7 @@ def test_the_gain_is_raised_until_the_feedback_follows_well_and_the_flag_removed
     assert lab.problems == ()
 
 
-def test_where_no_gain_is_good_the_first_is_set_again_and_the_experiment_goes_on(
+def test_original_gain_is_restored_if_none_is_good_and_the_experiment_goes_on(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     lab = tuned(Rig(lambda gain: off_by(0.5)))
@@ -97,18 +97,18 @@ def test_where_no_gain_is_good_the_first_is_set_again_and_the_experiment_goes_on
 
 
 @pytest.mark.parametrize(("values", "setpoint"), [(np.full((10, 10), np.nan), SETPOINT), (off_by(0.0), 0.0)])
-def test_a_scan_that_says_nothing_of_the_error_changes_nothing(values: np.ndarray, setpoint: float) -> None:
+def test_scan_without_an_error_value_changes_nothing(values: np.ndarray, setpoint: float) -> None:
     lab = tuned(Rig(lambda gain: values, setpoint))
     assert lab.gains == [BEFORE, BEFORE]
     assert (lab.scanned, lab.problems) == (1, ())
 
 
-def test_with_the_feedback_off_nothing_is_tried() -> None:
+def test_no_gain_is_tried_with_the_feedback_off() -> None:
     lab = tuned(Rig(lambda gain: off_by(0.5), on=False))
     assert (lab.gains, lab.scanned, lab.problems) == ([], 0, ())
 
 
-def test_a_gain_that_is_refused_ends_the_search_there() -> None:
+def test_refused_gain_ends_the_search_there() -> None:
     lab = Rig(lambda gain: off_by(0.5))
 
     def refuse(request: Request) -> Response | str:
@@ -124,14 +124,14 @@ def test_a_gain_that_is_refused_ends_the_search_there() -> None:
 
 
 @pytest.mark.parametrize("good", [False, True])
-def test_after_control_was_lost_the_gain_that_was_there_or_a_good_one_is_left_behind(good: bool) -> None:
+def test_original_or_good_gain_is_set_after_control_was_lost(good: bool) -> None:
     lab = Rig(lambda gain: off_by(0.06 if good and gain == 4.0 else 0.5))
     lab.at(350.0, lambda: lab.clear(Problem.FEEDBACK_NON_OPTIMAL))  # a person says that it is well
     tuned(lab)
     assert lab.gains[-2:] == ([8.0, 4.0] if good else [8.0, BEFORE])
 
 
-def test_one_that_is_started_after_a_kill_sets_the_gain_again_that_was_there(tmp_path: Path) -> None:
+def test_original_gain_is_restored_after_a_kill(tmp_path: Path) -> None:
     killed = Rig(lambda gain: off_by(0.5))
     killed.at(250.0, killed.kill)
     run(tuner(), killed, tmp_path)

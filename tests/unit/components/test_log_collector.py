@@ -10,7 +10,7 @@ from afspm.components.log_collector import LogCollector, formatted
 from afspm.model import LogLine, LogLines
 
 
-def test_a_line_says_when_how_bad_who_and_what() -> None:
+def test_line_has_time_level_process_and_text() -> None:
     line = formatted(LogLine(1_700_000_000_000_000_000, "scheduler", "WARNING", "first\nsecond"))
     assert line == "2023-11-14T22:13:20.000000Z WARNING  scheduler        first\n    second"
 

@@ -1,4 +1,4 @@
-"""The table of what was measured: right, complete, and nothing twice."""
+"""The table of measurements: right, complete, and without duplicates."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def rows(folder: Path) -> list[dict[str, str]]:
 
 
 def scanned(lab: Lab, at_s: float) -> None:
-    """A scan that somebody else takes, 100 s long."""
+    """Let another client take a scan of 100 s."""
     lab.at(at_s, lambda: lab._go(ScopeState.SCANNING))
     lab.at(at_s + 100.0, lambda: lab.publish_scan(REGION))
     lab.at(at_s + 100.0, lambda: lab._go(ScopeState.FREE))
@@ -35,7 +35,7 @@ def held_by(lab: Lab, name: str, at_s: float) -> None:
     lab.at(at_s, lambda: lab.does(a.ArbitrationEvent.REQUEST_CONTROL, name))
 
 
-def test_a_row_for_each_channel_says_where_and_who_was_in_control_when_the_scan_began(tmp_path: Path) -> None:
+def test_each_channel_has_a_row_with_place_and_holder_of_control_at_its_beginning(tmp_path: Path) -> None:
     lab = Lab("metadata")
     held_by(lab, "series", 5.0)
     scanned(lab, 10.0)
@@ -51,7 +51,7 @@ def test_a_row_for_each_channel_says_where_and_who_was_in_control_when_the_scan_
     assert (first["columns"], first["rows"], first["units"]) == ("8", "8", "m")
 
 
-def test_mode_and_problems_are_those_of_the_beginning(tmp_path: Path) -> None:
+def test_row_has_mode_and_problems_at_the_beginning_of_the_scan(tmp_path: Path) -> None:
     lab = Lab("metadata")
     lab.at(5.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
     lab.at(6.0, lambda: lab.set_mode(ControlMode.MANUAL))
@@ -64,7 +64,7 @@ def test_mode_and_problems_are_those_of_the_beginning(tmp_path: Path) -> None:
     }
 
 
-def test_a_person_who_pauses_a_scan_has_not_begun_it(tmp_path: Path) -> None:
+def test_person_that_pauses_a_scan_has_not_begun_it(tmp_path: Path) -> None:
     lab = Lab("metadata")
     held_by(lab, "series", 5.0)
     scanned(lab, 10.0)
@@ -110,7 +110,7 @@ def test_killed_at_any_time_there_is_one_header_and_no_row_twice(tmp_path: Path,
     assert {row["in_control"] for row in found} == {"series"}
 
 
-def test_a_scan_whose_beginning_nobody_saw_says_nothing_of_who_took_it(tmp_path: Path) -> None:
+def test_scan_with_an_unseen_beginning_has_no_holder_of_control(tmp_path: Path) -> None:
     lab = Lab("metadata")
     held_by(lab, "series", 1.0)
     lab.at(5.0, lambda: lab.publish_scan(REGION))
@@ -119,7 +119,7 @@ def test_a_scan_whose_beginning_nobody_saw_says_nothing_of_who_took_it(tmp_path:
     assert {row["in_control"] for row in rows(tmp_path)} == {""}
 
 
-def test_scans_that_say_neither_when_nor_in_which_file_have_a_row_each(tmp_path: Path) -> None:
+def test_scans_without_time_and_file_have_a_row_each(tmp_path: Path) -> None:
     lab = Lab("metadata")
     for at_s in (5.0, 6.0):
         lab.at(at_s, lambda: lab.publish(Scan(REGION, "Height", "m", np.zeros((8, 8)))))
@@ -131,7 +131,7 @@ def test_scans_that_say_neither_when_nor_in_which_file_have_a_row_each(tmp_path:
 
 
 @pytest.mark.parametrize("name", ["a\u2028b.nc", "a\x85b.nc", 'a"b,c.nc'])
-def test_after_a_restart_a_file_of_whatever_name_is_not_there_twice(tmp_path: Path, name: str) -> None:
+def test_file_with_any_name_has_one_row_after_a_restart(tmp_path: Path, name: str) -> None:
     lab = Lab("metadata")
     lab.publish(Scan(REGION, "Height", "m", np.zeros((8, 8)), 1_700_000_000_000_000_000, name))
     first_life = context_of(lab, tmp_path / "state", run_dir=str(tmp_path))
@@ -143,7 +143,7 @@ def test_after_a_restart_a_file_of_whatever_name_is_not_there_twice(tmp_path: Pa
     assert [row["filename"] for row in rows(tmp_path)] == [name]
 
 
-def test_a_row_that_a_kill_cut_in_two_is_taken_away(tmp_path: Path) -> None:
+def test_row_cut_in_two_by_a_kill_is_removed(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     LineFile(path, "a,b").append(["1,2", "3,4"])
     with path.open("a") as file:
@@ -154,7 +154,7 @@ def test_a_row_that_a_kill_cut_in_two_is_taken_away(tmp_path: Path) -> None:
     assert path.read_text() == "a,b\n1,2\n3,4\n5,6\n"
 
 
-def test_a_header_that_a_kill_cut_in_two_is_written_again(tmp_path: Path) -> None:
+def test_header_cut_in_two_by_a_kill_is_written_again(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("a,")
     LineFile(path, "a,b").append(["1,2"])
@@ -192,8 +192,6 @@ def test_rows_wait_while_another_program_has_locked_the_table(
 
 
 def _full_after(real: Any, room: int) -> Any:
-    """Path.open of a disk that has room for so many more bytes."""
-
     def opened(path: Path, mode: str) -> Any:
         file = real(path, mode)
         written = file.write

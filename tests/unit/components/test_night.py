@@ -1,4 +1,4 @@
-"""The picture of the night, and the record that it is drawn from."""
+"""The picture of the night, and the record for it."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def test_spans_of_control_and_problems_are_read_from_the_states() -> None:
     assert flagged_by(record, problem) == "tip_classifier"
 
 
-def test_a_record_is_the_same_after_being_written_and_read_and_knows_what_it_has() -> None:
+def test_record_round_trips_and_knows_its_contents() -> None:
     entries = [control_entry(ControlState(ControlMode.MANUAL, None, (TIP,)), 5), scan_entry(scan(7), 7, None, None)]
     lines = [json.dumps(entry) for entry in entries]
     record = NightRecord.from_lines([*lines, *lines, "{half a li", '{"kind": "unknown", "time_ns": 1}'])
@@ -93,7 +93,7 @@ def test_a_record_is_the_same_after_being_written_and_read_and_knows_what_it_has
     assert not record.add(entries[1])
 
 
-def test_who_took_a_scan_whose_beginning_was_missed_is_who_was_in_control_at_its_end() -> None:
+def test_scan_with_a_missed_beginning_has_the_holder_of_control_at_its_end() -> None:
     record = NightRecord()
     record.add(control_entry(ControlState(holder="series"), 1))
     record.add(scan_entry(scan(9), 9, None, None))
@@ -120,7 +120,7 @@ def test_a_few_long_lines_have_a_thumbnail_too(shape: tuple[int, int]) -> None:
     assert max(picture.shape) <= THUMBNAIL_PX
 
 
-def test_too_many_scans_are_thinned_but_not_those_that_something_happened_to() -> None:
+def test_thinning_of_scans_keeps_scans_with_events() -> None:
     record = night(scans=300)
     record.add(scan_entry(scan(1), 1501 * MINUTE_NS, 1500 * MINUTE_NS, "tip_corrector"))
     chosen = _chosen(record)
@@ -185,7 +185,7 @@ def test_scans_are_taken_in_while_the_drawing_is_loaded(monkeypatch: pytest.Monk
     assert (tmp_path / "night.png").exists()
 
 
-def test_a_scan_that_was_paused_began_before_that(tmp_path: Path) -> None:
+def test_paused_scan_has_its_time_of_beginning_before_the_pause(tmp_path: Path) -> None:
     lab = _lab()
     for at_s, is_paused in ((110.0, True), (130.0, None)):
         lab.at(at_s, lambda is_paused=is_paused: lab.publish(ScopeStatus(ScopeState.SCANNING, is_paused)))
@@ -208,7 +208,7 @@ def test_a_restart_loses_nothing_and_doubles_nothing(tmp_path: Path) -> None:
     assert len(times) == len(set(times)) == 3
 
 
-def test_simulated_is_written_on_the_picture_only_where_it_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_picture_of_a_simulated_night_alone_is_marked(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     from matplotlib.figure import Figure
 
     written: list[str] = []
@@ -221,7 +221,7 @@ def test_simulated_is_written_on_the_picture_only_where_it_is(monkeypatch: pytes
 
 
 @pytest.mark.parametrize("far_ns", [2**62, 2**63 - 1, -(2**62)])
-def test_a_time_that_is_centuries_off_makes_no_million_ticks(
+def test_time_that_is_centuries_off_makes_few_ticks(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, far_ns: int
 ) -> None:
     from matplotlib.axes import Axes
@@ -242,7 +242,7 @@ def test_a_time_that_is_centuries_off_makes_no_million_ticks(
     assert max(ticks) < 20
 
 
-def test_the_scan_that_was_judged_bad_is_framed_and_a_scan_of_the_repair_is_not() -> None:
+def test_scan_judged_bad_is_framed_and_a_test_scan_of_the_repair_is_not() -> None:
     record = night()
     assert record.bad_ns() == {12 * MINUTE_NS}
     record.add(mark_entry("tip_classifier", "verdict", 13 * MINUTE_NS, 1.0, 12 * MINUTE_NS))

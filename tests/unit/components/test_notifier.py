@@ -1,4 +1,4 @@
-"""People are told: when, once, again if that fails, and without giving secrets away."""
+"""Notifications: when, once, retried after failures, and without revealing secrets."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NOTICE = Notification(
 
 
 class Hook(ThreadingHTTPServer):
-    """A server that keeps what is posted to it, and answers with `codes` in turn (the last again and again)."""
+    """A server that stores each POST, and answers with `codes` in turn (repeating the last)."""
 
     def __init__(self) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
@@ -68,7 +68,7 @@ def hook() -> Iterator[Hook]:
 
 
 class Night:
-    """A notifier in an experiment: its lives share a clock and a memory."""
+    """A notifier in an experiment: its lives share clock and memory."""
 
     def __init__(self, folder: Path, **settings: object) -> None:
         self.folder, self.settings, self.clock = folder, settings, FakeClock()
@@ -99,13 +99,13 @@ class Night:
         self.notifier.on_log_lines(model.LogLines(tuple(told)))
 
     def passes(self, seconds: int) -> None:
-        """Time passes, with a tick every ten seconds."""
+        """Let time pass, with a tick every ten seconds."""
         for _ in range(seconds // 10):
             self.clock.passed_s += 10.0
             self.notifier.on_tick()
 
 
-def test_a_problem_that_nobody_solves_is_told_once(tmp_path: Path, hook: Hook) -> None:
+def test_unsolved_problem_is_notified_once(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0)
     night.control(1)
     night.passes(590)
@@ -118,7 +118,7 @@ def test_a_problem_that_nobody_solves_is_told_once(tmp_path: Path, hook: Hook) -
     assert str(told["time"]).endswith("+00:00")
 
 
-def test_a_problem_that_is_solved_in_time_is_not_told(tmp_path: Path, hook: Hook) -> None:
+def test_problem_solved_in_time_is_not_notified(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0)
     for _ in range(5):
         night.control(1)
@@ -127,7 +127,7 @@ def test_a_problem_that_is_solved_in_time_is_not_told(tmp_path: Path, hook: Hook
     assert hook.got == []
 
 
-def test_another_problem_meanwhile_does_not_begin_the_time_anew(tmp_path: Path, hook: Hook) -> None:
+def test_second_problem_does_not_reset_the_time_of_the_first(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url, unsolved_after=600.0)
     night.control(1)
     night.passes(300)
@@ -136,7 +136,7 @@ def test_another_problem_meanwhile_does_not_begin_the_time_anew(tmp_path: Path, 
     assert [str(told["text"]).split()[0] for told in hook.got] == ["tip-shape-changed"]
 
 
-def test_a_component_that_is_given_up_is_told_once(tmp_path: Path, hook: Hook) -> None:
+def test_component_given_up_is_notified_once(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url)
     for _ in range(3):  # a supervisor says so again and again
         night.given_up("judge", "exit code 1")
@@ -144,7 +144,7 @@ def test_a_component_that_is_given_up_is_told_once(tmp_path: Path, hook: Hook) -
     assert [told["text"] for told in hook.got] == ["judge is given up: exit code 1"]
 
 
-def test_what_is_critical_is_told_once(tmp_path: Path, hook: Hook) -> None:
+def test_critical_line_is_notified_once(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url)
     full = ("recorder", "CRITICAL", "nothing can be recorded, the experiment goes on: No space left on device")
     night.says(("recorder", "WARNING", "it takes long"), full, ("recorder", "CRITICAL", "what belongs to it"))
@@ -154,7 +154,7 @@ def test_what_is_critical_is_told_once(tmp_path: Path, hook: Hook) -> None:
     assert (told["what"], told["text"]) == ("critical", f"recorder: {full[2]}")
 
 
-def test_a_component_that_says_something_else_each_time_does_not_fill_the_memory(
+def test_ever_new_critical_lines_do_not_fill_the_memory(
     tmp_path: Path, hook: Hook, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(notifier, "MOST_TOLD", 3)
@@ -164,21 +164,21 @@ def test_a_component_that_says_something_else_each_time_does_not_fill_the_memory
     assert [key.split()[2] for key in night.notifier.memory["told"]] == ["2", "3", "4"]
 
 
-def test_what_is_critical_to_the_supervisor_is_told_as_what_it_is(tmp_path: Path, hook: Hook) -> None:
+def test_critical_lines_of_supervisor_and_notifier_are_not_notified(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url)
     night.says(("afspm", "CRITICAL", "judge is given up"), ("notifier", "CRITICAL", "a restart would not know"))
     night.passes(60)
     assert hook.got == []
 
 
-def test_only_what_is_wanted_is_told(tmp_path: Path, hook: Hook) -> None:
+def test_only_chosen_occasions_are_notified(tmp_path: Path, hook: Hook) -> None:
     night = Night(tmp_path, webhook=hook.url, on=["unsolved-problem"])
     night.given_up("judge")
     night.passes(100)
     assert hook.got == []
 
 
-def test_what_fails_is_tried_again_later_and_later(tmp_path: Path, hook: Hook) -> None:
+def test_failed_delivery_is_retried_with_growing_delays(tmp_path: Path, hook: Hook) -> None:
     hook.codes = [500, 503, 200]
     night = Night(tmp_path, webhook=hook.url)
     night.given_up("judge")
@@ -187,7 +187,9 @@ def test_what_fails_is_tried_again_later_and_later(tmp_path: Path, hook: Hook) -
     assert [notifications.delay_s(tries) for tries in (1, 2, 3, 20)] == [2.0, 4.0, 8.0, notifications.LONGEST_DELAY_S]
 
 
-def test_what_never_succeeds_is_given_up_and_said(tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture) -> None:
+def test_delivery_that_always_fails_is_given_up_and_logged(
+    tmp_path: Path, hook: Hook, caplog: pytest.LogCaptureFixture
+) -> None:
     hook.codes = [500]
     night = Night(tmp_path, webhook=hook.url)
     night.given_up("judge")
@@ -196,7 +198,7 @@ def test_what_never_succeeds_is_given_up_and_said(tmp_path: Path, hook: Hook, ca
     assert "gave up a notification: 127.0.0.1 answers 500" in caplog.text
 
 
-def test_a_notifier_that_is_killed_goes_on_and_tells_nothing_twice(tmp_path: Path, hook: Hook) -> None:
+def test_killed_notifier_continues_and_sends_nothing_twice(tmp_path: Path, hook: Hook) -> None:
     hook.codes = [500, 200]
     night = Night(tmp_path, webhook=hook.url, unsolved_after=100.0)
     night.control(1)
@@ -204,7 +206,7 @@ def test_a_notifier_that_is_killed_goes_on_and_tells_nothing_twice(tmp_path: Pat
     night.start()
     night.control(1)  # replayed
     night.passes(60)
-    night.start()  # told, but not delivered yet
+    night.start()  # queued, but not delivered yet
     night.passes(60)
     night.start()
     night.control(1)
@@ -212,7 +214,7 @@ def test_a_notifier_that_is_killed_goes_on_and_tells_nothing_twice(tmp_path: Pat
     assert len(hook.got) == 1
 
 
-def test_each_way_is_tried_by_itself(tmp_path: Path, hook: Hook) -> None:
+def test_command_and_webhook_are_retried_separately(tmp_path: Path, hook: Hook) -> None:
     hook.codes = [500, 200]
     night = Night(tmp_path, webhook=hook.url, program=recording(tmp_path))
     night.given_up("judge")
@@ -234,7 +236,7 @@ def test_no_log_holds_the_secret(tmp_path: Path, hook: Hook, caplog: pytest.LogC
 
 
 def recording(folder: Path) -> list[str]:
-    """A command that writes down what it gets."""
+    """Return a command that writes its input to a file."""
     code = "import sys, os; open(sys.argv[1], 'a').write(sys.stdin.read() + '|' + os.environ['AFSPM_WHAT'] + chr(10))"
     return [sys.executable, "-c", code, str(folder / "told.txt")]
 
@@ -261,14 +263,14 @@ def test_a_command_gets_the_notice(tmp_path: Path) -> None:
     ("code", "said"),
     [("import sys; sys.exit('no network')", "ended with 1: no network"), ("while True: pass", "took longer")],
 )
-def test_a_command_that_fails_is_said(monkeypatch: pytest.MonkeyPatch, code: str, said: str) -> None:
+def test_failing_command_is_an_error(monkeypatch: pytest.MonkeyPatch, code: str, said: str) -> None:
     if said == "took longer":
         monkeypatch.setattr(notifications, "TIMEOUT_S", 0.5)
     with pytest.raises(NotDelivered, match=said):
         Targets([sys.executable, "-c", code]).deliver(NOTICE, "command")
 
 
-def test_a_program_that_is_not_there_is_said() -> None:
+def test_missing_program_is_an_error() -> None:
     with pytest.raises(NotDelivered, match="no-such-program can't be run"):
         Targets(["/nowhere/no-such-program"]).deliver(NOTICE, "command")
 
@@ -282,13 +284,13 @@ def test_a_webhook_may_be_named_by_the_environment() -> None:
 @pytest.mark.parametrize(
     "wrong", ["ftp://a.example", "file:///etc/passwd", "chitchat", "http://", "https://u:pw@a.example"]
 )
-def test_what_is_no_address_is_refused_without_repeating_it(wrong: str) -> None:
+def test_invalid_address_is_refused_without_repeating_it(wrong: str) -> None:
     with pytest.raises(ConfigError) as refused:
         notifications.address(wrong)
     assert wrong not in str(refused.value)
 
 
-def test_nobody_to_tell_is_an_error() -> None:
+def test_notifier_without_target_is_an_error() -> None:
     with pytest.raises(ConfigError, match="there is no recipient"):
         Notifier()
     with pytest.raises(ConfigError, match="'dawn' never happens"):
@@ -296,7 +298,7 @@ def test_nobody_to_tell_is_an_error() -> None:
 
 
 @pytest.mark.parametrize(("code", "exit_code"), [(200, 0), (500, 1)])
-def test_a_test_message_says_whether_it_arrived(tmp_path: Path, hook: Hook, code: int, exit_code: int) -> None:
+def test_command_reports_whether_a_test_message_arrived(tmp_path: Path, hook: Hook, code: int, exit_code: int) -> None:
     hook.codes = [code]
     file = tmp_path / "night.toml"
     parts = "".join(f'[{n}]\ncomponent = true\nclass = "{c}"\n' for n, c in (("m", "Simulator"), ("s", "Scheduler")))

@@ -1,4 +1,4 @@
-"""Scans by plan in the laboratory in memory: exactly once, whatever happens."""
+"""Scans by plan in the in-memory laboratory: each exactly once, over kills and lost control."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_series_that_need_not_end_the_experiment_leaves_it_running() -> None:
     assert not lab.control.ended
 
 
-def test_control_is_given_back_between_scans_unless_it_is_to_be_kept() -> None:
+def test_control_is_released_between_scans_unless_kept() -> None:
     given_back, kept = Lab("series"), Lab("series")
     run(series(), given_back)
     run(series(keep_control=True), kept)
@@ -52,7 +52,7 @@ def test_control_is_given_back_between_scans_unless_it_is_to_be_kept() -> None:
     assert kept.count(ControlRequest.RELEASE_CTRL) <= 2  # after setting parameters, and at the end
 
 
-def test_a_scan_that_a_problem_interrupts_is_taken_again_and_said(caplog: pytest.LogCaptureFixture) -> None:
+def test_scan_interrupted_by_a_problem_is_repeated_and_logged(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab("series")
     lab.at(40.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
     lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
@@ -69,7 +69,7 @@ def lasting(duration_s: float, every_s: float, **planned: Any) -> ScanSeries:
 
 
 def at_times(series: ScanSeries, lab: Lab) -> list[int]:
-    """When each scan was begun, in periods of 900 s; control is lost from 150 s to 3000 s."""
+    """Return when each scan began, in periods of 900 s; control is lost from 150 s to 3000 s."""
     begun: list[int] = []
 
     def note(request: Request) -> str:
@@ -93,7 +93,7 @@ def at_times(series: ScanSeries, lab: Lab) -> list[int]:
     ],
 )
 @pytest.mark.parametrize("make", [lambda **p: series(5, **p), lambda **p: lasting(4 * 900.0, 900.0, **p)])
-def test_the_file_says_what_becomes_of_scans_missed_while_control_was_lost(
+def test_setting_missed_decides_on_scans_missed_while_control_was_lost(
     make: Callable[..., ScanSeries], missed: str, begun: list[int], told: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab = Lab("series")
@@ -111,7 +111,7 @@ def test_by_default_no_scan_is_lost() -> None:
     assert len(at_times(lasting(4 * 900.0, 900.0), Lab("series"))) == 5
 
 
-def test_a_series_for_a_time_ends_then_however_long_a_scan_takes(caplog: pytest.LogCaptureFixture) -> None:
+def test_series_with_a_duration_ends_on_time_however_long_a_scan_takes(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab("series")
     with caplog.at_level("INFO"):
         assert run(lasting(600.0, every_s=60.0), lab) == ExitCode.ENDED  # each takes longer than that
@@ -121,7 +121,7 @@ def test_a_series_for_a_time_ends_then_however_long_a_scan_takes(caplog: pytest.
     assert caplog.messages.count("a round takes 101 s, longer than its period of 60 s") == 1
 
 
-def test_time_in_which_nothing_ran_is_not_that_of_a_series_for_a_time(tmp_path: Path) -> None:
+def test_time_without_a_running_process_does_not_count_for_the_duration_of_a_series(tmp_path: Path) -> None:
     lab = Lab("series")
     lab.at(1000.0, lab.parent_goes)
     lasting(4 * 900.0, every_s=900.0).run_process(context_of(lab, tmp_path))
@@ -131,7 +131,7 @@ def test_time_in_which_nothing_ran_is_not_that_of_a_series_for_a_time(tmp_path: 
     assert len(lab.finished) == 5
 
 
-def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> None:
+def test_missed_scan_is_logged_in_the_singular(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab("series")
     lab.at(150.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
     lab.at(2000.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
@@ -141,7 +141,6 @@ def test_one_missed_scan_is_told_as_one(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
-    """Run a component that is killed -9 at a call to the network, start it again, and let it end."""
     lab = Lab("series")
     context = context_of(lab, state_dir)
     context.open_port = lambda: LabPort(lab, call, is_late=is_late)  # type: ignore[assignment,return-value]
@@ -155,15 +154,17 @@ def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is
 
 @pytest.mark.parametrize("is_late", [False, True])
 @pytest.mark.parametrize("keep_control", [False, True])
-def test_killed_anywhere_no_scan_is_missing_or_there_twice(tmp_path: Path, is_late: bool, keep_control: bool) -> None:
+def test_no_scan_is_missing_or_repeated_after_a_kill_anywhere(
+    tmp_path: Path, is_late: bool, keep_control: bool
+) -> None:
     for call in range(1, 150, 7):
         folder = tmp_path / str(call)
         lab = _killed_at(call, lambda: series(keep_control=keep_control), folder, is_late=is_late)
         assert len(lab.finished) == 3, f"killed at call {call}"
 
 
-def test_what_is_kept_of_a_long_series_does_not_grow_with_it(tmp_path: Path) -> None:
-    """A night of a thousand scans would keep each of them twice."""
+def test_saved_state_of_a_series_does_not_grow(tmp_path: Path) -> None:
+    """Otherwise a night of a thousand scans would keep each of them twice."""
     kept: list[int] = []
     lab = Lab("series")
     for number in range(1, 6):
@@ -173,7 +174,7 @@ def test_what_is_kept_of_a_long_series_does_not_grow_with_it(tmp_path: Path) -> 
     assert kept == [0] * 5
 
 
-def test_started_again_it_says_where_it_goes_on_unless_nothing_is_left(
+def test_restarted_plan_logs_where_it_continues_unless_nothing_is_left(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with caplog.at_level("INFO"):
@@ -186,7 +187,7 @@ def test_started_again_it_says_where_it_goes_on_unless_nothing_is_left(
     assert caplog.text.count("all 3 scans are taken") == 2
 
 
-def test_a_list_is_gone_through_in_its_order_round_after_round() -> None:
+def test_list_is_scanned_in_order_round_after_round() -> None:
     lab = Lab("list")
     places = [{"center": [x, 0.0], "size": [1e-6, 1e-6]} for x in (1e-6, 2e-6)]
     run(ScanList(regions=places, pixels=(8, 8), rounds=2), lab)  # type: ignore[arg-type]
@@ -227,19 +228,19 @@ def told_progress(lab: Lab) -> list[tuple[str, int, int]]:
     return [(one.name, one.done, one.of) for one in progress_of(lab)]
 
 
-def test_those_who_look_on_are_told_how_far_it_is() -> None:
+def test_progress_is_published() -> None:
     lab = Lab("series")
     run(series(), lab)
     assert told_progress(lab) == [("series", 1, 3), ("series", 2, 3), ("series", 3, 3)]
 
 
-def test_what_remains_of_a_series_goes_by_its_beat() -> None:
+def test_remaining_time_of_a_series_follows_its_period() -> None:
     lab = Lab("series")
     run(series(), lab)
     assert [one.left_s for one in progress_of(lab)] == pytest.approx([1800.0, 900.0, 0.0])
 
 
-def test_what_remains_of_a_list_goes_by_its_pace() -> None:
+def test_remaining_time_of_a_list_follows_its_pace() -> None:
     lab = Lab("list")
     place = {"center": (0.0, 0.0), "size": (1e-6, 1e-6)}
     run(ScanList([place, place, place], pixels=(8, 8), end_when_done=True), lab)  # type: ignore[list-item]
@@ -249,7 +250,7 @@ def test_what_remains_of_a_list_goes_by_its_pace() -> None:
     assert last == 0.0
 
 
-def test_who_does_not_say_how_long_the_rest_takes_has_it_told_by_the_pace() -> None:
+def test_remaining_time_is_estimated_from_the_pace_by_default() -> None:
     class Script(Component):
         def run(self) -> None:
             self.scope.set("tip-bias-voltage", 1.0)  # the scheduler is known then
@@ -262,7 +263,7 @@ def test_who_does_not_say_how_long_the_rest_takes_has_it_told_by_the_pace() -> N
     assert [one.left_s for one in progress_of(lab)] == [None, pytest.approx(180.0), pytest.approx(120.0)]
 
 
-def test_a_series_without_end_tells_no_progress() -> None:
+def test_endless_series_publishes_no_progress() -> None:
     lab = Lab("series")
     lab.at(2000.0, lab.kill)
     run(ScanSeries(size=(1e-6, 1e-6), pixels=(8, 8), every=900.0), lab)
@@ -270,7 +271,7 @@ def test_a_series_without_end_tells_no_progress() -> None:
     assert told_progress(lab) == []
 
 
-def test_a_grid_of_spectra_tells_its_progress() -> None:
+def test_spectroscopy_grid_publishes_its_progress() -> None:
     lab = Lab("grid")
     run(SpectroscopyGrid(counts=(2, 1), spacing=(1e-9, 1e-9), end_when_done=True), lab)
     assert told_progress(lab) == [("grid", 1, 2), ("grid", 2, 2)]

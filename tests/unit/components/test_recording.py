@@ -1,4 +1,4 @@
-"""The thread that records: it writes what comes, waits for room on a disk, and asks for what was missed."""
+"""The recording thread writes packets, waits for room on a disk, and asks for missed packets."""
 
 from __future__ import annotations
 
@@ -67,18 +67,18 @@ class Bench:
         return writer
 
     def publish(self, *packets: Packet) -> None:
-        """As the scheduler does."""
+        """Append a packet to the log, as the scheduler does."""
         for packet in packets:
             self.log.append(LoggedPacket(packet, None, 1))
 
     @property
     def is_committed(self) -> bool:
-        """All of the log is said to be recorded."""
+        """Return whether the whole log is committed as recorded."""
         position = committed(self.packets)
         return position is not None and not LogReader(self.packets, position).read(1)
 
     def times(self) -> list[int | None]:
-        """Of what is recorded; none before the record has begun."""
+        """Return the times of the recorded packets; none before the record exists."""
         with contextlib.suppress(FileError), afspm.open_run(self.folder) as run:
             return [packet.time_ns for packet in run.packets()]
         return []
@@ -93,7 +93,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
     made.log.close()
 
 
-def test_the_log_and_what_others_send_are_recorded_once_in_order(bench: Bench) -> None:
+def test_log_and_packets_of_other_publishers_are_recorded_once_in_order(bench: Bench) -> None:
     bench.publish(*map(control, (1, 2, 3)))
     writer = bench.writer()
     bench.publish(*map(control, (3, 4, 5)))
@@ -106,7 +106,7 @@ def test_the_log_and_what_others_send_are_recorded_once_in_order(bench: Bench) -
     assert bench.is_committed
 
 
-def test_another_life_goes_on_where_the_last_had_committed(bench: Bench) -> None:
+def test_restarted_recorder_continues_at_the_committed_position(bench: Bench) -> None:
     bench.publish(*map(control, range(1, 6)))
     bench.writer().finish(ended=False)
     position = committed(bench.packets)
@@ -118,7 +118,7 @@ def test_another_life_goes_on_where_the_last_had_committed(bench: Bench) -> None
     assert bench.is_committed
 
 
-def test_lines_of_a_scan_that_is_not_over_are_read_again_by_another_life(bench: Bench) -> None:
+def test_restarted_recorder_reads_lines_of_an_unfinished_scan_again(bench: Bench) -> None:
     region = Region((0.0, 0.0), (1e-6, 1e-6))
 
     def lines(number: int) -> Packet:
@@ -138,7 +138,7 @@ def test_lines_of_a_scan_that_is_not_over_are_read_again_by_another_life(bench: 
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is open on is found in /proc")
-def test_what_is_said_to_be_recorded_is_on_the_disk(
+def test_committed_packets_are_on_the_disk(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     lossy = runpy.run_path(str(LOSSY / "sitecustomize.py"))
@@ -157,7 +157,7 @@ def test_what_is_said_to_be_recorded_is_on_the_disk(
     writer.finish(ended=True)
 
 
-def test_a_full_disk_is_told_once_and_all_is_recorded_when_there_is_room(
+def test_full_disk_is_logged_once_and_all_is_recorded_once_there_is_room(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     disk = _Disk(monkeypatch)
@@ -175,7 +175,7 @@ def test_a_full_disk_is_told_once_and_all_is_recorded_when_there_is_room(
     assert not writer.wants_replay()
 
 
-def test_what_did_not_fit_while_the_disk_was_full_is_asked_for_again(
+def test_packets_dropped_while_the_disk_was_full_are_requested_again(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording, "MOST_BYTES", 200)
@@ -197,7 +197,7 @@ def test_what_did_not_fit_while_the_disk_was_full_is_asked_for_again(
     assert _all_times(bench) == [packet.time_ns for packet in packets]
 
 
-def test_a_damaged_journal_is_put_aside_and_told(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_journal_is_moved_aside_and_logged(bench: Bench, caplog: pytest.LogCaptureFixture) -> None:
     (bench.folder / JOURNAL_FILE).write_bytes(b"SQLite format 3\0" + b"nonsense" * 1000)
     writer = bench.writer()
     bench.publish(control(1))
@@ -208,7 +208,7 @@ def test_a_damaged_journal_is_put_aside_and_told(bench: Bench, caplog: pytest.Lo
 
 
 @pytest.mark.parametrize("table", ["packets", "packets_once", "packets_by_message"])
-def test_a_journal_that_is_damaged_further_in_is_put_aside_too(
+def test_journal_damaged_further_in_is_moved_aside_too(
     bench: Bench, caplog: pytest.LogCaptureFixture, table: str
 ) -> None:
     writer = bench.writer()
@@ -231,7 +231,7 @@ def test_a_journal_that_is_damaged_further_in_is_put_aside_too(
     assert again.wants_replay()
 
 
-def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_that_ends_the_writing_is_raised_by_check(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: Any) -> None:
         raise RuntimeError("a mistake of ours")
 
@@ -243,7 +243,7 @@ def test_what_ends_the_writing_is_raised_where_it_is_noticed(bench: Bench, monke
         writer.check()
 
 
-def test_a_packet_without_a_time_gets_that_of_now(bench: Bench) -> None:
+def test_packet_without_a_time_gets_the_current_time(bench: Bench) -> None:
     writer = bench.writer()
     writer.put(Packet("ControlState", control(1).payload), "tcp://another")
     writer.finish(ended=True)
@@ -251,12 +251,12 @@ def test_a_packet_without_a_time_gets_that_of_now(bench: Bench) -> None:
     assert row == [("tcp://another", 1)]
 
 
-def test_what_wakes_the_recorder_is_the_port_that_is_open_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writer_wakes_the_port_that_is_open_now(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ports: list[_Port] = []
     made: list[_Writer] = []
 
     class _Port:
-        """Brings the end, to who has been woken up often enough."""
+        """Ends the run after enough wake-ups."""
 
         def __init__(self, heard: tuple[str, ...] | None) -> None:
             self.woken = 0
@@ -276,7 +276,7 @@ def test_what_wakes_the_recorder_is_the_port_that_is_open_now(tmp_path: Path, mo
             pass
 
     class _Writer:
-        """Wants a replay at first."""
+        """Wants one replay."""
 
         def __init__(self, *_: object, wake: Callable[[], None], **__: object) -> None:
             self.wake = wake
@@ -315,12 +315,10 @@ class _Disk:
 
 
 def _all_times(bench: Bench) -> list[int]:
-    """Of what is recorded, whoever published it."""
     return [row[0] for row in afspm.open_run(bench.folder)._query("SELECT time_ns FROM packets ORDER BY time_ns")]
 
 
 def _until(condition: Callable[[], bool]) -> None:
-    """Wait for what another thread does."""
     changed = threading.Event()
     clock = ExperimentClock.real()
     until_s = clock.monotonic_s() + DEADLINE_S

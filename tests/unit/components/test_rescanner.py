@@ -1,4 +1,4 @@
-"""The Rescanner in the laboratory in memory: what it scans again, how often, and what it leaves behind."""
+"""The Rescanner in the in-memory laboratory: repeated scans, their number, and the settings it leaves."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ELSEWHERE = Region((3e-6, 1e-6), (1e-6, 0.5e-6), 0.2)
 
 
 class Drifting(Lab):
-    """A scheduler that tells what it was told to of each scan: "well", "off", "lost" or "unmatched"."""
+    """A scheduler that publishes a given outcome for each scan: "well", "off", "lost" or "unmatched"."""
 
     def __init__(self, told: list[str]) -> None:
         super().__init__("rescanner")
@@ -67,7 +67,7 @@ class Drifting(Lab):
 def asked(
     kind: int, told: list[str], region: Region = REGION, *, upwards: bool | None = None, **settings: float
 ) -> Drifting:
-    """A Rescanner that was asked once."""
+    """Run a Rescanner with one request."""
     lab = Drifting(told)
     lab.at(10.0, lambda: lab.wants(kind, region, upwards=upwards))
     lab.at(5000.0, lab.kill)
@@ -82,11 +82,11 @@ def test_the_region_is_taken_again_with_the_problem_flagged_meanwhile() -> None:
     assert lab.control.holder is None
 
 
-def test_it_is_tried_again_until_it_lies_well() -> None:
+def test_rescans_are_repeated_until_the_offset_is_small() -> None:
     assert len(asked(RescanKind.AGAIN, ["off", "unmatched", "well"]).finished) == 3
 
 
-def test_after_its_attempts_it_lets_the_experiment_go_on() -> None:
+def test_experiment_goes_on_after_the_last_attempt() -> None:
     lab = asked(RescanKind.AGAIN, ["off"] * 10, attempts=2)
     assert len(lab.finished) == 2
     assert lab.problems == ()
@@ -99,14 +99,14 @@ def test_the_other_direction_is_scanned_and_the_direction_set_back() -> None:
     assert lab.problems == ()
 
 
-def test_the_other_direction_is_tried_once_and_costs_no_night() -> None:
+def test_opposite_direction_is_tried_once_only() -> None:
     lab = asked(RescanKind.OPPOSITE, ["unmatched"] * 3, upwards=False)
     assert len(lab.finished) == 1
     assert lab.problems == ()
 
 
 @pytest.mark.parametrize("kind", [RescanKind.OPPOSITE, RescanKind.SEARCH])
-def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is_no_drift(kind: int) -> None:
+def test_direction_and_region_are_restored_when_another_client_clears_the_problem(kind: int) -> None:
     lab = Drifting([])
     lab.at(10.0, lambda: lab.wants(kind, upwards=False))
     lab.at(60.0, lambda: lab.clear(DRIFT))
@@ -117,7 +117,7 @@ def test_direction_and_region_are_set_back_when_somebody_else_says_that_there_is
         assert (lab.parameters.region, lab.parameters.shape) == (REGION, (8, 8))
 
 
-def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_back() -> None:
+def test_search_widens_until_the_sample_is_found_and_restores_the_region() -> None:
     lab = asked(RescanKind.SEARCH, ["lost", "unmatched", "well"])
     assert [region.size_m[0] for region in lab.finished] == pytest.approx([2e-6, 4e-6, 8e-6])
     assert {region.center_m for region in lab.finished} == {REGION.center_m}
@@ -125,7 +125,7 @@ def test_a_search_gets_wider_until_the_sample_is_found_and_the_region_is_set_bac
     assert (lab.parameters.region, lab.parameters.shape) == (REGION, (8, 8))
 
 
-def test_a_sample_that_is_not_found_again_is_a_person_s_business() -> None:
+def test_sample_that_is_not_found_is_flagged_for_a_person() -> None:
     lab = asked(RescanKind.SEARCH, ["lost"] * 10)
     assert len(lab.finished) == 3
     assert lab.problems == (MALFUNCTION,)
@@ -135,7 +135,7 @@ def test_a_sample_that_is_not_found_again_is_a_person_s_business() -> None:
 
 
 def refusing(lab: Drifting, most_m: float) -> None:
-    """No region may be wider."""
+    """Refuse regions wider than this."""
 
     def too_wide(request: Request) -> Response | str:
         starts = lab.parameters if request.subject == "start-scan" else request.subject
@@ -148,7 +148,7 @@ def refusing(lab: Drifting, most_m: float) -> None:
 
 
 @pytest.mark.parametrize(("most_m", "widths"), [(3e-6, [2e-6, 2e-6]), (1.5e-6, [1e-6, 1e-6])])
-def test_a_search_is_as_wide_as_is_allowed(most_m: float, widths: list[float]) -> None:
+def test_search_stays_within_its_allowed_width(most_m: float, widths: list[float]) -> None:
     lab = Drifting(["lost", "well"])
     refusing(lab, most_m)
     lab.at(10.0, lambda: lab.wants(RescanKind.SEARCH))
@@ -159,7 +159,7 @@ def test_a_search_is_as_wide_as_is_allowed(most_m: float, widths: list[float]) -
 
 
 @pytest.mark.parametrize(("kind", "left"), [(RescanKind.SEARCH, (MALFUNCTION,)), (RescanKind.AGAIN, ())])
-def test_what_may_not_be_scanned_at_all_has_not_helped(kind: int, left: tuple[int, ...]) -> None:
+def test_refused_rescan_counts_as_failed(kind: int, left: tuple[int, ...]) -> None:
     lab = Drifting([])
     refusing(lab, 0.0)
     lab.at(10.0, lambda: lab.wants(kind))
@@ -169,7 +169,7 @@ def test_what_may_not_be_scanned_at_all_has_not_helped(kind: int, left: tuple[in
     assert lab.problems == left
 
 
-def test_killed_in_the_middle_it_sets_back_the_direction_from_before(tmp_path: Path) -> None:
+def test_original_direction_is_restored_after_a_kill(tmp_path: Path) -> None:
     (tmp_path / "rescanner.json").write_text(json.dumps({"direction_before": names.UP}))
     lab = Drifting(["well"])
     lab.values[names.SCAN_DIRECTION] = names.DOWN  # set in an earlier life
@@ -180,7 +180,7 @@ def test_killed_in_the_middle_it_sets_back_the_direction_from_before(tmp_path: P
     assert "direction_before" not in json.loads((tmp_path / "rescanner.json").read_text())
 
 
-def test_what_it_was_asked_for_by_its_own_scans_is_not_done_again() -> None:
+def test_rescan_requested_by_its_own_scans_is_not_repeated() -> None:
     lab = Drifting(["off", "off"])
     lab.at(10.0, lambda: lab.wants(RescanKind.AGAIN))
     lab.at(10.0 + 105.0, lambda: lab.wants(RescanKind.AGAIN))  # of its first scan
@@ -191,6 +191,6 @@ def test_what_it_was_asked_for_by_its_own_scans_is_not_done_again() -> None:
 
 
 @pytest.mark.parametrize("settings", [{"attempts": 0}, {"widen": 1.0}, {"most_pixels": 1}])
-def test_settings_that_can_not_be_are_refused(settings: dict[str, float]) -> None:
+def test_impossible_settings_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
         Rescanner(**settings)  # type: ignore[arg-type]

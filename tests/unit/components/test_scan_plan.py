@@ -1,4 +1,4 @@
-"""Plans: what is scanned, under which key, and when."""
+"""Plans: regions, keys and times."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_every_step_has_a_key_of_its_own(regions: tuple[Region, ...]) -> None:
     assert len(keys) == len(set(keys)) == plan.total == 5 * len(regions)
 
 
-def test_going_on_in_the_middle_gives_the_same_steps() -> None:
+def test_continued_plan_has_the_same_steps() -> None:
     plan = ScanPlan((HERE, THERE), (64, 64), rounds=3)
     assert list(plan.steps(4)) == list(plan.steps())[4:]
 
@@ -34,7 +34,7 @@ def test_only_the_first_region_of_a_round_waits_for_the_beat() -> None:
     assert [step.starts_round for step in ScanPlan((HERE, THERE), rounds=2).steps()] == [True, False, True, False]
 
 
-def test_a_plan_without_end_goes_on() -> None:
+def test_endless_plan_goes_on() -> None:
     plan = ScanPlan((HERE,), rounds=None)
     assert plan.total is None
     assert next(plan.steps(10_000)).key == "scan-10000"
@@ -53,7 +53,7 @@ def test_rounds_are_due_at_multiples_of_the_period() -> None:
     assert rhythm.next_due_s(1000.02) == 1900.0
 
 
-def test_after_a_long_round_the_next_is_due_on_the_old_beat_and_none_is_made_up_for() -> None:
+def test_round_after_a_long_one_is_due_on_the_old_beat_without_catching_up() -> None:
     rhythm = RoundSchedule(start_s=0.0, period_s=900.0)
     assert rhythm.next_due_s(3700.0) == 4500.0
     assert rhythm.left_out(1800.0, 4500.0) == 2
@@ -72,7 +72,7 @@ def test_without_a_period_everything_is_due_at_once() -> None:
     assert rhythm.left_out(5.0, 5.0) == 0
 
 
-def test_a_grid_is_gone_through_there_and_back() -> None:
+def test_grid_is_scanned_back_and_forth() -> None:
     points = grid_centers((0.0, 0.0), (3, 2), (1.0, 2.0))
     assert points == ((-1, -1), (0, -1), (1, -1), (1, 1), (0, 1), (-1, 1))
 
@@ -99,7 +99,7 @@ def test_a_series_of_eight_hours_every_fifteen_minutes_has_a_scan_at_both_ends()
     assert series.plan.shape == (32, 64)  # pixels are (columns, rows), a shape is (rows, columns)
 
 
-def test_a_series_with_two_ends_or_with_an_end_to_wait_for_that_never_comes_is_refused() -> None:
+def test_series_with_two_ends_or_an_unreachable_end_is_refused() -> None:
     with pytest.raises(ConfigError):
         ScanSeries(size=(1e-6, 1e-6), every=60.0, scans=3, duration=3600.0)
     with pytest.raises(ConfigError):

@@ -1,4 +1,4 @@
-"""A survey in the laboratory in memory: every target once, whatever happens."""
+"""A survey in the in-memory laboratory: every target once, over kills and refusals."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ def test_the_targets_are_zoomed_highest_first_with_a_curve_at_each_place(ran: An
     assert [row["zoom"] for row in rows] == ["scan-2.nc", "scan-3.nc", "scan-4.nc"]
 
 
-def test_the_picture_is_there_at_the_end(ran: Any, tmp_path: Path) -> None:
+def test_survey_leaves_a_picture(ran: Any, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     ran(ParticleLab())
     assert (tmp_path / "targets.png").stat().st_size > 50_000
 
 
-def test_a_target_outside_the_limits_is_told_as_refused_and_the_next_one_follows(ran: Any) -> None:
+def test_target_outside_limits_is_refused_in_the_table_and_the_next_follows(ran: Any) -> None:
     lab = ParticleLab(limit_m=1e-6)
     rows = ran(lab)
     assert [row["outcome"] for row in rows] == ["refused", "measured", "measured"]
@@ -70,7 +70,7 @@ def test_a_target_outside_the_limits_is_told_as_refused_and_the_next_one_follows
     assert len(lab.finished) == 3
 
 
-def test_without_targets_it_says_so_and_ends(ran: Any, caplog: pytest.LogCaptureFixture) -> None:
+def test_survey_without_targets_logs_that_and_ends(ran: Any, caplog: pytest.LogCaptureFixture) -> None:
     rows = ran(ParticleLab(), survey(min_height=1e-6))
     assert rows == []
     assert "no target found" in caplog.text
@@ -88,7 +88,7 @@ def test_parameters_are_set_before_the_survey_and_others_before_the_zooms(ran: A
     assert done == ["1.0", "start-scan", "2.0", "start-scan"]
 
 
-def test_a_problem_in_between_costs_nothing_but_time(ran: Any) -> None:
+def test_problem_in_between_only_delays_the_survey(ran: Any) -> None:
     lab = ParticleLab()
     lab.at(250.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
     lab.at(900.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
@@ -96,7 +96,7 @@ def test_a_problem_in_between_costs_nothing_but_time(ran: Any) -> None:
     assert (len(lab.finished), len(lab.spots)) == (4, 9)
 
 
-def test_when_the_experiment_is_ended_early_the_table_holds_what_there_is(ran: Any, tmp_path: Path) -> None:
+def test_table_after_an_early_end_has_the_results_so_far(ran: Any, tmp_path: Path) -> None:
     lab = ParticleLab()
     lab.at(350.0, lab.kill)
     rows = ran(lab)
@@ -104,7 +104,7 @@ def test_when_the_experiment_is_ended_early_the_table_holds_what_there_is(ran: A
 
 
 @pytest.mark.parametrize("is_late", [False, True])
-def test_killed_anywhere_no_scan_or_curve_is_missing_or_there_twice(tmp_path: Path, is_late: bool) -> None:
+def test_no_scan_or_curve_is_missing_or_repeated_after_a_kill_anywhere(tmp_path: Path, is_late: bool) -> None:
     for call in range(3, 260, 37):
         lab, folder = ParticleLab(), tmp_path / str(call)
         folder.mkdir()
@@ -126,21 +126,21 @@ def test_killed_anywhere_no_scan_or_curve_is_missing_or_there_twice(tmp_path: Pa
 
 
 def corners(scan: Scan) -> list[tuple[float, float]]:
-    """A finder of the user's: two places of the survey, and nothing in zooms."""
+    """A user's finder: two places of the survey, and nothing in zooms."""
     return [(1e-6, 1e-6), (-1e-6, 1e-6)] if scan.shape == (96, 96) else []
 
 
-def test_a_function_of_the_users_finds_the_targets(ran: Any) -> None:
+def test_user_function_finds_the_targets(ran: Any) -> None:
     lab = ParticleLab()
     rows = ran(lab, survey(targets=f"{__name__}.corners"))
     assert [(row["x"], row["y"], row["height"]) for row in rows] == [("1e-06", "1e-06", ""), ("-1e-06", "1e-06", "")]
     assert lab.spots[0] == (1e-6, 1e-6)
 
 
-def test_settings_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ConfigError, match="0 targets are none"):
+def test_invalid_survey_settings_are_refused() -> None:
+    with pytest.raises(ConfigError, match="0 is not at least 1"):
         survey(count=0)
-    with pytest.raises(ConfigError, match="says nothing of `targets`"):
+    with pytest.raises(ConfigError, match="applies to particles only"):
         survey(targets="my.function", min_height=1e-9)
     with pytest.raises(ConfigError, match="lies outside its zoom"):
         survey(curves={"beside": 300e-9})

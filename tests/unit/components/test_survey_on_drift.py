@@ -1,4 +1,4 @@
-"""The tutorial's survey on a sample that drifts: each scan is registered, and dead reckoning is never silent."""
+"""The tutorial's survey on a drifting sample: each scan is registered, and dead reckoning is never silent."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Surveyed = Callable[..., list[dict[str, str]]]
 
 @pytest.fixture
 def surveyed(tmp_path: Path) -> Surveyed:
-    """Runs the survey of a laboratory, and returns its table."""
+    """Run the survey of a laboratory, and return its table."""
 
     def surveyed(lab: DriftingLab, **settings: Any) -> list[dict[str, str]]:
         component = lab.survey(**settings)
@@ -42,7 +42,7 @@ def surveyed(tmp_path: Path) -> Surveyed:
 def test_every_scan_of_the_tutorials_survey_is_registered(surveyed: Surveyed, tmp_path: Path, seed: int) -> None:
     lab = DriftingLab(tmp_path, seed)
     rows = surveyed(lab)
-    assert [said.outcome for said in lab.told] == [RegistrationOutcome.REGISTERED] * len(lab.told)
+    assert [said.outcome for said in lab.registrations] == [RegistrationOutcome.REGISTERED] * len(lab.registrations)
     assert len(rows) >= 8
     assert [row["registration"] for row in rows] == ["registered"] * len(rows)
     assert all(0.0 < float(row["position_sd"]) < PIXEL_M / 2 for row in rows)
@@ -50,7 +50,7 @@ def test_every_scan_of_the_tutorials_survey_is_registered(surveyed: Surveyed, tm
 
 
 class Fails:
-    """An estimator that has an error over some pairs, of which no scan can be blamed."""
+    """An estimator that raises an error for some pairs of scans."""
 
     def __init__(self, every: int) -> None:
         self.calls, self.every = 0, every
@@ -78,12 +78,12 @@ def test_positions_without_a_registration_are_marked_in_the_table_with_their_unc
     assert "zooms: registered 0 of 4 scans, 4 failed" in caplog.text
 
 
-def test_where_the_estimator_fails_a_coarse_estimate_bridges(surveyed: Surveyed, tmp_path: Path) -> None:
+def test_coarse_estimate_bridges_a_failed_registration(surveyed: Surveyed, tmp_path: Path) -> None:
     failures: list[PairFailure] = []
     lab = DriftingLab(tmp_path, 1, estimator(Fails(every=1), failures.append), failures)
     rows = surveyed(lab, count=6)
     assert [row["registration"] for row in rows] == ["coarse"] * 6
-    assert all("ZeroDivisionError: oh" in said.failures[0] for said in lab.told[2:])
+    assert all("ZeroDivisionError: oh" in said.failures[0] for said in lab.registrations[2:])
     assert max(lab.off_m) < PIXEL_M
 
 

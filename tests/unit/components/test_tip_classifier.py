@@ -1,4 +1,4 @@
-"""The classifier in the laboratory in memory: what it flags, clears, tells and remembers."""
+"""The classifier in the in-memory laboratory: flags, verdicts, and saved state."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def publish_at(lab: Lab, at_s: float, pair: tuple[Scan, Scan]) -> None:
 
 
 def night(lab: Lab) -> tuple[tuple[Scan, Scan], ...]:
-    """Three scans to learn from, two of a double tip, one of a good tip again."""
+    """Take three scans to learn from, two of a double tip, and one of a good tip again."""
     pairs = channels(1, "double", 5)
     good_again = tuple(Scan(s.region, s.channel, s.unit, s.values, pairs[6][0].time_ns + 1) for s in pairs[3])
     story = (*pairs[:3], *pairs[5:7], good_again)
@@ -60,7 +60,7 @@ def test_a_changed_tip_is_flagged_once_and_a_good_one_clears_it() -> None:
     assert asked(lab, ControlRequest.RMV_EXP_PRBLM) == 1
 
 
-def test_each_scan_judged_is_told_with_its_time() -> None:
+def test_verdict_is_published_with_the_time_of_its_scan() -> None:
     lab = Lab("tip_classifier")
     story = night(lab)
     lab.at(700.0, lab.kill)
@@ -68,7 +68,7 @@ def test_each_scan_judged_is_told_with_its_time() -> None:
     assert verdicts_of(lab) == [(story[3][0].time_ns, BAD), (story[4][0].time_ns, BAD), (story[5][0].time_ns, GOOD)]
 
 
-def test_one_bad_scan_is_not_enough_if_two_are_asked_for() -> None:
+def test_single_bad_scan_is_not_flagged_if_two_are_required() -> None:
     lab = Lab("tip_classifier")
     pairs = channels(1, "double", 5)
     for number, pair in enumerate((*pairs[:3], pairs[5])):
@@ -78,7 +78,7 @@ def test_one_bad_scan_is_not_enough_if_two_are_asked_for() -> None:
     assert asked(lab, ControlRequest.ADD_EXP_PRBLM) == 0
 
 
-def test_what_was_learnt_and_judged_survives_a_kill(tmp_path: Path) -> None:
+def test_reference_and_counts_survive_a_kill(tmp_path: Path) -> None:
     lab = Lab("tip_classifier")
     pairs = channels(1, "double", 5)
     for number, pair in enumerate(pairs[:3]):
@@ -105,13 +105,13 @@ def test_nothing_is_learnt_while_a_problem_is_flagged() -> None:
     assert component.judge.kinds == ()
 
 
-def test_a_tip_that_somebody_has_seen_to_is_flagged_by_what_is_bad_from_then_on() -> None:
+def test_treated_tip_is_flagged_by_later_bad_scans_only() -> None:
     lab = Lab("tip_classifier")
     pairs = channels(1, "double", 5)
     for number, pair in enumerate((*pairs[:3], pairs[5])):
         publish_at(lab, 100.0 * (number + 1), pair)
     lab.at(500.0, lambda: lab.clear(TIP))
-    elsewhere = Region((0.0, 0.0), (5e-6, 5e-6))  # an overview, of which it can't tell
+    elsewhere = Region((0.0, 0.0), (5e-6, 5e-6))  # an overview, without a reference
     for scan in pairs[3]:
         overview = Scan(elsewhere, scan.channel, scan.unit, scan.values, (pairs[5][0].time_ns or 0) + 10**9)
         lab.at(600.0, lambda overview=overview: lab.publish(overview))
@@ -136,13 +136,13 @@ def test_a_kind_of_scan_that_is_new_while_a_problem_is_flagged_is_unclear_and_no
     assert len(component.judge.kinds) == 1
 
 
-def test_what_was_rightly_not_learnt_from_is_not_after_a_restart_either(tmp_path: Path) -> None:
+def test_scans_excluded_from_learning_stay_excluded_after_a_restart(tmp_path: Path) -> None:
     lab = Lab("tip_classifier")
     lab.at(50.0, lambda: lab.flag(TIP))
     publish_at(lab, 100.0, channels(1, "double", 5)[5])
     lab.at(
         120.0, lambda: lab.does(ArbitrationEvent.REQUEST_CONTROL, "tip_corrector", TIP)
-    )  # who is in control is told after it
+    )  # the holder of control is published after it
     lab.at(200.0, lab.parent_goes)
     run(classifier(), lab, tmp_path)
     lab.restart_component()
@@ -162,7 +162,7 @@ def test_channels_of_two_scans_are_not_taken_for_one() -> None:
     assert component.judge.kinds == ()
 
 
-def test_that_nothing_is_judged_for_want_of_a_channel_is_said_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_missing_channel_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab("tip_classifier")
     for number, (trace, retrace) in enumerate(channels(1, "double", 5)):
         named = replace(trace, channel="Z Forward"), replace(retrace, channel="Z Backward")

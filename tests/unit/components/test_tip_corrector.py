@@ -1,4 +1,4 @@
-"""The corrector in the laboratory in memory: what it does to a tip, and what it never does."""
+"""The corrector in the in-memory laboratory: its treatments of a tip, and treatments that it never makes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ TIP, MALFUNCTION = Problem.TIP_SHAPE_CHANGED, Problem.DEVICE_MALFUNCTION
 
 
 class Repairs(Lab):
-    """A microscope that can pulse and crash, and a classifier that gives the verdicts it is told to, then `UNCLEAR`."""
+    """A microscope that can pulse and crash, and a classifier with given verdicts, then `UNCLEAR`."""
 
     def __init__(self, verdicts: list[float]) -> None:
         super().__init__("tip_corrector")
@@ -66,7 +66,7 @@ class Repairs(Lab):
         return super()._execute(request)
 
     def stand_at(self, xy_m: tuple[float, float]) -> None:
-        """Somebody else has moved the probe."""
+        """Let a person move the probe."""
         self.position = ProbePosition(xy_m)
         self.publish(self.position)
 
@@ -107,7 +107,7 @@ def test_crashes_come_after_the_pulses() -> None:
     assert lab.problems == ()
 
 
-def test_what_is_done_is_done_away_from_the_scans_at_a_fresh_place_and_told() -> None:
+def test_treatments_are_made_at_fresh_places_away_from_scans_and_published() -> None:
     lab = repaired([BAD, BAD, GOOD])
     places = [place for _, place in lab.actions]
     assert len(set(places)) == 3
@@ -117,7 +117,7 @@ def test_what_is_done_is_done_away_from_the_scans_at_a_fresh_place_and_told() ->
 
 
 class MovesInItsFrame(Repairs):
-    """As GXSM: the tip is moved within the scan frame alone."""
+    """A microscope that, like GXSM, moves its tip only within the scan frame."""
 
     def _execute(self, request: Request) -> Response:
         if request.kind == ControlRequest.SET_PROBE_POS:
@@ -127,7 +127,7 @@ class MovesInItsFrame(Repairs):
         return super()._execute(request)
 
 
-def test_the_frame_goes_along_where_the_tip_is_moved_in_it_alone() -> None:
+def test_frame_moves_along_if_the_tip_moves_only_within_it() -> None:
     lab = MovesInItsFrame([BAD, BAD, GOOD])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, lab.kill)
@@ -138,19 +138,19 @@ def test_the_frame_goes_along_where_the_tip_is_moved_in_it_alone() -> None:
     assert lab.problems == ()
 
 
-def test_what_it_may_do_to_a_tip_the_microscope_has_to_be_able_to() -> None:
+def test_microscope_must_have_the_allowed_treatments() -> None:
     assert corrector().needs_actions == ("start-scan", "x-pulse", "x-crash")
     assert corrector(crash_depths=()).needs_actions == ("start-scan", "x-pulse")
     assert corrector(pulse_voltages=()).needs_actions == ("start-scan", "x-crash")
 
 
-def test_an_unclear_verdict_is_looked_at_again_without_another_treatment() -> None:
+def test_unclear_verdict_leads_to_another_test_scan_without_treatment() -> None:
     lab = repaired([UNCLEAR, GOOD])
     assert len(lab.actions) == 1
     assert len(lab.finished) == 2
 
 
-def test_the_first_test_scan_is_apart_and_the_next_where_the_sample_is_known() -> None:
+def test_first_test_scan_is_at_test_center_and_the_next_at_the_known_place() -> None:
     lab = repaired([UNCLEAR, GOOD], test_center=(0.0, 4e-6))
     assert lab.finished == [REGION.moved_to((0.0, 4e-6)), REGION]
 
@@ -159,7 +159,7 @@ ZOOM = Region((1e-6, 1e-6), (2e-7, 2e-7))
 
 
 def flagged_at_a_zoom(verdicts: list[float], *scores: float) -> Repairs:
-    """The zoom is judged, then the next region is set, and then the flag comes."""
+    """Judge the zoom, then set the next region, then flag."""
     lab = Repairs(verdicts)
 
     def judged() -> None:
@@ -185,18 +185,18 @@ def test_a_repair_is_tested_at_the_region_and_pixels_of_the_scan_judged_bad() ->
     assert lab.problems == ()
 
 
-def test_a_later_good_verdict_takes_back_where_the_fault_was_seen() -> None:
+def test_later_good_verdict_discards_the_frame_of_the_fault() -> None:
     assert flagged_at_a_zoom([GOOD], BAD, GOOD).finished == [REGION]
 
 
-def test_a_tip_that_stays_bad_is_given_up_on_loudly_after_what_is_allowed_and_no_more() -> None:
+def test_tip_that_stays_bad_is_given_up_after_the_allowed_treatments() -> None:
     lab = repaired([BAD] * 20, until_s=20_000.0)
     assert len(lab.actions) == 3
     assert lab.problems == (TIP, MALFUNCTION)
     assert lab.control.holder is None
 
 
-def test_after_a_person_has_looked_it_may_try_again() -> None:
+def test_repair_is_allowed_again_after_a_person_cleared_the_flag() -> None:
     lab = Repairs([BAD] * 3 + [GOOD])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, lambda: lab.clear(MALFUNCTION))
@@ -224,7 +224,7 @@ def test_a_treatment_that_a_limit_refuses_is_left_out(caplog: pytest.LogCaptureF
     assert "above the limit of 2 V" in caplog.text
 
 
-def test_a_test_scan_that_is_refused_is_told_and_the_next_taken_instead(caplog: pytest.LogCaptureFixture) -> None:
+def test_refused_test_scan_is_logged_and_replaced_by_the_next(caplog: pytest.LogCaptureFixture) -> None:
     lab = Repairs([GOOD])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, lab.kill)
@@ -235,7 +235,7 @@ def test_a_test_scan_that_is_refused_is_told_and_the_next_taken_instead(caplog: 
     assert "no test scan at (0, 4) µm" in caplog.text
 
 
-def test_a_tip_of_which_no_test_scan_can_be_taken_is_not_treated_any_further() -> None:
+def test_tip_without_a_possible_test_scan_is_not_treated_further() -> None:
     lab = Repairs([])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, lab.kill)
@@ -275,13 +275,13 @@ def test_its_own_judge_learns_nothing_from_the_test_scans_of_a_bad_tip() -> None
     assert repairing.judge.kinds == ()
 
 
-def test_no_treatment_near_what_is_scanned() -> None:
+def test_no_treatment_is_near_a_scanned_region() -> None:
     lab = repaired([], until_s=20_000.0, workshop_center=(0.6e-6, 0.0), keep_away=2e-6)
     assert lab.actions == []
     assert lab.problems == (TIP, MALFUNCTION)
 
 
-def test_a_microscope_that_cannot_crash_is_given_up_on_without_one() -> None:
+def test_microscope_without_crash_is_given_up_without_one() -> None:
     lab = Repairs([BAD] * 9)
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(20_000.0, lab.kill)
@@ -297,7 +297,7 @@ def test_a_microscope_that_cannot_crash_is_given_up_on_without_one() -> None:
 
 
 @pytest.mark.parametrize("is_late", [False, True])
-def test_killed_anywhere_it_never_does_more_than_is_allowed(tmp_path: Path, is_late: bool) -> None:
+def test_repair_never_exceeds_the_allowed_treatments_after_a_kill_anywhere(tmp_path: Path, is_late: bool) -> None:
     for call in range(1, 120, 6):
         lab = Repairs([BAD] * 30)
         lab.at(10.0, lambda lab=lab: lab.flag(TIP))
@@ -316,7 +316,7 @@ def test_killed_anywhere_it_never_does_more_than_is_allowed(tmp_path: Path, is_l
         assert lab.problems == (TIP, MALFUNCTION), f"killed at call {call}"
 
 
-def test_settings_without_sense_are_refused() -> None:
+def test_invalid_settings_are_refused() -> None:
     for wrong in ({"pulse_voltages": (), "crash_depths": ()}, {"place_spacing": 0.0}, {"workshop_center": (1.0,)}):
         with pytest.raises((ConfigError, ValueError)):
             corrector(**wrong)
@@ -327,14 +327,14 @@ def is_of_treatment(request: Request) -> bool:
 
 
 def a_person_takes_over(lab: Repairs) -> None:
-    """Sets MANUAL, moves the probe to where the experiment scans, and hands back."""
+    """Set MANUAL, move the probe to the experiment's region, and set AUTOMATED again."""
     lab.set_mode(ControlMode.MANUAL)
     lab.at(60.0, lambda: lab.stand_at((0.0, 0.0)))
     lab.at(90.0, lambda: lab.set_mode(ControlMode.AUTOMATED))
 
 
 def just_before(lab: Repairs, kind: ControlRequest, happens: Callable[[], None], number: int = 1) -> None:
-    """Something happens just before the scheduler hears the `number`-th request of a kind."""
+    """Call a function just before the scheduler gets the `number`-th request of a kind."""
     heard = 0
 
     def intercept(request: Request) -> Response | str:
@@ -357,7 +357,7 @@ def just_before(lab: Repairs, kind: ControlRequest, happens: Callable[[], None],
         (ControlRequest.ACTION, 1),
     ],
 )
-def test_a_probe_that_a_person_has_moved_is_moved_back_before_the_tip_is_treated(
+def test_probe_moved_by_a_person_is_moved_back_before_a_treatment(
     kind: ControlRequest, number: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -373,7 +373,7 @@ def test_a_probe_that_a_person_has_moved_is_moved_back_before_the_tip_is_treated
     assert lab.problems == ()
 
 
-def test_a_region_that_a_person_has_chosen_over_the_workshop_is_kept_away_from(
+def test_treatments_keep_away_from_a_region_chosen_by_a_person(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     lab = Repairs([BAD] * 9)
@@ -391,7 +391,7 @@ def test_a_region_that_a_person_has_chosen_over_the_workshop_is_kept_away_from(
     assert MALFUNCTION in lab.problems
 
 
-def test_nothing_is_done_where_the_probe_is_not_published_to_stand(caplog: pytest.LogCaptureFixture) -> None:
+def test_no_treatment_is_made_unless_the_published_probe_position_fits(caplog: pytest.LogCaptureFixture) -> None:
     lab = Repairs([])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(20_000.0, lab.kill)
@@ -409,7 +409,7 @@ def test_nothing_is_done_where_the_probe_is_not_published_to_stand(caplog: pytes
 
 
 @pytest.mark.parametrize("is_done", [False, True])
-def test_a_treatment_that_was_not_answered_before_a_person_took_over_is_not_asked_for_again(is_done: bool) -> None:
+def test_treatment_without_an_answer_is_not_requested_again(is_done: bool) -> None:
     lab = Repairs([BAD, GOOD])
     lab.at(10.0, lambda: lab.flag(TIP))
     lab.at(5000.0, lab.kill)
@@ -431,7 +431,7 @@ def test_a_treatment_that_was_not_answered_before_a_person_took_over_is_not_aske
     assert lab.problems == ()
 
 
-def test_what_can_not_be_written_down_is_not_done(
+def test_treatment_that_can_not_be_saved_is_not_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(descriptor: int) -> None:
@@ -447,7 +447,7 @@ def test_what_can_not_be_written_down_is_not_done(
     assert "the tip can't be repaired: the disk is full" in caplog.text
 
 
-def test_once_there_is_room_again_and_a_person_has_looked_it_is_repaired(
+def test_tip_is_repaired_once_the_disk_has_room_and_a_person_cleared_the_flag(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fsync, is_full = os.fsync, True

@@ -1,4 +1,4 @@
-"""Judging tips by their scans, against a simulation whose tips are known."""
+"""Verdicts on tips by their scans, against a simulation with known tips."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def judged(judge: TipJudge, pair: tuple[Scan, Scan]) -> Verdict:
 def learnt(
     seed: int, condition: str, number: int = 5
 ) -> tuple[TipJudge, list[tuple[Scan, Scan]], list[tuple[Scan, Scan]]]:
-    """A judge that has learnt, the scans of the good tip that are left, and those of the changed one."""
+    """Return a judge with a reference, further scans with the good tip, and scans with the changed one."""
     pairs = channels(seed, condition, number)
     judge = TipJudge(LEARN)
     for pair in pairs[:LEARN]:
@@ -42,7 +42,7 @@ def at_home(pairs: list[tuple[Scan, Scan]]) -> list[tuple[Scan, Scan]]:
 
 @pytest.mark.parametrize("condition", FLAWS)
 @pytest.mark.parametrize("seed", range(2))
-def test_a_good_tip_is_good_and_a_changed_one_bad_where_the_sample_is_known(seed: int, condition: str) -> None:
+def test_judge_distinguishes_good_from_changed_tips_at_known_places(seed: int, condition: str) -> None:
     judge, good, bad = learnt(seed, condition)
     for pair in at_home(good):
         assert judged(judge, pair).opinion is Opinion.GOOD
@@ -53,7 +53,7 @@ def test_a_good_tip_is_good_and_a_changed_one_bad_where_the_sample_is_known(seed
 @pytest.mark.parametrize(
     ("condition", "word"), [("double", "double"), ("blunt", "blunt"), ("contaminated", "blunt|unsteady")]
 )
-def test_a_verdict_says_what_is_wrong(condition: str, word: str) -> None:
+def test_verdict_names_the_fault(condition: str, word: str) -> None:
     judge, _, bad = learnt(1, condition)
     assert any(part in judged(judge, bad[0]).why for part in word.split("|"))
 
@@ -68,14 +68,14 @@ def test_an_unknown_place_does_not_make_a_good_tip_bad(seed: int) -> None:
 
 @pytest.mark.parametrize("condition", FLAWS)
 @pytest.mark.parametrize("seed", range(2))
-def test_a_fault_found_where_the_sample_is_known_is_not_called_over_elsewhere(seed: int, condition: str) -> None:
+def test_fault_found_at_a_known_place_is_not_cleared_elsewhere(seed: int, condition: str) -> None:
     judge, _, bad = learnt(seed, condition)
     assert judged(judge, bad[0]).opinion is Opinion.BAD
     assert bad[-1][0].region == ELSEWHERE
     assert judged(judge, bad[-1]).opinion is not Opinion.GOOD
 
 
-def test_what_was_learnt_survives_a_restart() -> None:
+def test_reference_survives_a_restart() -> None:
     judge, good, bad = learnt(2, "double")
     again = TipJudge(LEARN)
     again.restore(json.loads(json.dumps(judge.state())))
@@ -94,27 +94,27 @@ def test_a_sample_so_smooth_that_its_first_scans_had_no_fine_detail_is_judged_by
     assert judged(judge, left[0]).opinion is Opinion.GOOD
 
 
-def test_without_a_retrace_a_double_tip_is_still_seen() -> None:
+def test_double_tip_is_detected_without_retrace() -> None:
     pairs = channels(1, "double", 5)
     judge = TipJudge(LEARN)
     opinions = [judge.judge(trace.values, None, trace.region).opinion for trace, _ in pairs[:4] + pairs[5:7]]
     assert opinions[LEARN:] == [Opinion.GOOD, Opinion.BAD, Opinion.BAD]
 
 
-def test_nothing_but_noise_says_nothing_of_the_tip() -> None:
+def test_scan_of_pure_noise_is_unclear() -> None:
     random = np.random.default_rng(1)
     noise = random.normal(size=(2, PIXELS, PIXELS)) * 1e-10
     assert TipJudge(LEARN).judge(noise[0], noise[1], HOME).opinion is Opinion.UNCLEAR
 
 
 def zoom_of(pair: tuple[Scan, Scan]) -> tuple[np.ndarray, np.ndarray, Region]:
-    """The middle of a scan, as a scan of its own: of another size and other pixels."""
+    """Return the middle of a scan as a scan of its own, with another size and other pixels."""
     trace, retrace = (scan.values[16:80, 16:80] for scan in pair)
     return trace, retrace, Region((0.0, 0.0), (HOME.size_m[0] * 64 / PIXELS, HOME.size_m[1] * 64 / PIXELS))
 
 
 def both_kinds(seed: int, condition: str) -> tuple[TipJudge, list[tuple[Scan, Scan]], list[tuple[Scan, Scan]]]:
-    """A judge that has learnt whole scans and their middles, one after the other in turns."""
+    """Return a judge with references of whole scans and of their middles, learnt in turns."""
     pairs = channels(seed, condition, 5)
     judge = TipJudge(LEARN)
     for pair in pairs[:LEARN]:
@@ -136,7 +136,7 @@ def test_scans_of_two_sizes_are_each_compared_with_their_own_kind(seed: int, con
         assert judged(judge, pair).opinion is Opinion.BAD
 
 
-def test_another_kind_is_not_learnt_from_while_the_tip_may_be_bad() -> None:
+def test_new_kind_of_scan_is_not_learnt_while_the_tip_may_be_bad() -> None:
     judge, good, bad = learnt(0, "double")
     assert judged(judge, bad[0]).opinion is Opinion.BAD
     assert judge.judge(*zoom_of(bad[1])).opinion is Opinion.UNCLEAR
@@ -145,7 +145,7 @@ def test_another_kind_is_not_learnt_from_while_the_tip_may_be_bad() -> None:
     assert judge.judge(*zoom_of(good[0]), learns=False).opinion is Opinion.UNCLEAR
 
 
-def test_what_was_learnt_between_the_last_good_scan_and_a_bad_one_is_forgotten() -> None:
+def test_scans_learnt_between_the_last_good_and_a_bad_one_are_forgotten() -> None:
     judge, good, bad = learnt(0, "double")
     assert judged(judge, good[0]).opinion is Opinion.GOOD
     for pair in bad[:LEARN]:
@@ -155,7 +155,7 @@ def test_what_was_learnt_between_the_last_good_scan_and_a_bad_one_is_forgotten()
     assert len(judge.kinds) == 1
 
 
-def test_a_fault_is_not_called_over_by_coarser_scans() -> None:
+def test_fault_is_not_cleared_by_coarser_scans() -> None:
     judge, good, bad = learnt(0, "double")
     coarse = [(t.values[::2, ::2], r.values[::2, ::2], t.region) for t, r in [*good[:1], *channels(0, "double", 5)[:3]]]
     assert judged(judge, good[0]).opinion is Opinion.GOOD
@@ -206,12 +206,12 @@ def test_a_few_missing_lines_do_no_harm() -> None:
     assert judge.judge(trace, retrace, HOME).opinion is not Opinion.BAD
 
 
-def test_two_scans_of_different_shape_are_no_pair() -> None:
+def test_scans_of_different_shape_are_no_pair() -> None:
     with pytest.raises(InvalidValue):
         slopes(np.zeros((64, 64)), np.zeros((64, 63)))
 
 
-def test_a_ghost_is_found_where_it_is() -> None:
+def test_ghost_is_found_at_its_distance() -> None:
     random = np.random.default_rng(3)
     rows, columns = np.mgrid[0:96, 0:120]
     heights = np.zeros((96, 120))
@@ -237,11 +237,11 @@ def test_opinions_in_a_row_set_and_clear_a_flag_and_unclear_ones_do_not_count() 
 
 
 @pytest.mark.parametrize("wrong", [{"detail": 1.5}, {"ghost": 0.0}, {"unrest": 1.0}, {"sigmas": -1.0}, {"margin": 0.0}])
-def test_tolerances_without_sense_are_refused(wrong: dict[str, float]) -> None:
+def test_invalid_tolerances_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError):
         TipTolerance(**wrong)
 
 
-def test_one_reference_scan_is_too_few() -> None:
+def test_single_reference_scan_is_too_few() -> None:
     with pytest.raises(ConfigError):
         TipJudge(1)

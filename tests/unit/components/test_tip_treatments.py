@@ -1,4 +1,4 @@
-"""What may be done to a tip, and where."""
+"""Allowed treatments of a tip, and their places."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from afspm.components.tip_treatments import Crash, Pulse, clearance_m, fresh_pla
 from afspm.model import Region
 
 
-def test_the_gentle_ones_come_first_and_no_more_is_done_than_listed() -> None:
+def test_gentle_treatments_come_first_and_only_listed_ones_are_made() -> None:
     assert treatments([3.0, -4.0], 0.05, [5e-9, 1e-8], 5e-8) == (
         Pulse(3.0, 0.05),
         Pulse(-4.0, 0.05),
@@ -31,7 +31,7 @@ def test_the_gentle_ones_come_first_and_no_more_is_done_than_listed() -> None:
         ([], 0.1, [1e-9], 0.0),
     ],
 )
-def test_what_is_no_treatment_is_refused(
+def test_invalid_treatment_is_refused(
     voltages: list[float], duration: float, depths: list[float], speed: float
 ) -> None:
     with pytest.raises(ConfigError):

@@ -1,4 +1,4 @@
-"""Scans of the simulated world for judging tips: the same sample with a tip that changes when it is told to."""
+"""Simulated scans for judging tips: the same sample, with a tip that changes on command."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def world(seed: int, condition: str = "sharp", surface: str = "particles") -> Wo
 
 @cache
 def channels(seed: int, condition: str, number: int, surface: str = "particles") -> tuple[tuple[Scan, Scan], ...]:
-    """Scans of HOME before and after the change of the tip, `number` of each, and one of ELSEWHERE before and after."""
+    """Return `number` scans of HOME before and after the change of the tip, and one of ELSEWHERE each."""
     made = world(seed, condition, surface)
     times = [200.0 * i for i in range(number)] + [CHANGED_S + 200.0 * (i + 1) for i in range(number)]
     places = [HOME] * len(times)

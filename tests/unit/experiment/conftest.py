@@ -128,7 +128,7 @@ class NoComponent:
 PYTHON = json.dumps(sys.executable)
 """The one program that is on every computer; texts say "python3" for it."""
 
-# commands, so that these tests are about the file and not about what is ready-made
+# commands, so that these tests depend on the file and not on classes
 FRAME = f"""
 [scheduler]
 component = true
@@ -147,7 +147,7 @@ Write = Callable[..., Experiment]
 
 @pytest.fixture
 def write(tmp_path: Path) -> Write:
-    """Writes an experiment file (with scheduler and translator, unless `frame` is empty) and loads it."""
+    """Write an experiment file (with scheduler and translator, unless `frame` is empty) and load it."""
     (tmp_path / "parts.py").write_text(COMPONENTS, encoding="utf-8")
 
     def write(text: str, *overlays: str, frame: str = FRAME) -> Experiment:
@@ -162,7 +162,7 @@ def write(tmp_path: Path) -> Write:
 
 
 def line_of(experiment: Experiment, start: str, file: str = "night.toml") -> int:
-    """The line (from 1) of a file of the experiment that begins with `start`."""
+    """Return the number (from 1) of the line that begins with `start`."""
     lines = (experiment.folder / file).read_text(encoding="utf-8").splitlines()
     return next(i for i, line in enumerate(lines, 1) if line.startswith(start))
 

@@ -1,4 +1,4 @@
-"""Classes out of modules beside an experiment file."""
+"""Classes from modules beside an experiment file."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ import pytest
 from afspm.experiment import class_loader
 
 
-def test_modules_beside_the_file_are_forgotten_and_those_of_an_environment_in_its_folder_are_not(
+def test_modules_beside_the_file_are_unloaded_and_modules_of_an_environment_in_its_folder_are_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else numpy, say, would have to be imported once more, which it refuses."""
+    """numpy, for one, refuses a second import."""
     environment = tmp_path / ".venv" / "site-packages"
     for file in (tmp_path / "beside.py", tmp_path / "package" / "__init__.py", environment / "library.py"):
         file.parent.mkdir(parents=True, exist_ok=True)

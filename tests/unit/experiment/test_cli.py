@@ -29,7 +29,7 @@ def test_check_of_a_good_file_ends_with_0(write: Write, runner: CliRunner) -> No
     assert "night: 4 processes, nothing wrong" in result.output
 
 
-def test_check_tells_every_error_with_file_and_line_and_ends_with_1(write: Write, runner: CliRunner) -> None:
+def test_check_prints_every_error_with_file_and_line_and_ends_with_1(write: Write, runner: CliRunner) -> None:
     write("[clock]\nsped = 2\n" + CORRECTOR + 'volage = "3 V"\nvoltage = "2 nm"\n')
     result = runner.invoke(app, ["check", "night.toml"])
     assert result.exit_code == 1
@@ -39,19 +39,19 @@ def test_check_tells_every_error_with_file_and_line_and_ends_with_1(write: Write
     assert "3 errors" in result.output
 
 
-def test_check_of_an_absent_file_says_no_more_than_that(runner: CliRunner) -> None:
+def test_check_of_a_missing_file_prints_only_that(runner: CliRunner) -> None:
     result = runner.invoke(app, ["check", "absent.toml"])
     assert result.exit_code == 1
     assert result.output == "absent.toml: error: the file can't be read: No such file or directory\n"
 
 
-def test_check_lays_files_over_each_other(write: Write, runner: CliRunner) -> None:
+def test_check_merges_files(write: Write, runner: CliRunner) -> None:
     write(CORRECTOR, '[repair]\nvoltage = "2 nm"\n')
     result = runner.invoke(app, ["check", "night.toml", "over1.toml"])
     assert "over1.toml:2: error" in result.output
 
 
-def test_check_prints_what_the_file_expands_to(write: Write, runner: CliRunner) -> None:
+def test_check_prints_the_expanded_file(write: Write, runner: CliRunner) -> None:
     write('volts = "2 V"\n' + CORRECTOR + 'voltage = "volts"\n')
     result = runner.invoke(app, ["check", "night.toml", "--expanded"])
     assert tomllib.loads(result.stdout)["repair"]["voltage"] == "2 V"
@@ -85,14 +85,14 @@ def test_help_keeps_names_in_brackets_and_fills_its_paragraphs(runner: CliRunner
     assert len(paragraph[0].rstrip()) > 70
 
 
-def test_every_command_is_listed_under_when_it_is_used(runner: CliRunner) -> None:
+def test_each_command_is_listed_in_its_panel(runner: CliRunner) -> None:
     helped = runner.invoke(app, ["--help"]).output
     order = ["run ", "Before", "check", "While it runs", "watch", "Afterwards", "report", "Microscopes", "emulate"]
     places = [helped.index(f"─ {title}" if title[0].isupper() else f"│ {title}") for title in order]
     assert places == sorted(places)
 
 
-def test_says_its_version(runner: CliRunner) -> None:
+def test_version_is_printed(runner: CliRunner) -> None:
     result = runner.invoke(app, ["--version"])
     assert result.exit_code == 0
     assert result.output.split()[0] == "afspm"

@@ -1,4 +1,4 @@
-"""The Drift Compensated Scheduler in an experiment file: its table is checked, and components know what places mean."""
+"""The Drift Compensated Scheduler in an experiment file: its table, and the coordinates of components."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def launched(write: Write, text: str) -> dict[str, Any]:
     return {start.launch.name: start.launch for start in found}
 
 
-def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_it(write: Write) -> None:
+def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_unchanged(write: Write) -> None:
     drift = 'correct_after = "2 h", tracker = { class = "paper", queue = 3 }, rescan = { tolerance = "20 nm" }'
     launch = launched(write, experiment(drift))["scheduler"]
     from afspm.transport.process.loading import load
@@ -61,11 +61,11 @@ def test_settings_reach_the_scheduler_in_si_and_a_table_with_a_class_is_left_to_
         ("rescan = { tolerance = 0.0 }", "tolerance = 0.0 m is not above zero"),
     ],
 )
-def test_what_is_wrong_with_it_is_told_before_it_runs(write: Write, drift: str, said: str) -> None:
+def test_wrong_drift_settings_are_errors_of_the_check(write: Write, drift: str, said: str) -> None:
     assert said in only_error(write(experiment(drift), frame="")).what
 
 
-def test_components_know_whose_places_they_see(write: Write) -> None:
+def test_components_know_whether_places_are_in_sample_coordinates(write: Write) -> None:
     compensated = launched(write, experiment())
     assert compensated["rescanner"].sample_coordinates
     assert not compensated["microscope"].sample_coordinates
@@ -73,18 +73,18 @@ def test_components_know_whose_places_they_see(write: Write) -> None:
     assert not plain["rescanner"].sample_coordinates
 
 
-def test_a_rescanner_without_anybody_to_ask_it_is_told_of(write: Write) -> None:
+def test_rescanner_without_a_drift_scheduler_is_a_finding(write: Write) -> None:
     found = errors(write(experiment(name="Scheduler"), frame=""))
     assert ["no component publishes" in one.what for one in found] == [True, True]  # wishes, and what comes of them
 
 
-def test_drift_must_be_somebody_s_business(write: Write) -> None:
+def test_drift_problem_needs_a_solver(write: Write) -> None:
     alone = MICROSCOPE + SCHEDULER.format(name="DriftCompensatedScheduler")
     assert "thermal-drift" in only_error(write(alone, frame="")).what
     assert not errors(write(alone + '[control]\nsolved_by_hand = ["thermal-drift", "device-malfunction"]\n', frame=""))
 
 
-def test_the_published_names_are_ours(write: Write) -> None:
+def test_published_names_of_drift_classes_are_known(write: Write) -> None:
     names = launched(
         write,
         experiment(
@@ -97,9 +97,7 @@ def test_the_published_names_are_ours(write: Write) -> None:
 
 
 @pytest.mark.parametrize(("rescanner", "solved"), [(True, ("thermal-drift",)), (False, ())])
-def test_the_scheduler_is_told_which_problems_are_solved(
-    write: Write, rescanner: bool, solved: tuple[str, ...]
-) -> None:
+def test_scheduler_gets_the_solved_problems(write: Write, rescanner: bool, solved: tuple[str, ...]) -> None:
     text = experiment() if rescanner else experiment().replace(RESCANNER.format(name="Rescanner"), BY_HAND)
     assert launched(write, text)["scheduler"].solved == solved
 

@@ -1,4 +1,4 @@
-"""The picture of an experiment: everything is in it, and no two texts overlap."""
+"""The picture of an experiment has all parts, and no overlapping texts."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def texts(svg: str) -> list[ElementTree.Element]:
     return [e for e in root.iter("{http://www.w3.org/2000/svg}text") if e.get("aria-hidden") is None]
 
 
-def test_all_parts_sockets_and_envelopes_are_in_the_picture(write: Write) -> None:
+def test_picture_has_all_parts_sockets_and_envelopes(write: Write) -> None:
     shown = " | ".join(e.text or "" for e in texts(draw(write(TEXT))))
     for wanted in ("watch", "repair", "scheduler", "microscope", "flags tip-shape-changed", "solves tip-shape-changed",
                    "Scan2d", "ControlState", "PeakList at tcp://127.0.0.1:9000", "simulated microscope",
@@ -68,7 +68,7 @@ def test_an_experiment_of_nothing_but_scheduler_and_translator_can_be_drawn(writ
 
 
 def _extent(e: ElementTree.Element) -> tuple[float, float, float, float, str]:
-    """Left, top, right and bottom of a text."""
+    # left, top, right, bottom of a text
     x, y, size = (float(e.get(key, "0")) for key in ("x", "y", "font-size"))
     text = e.text or ""
     wide = text_width(text, size, bold=e.get("font-weight") is not None)

@@ -33,7 +33,7 @@ EACH = [
 ]
 
 
-def test_all_that_is_wrong_in_all_tables_is_found_at_once(write: Write) -> None:
+def test_errors_in_all_tables_are_found_at_once(write: Write) -> None:
     experiment = write(MICROSCOPE + WRONG, frame=WITHOUT_MICROSCOPE)
     found = {error.what.split(":")[0]: error.place.line for error in errors(experiment)}
     assert found == {f"[microscope] {where}": line_of(experiment, line) for where, line in EACH}
@@ -47,8 +47,8 @@ def test_an_error_beside_the_tables_hides_none_within_them(write: Write) -> None
         assert where in said
 
 
-def test_what_only_follows_from_another_error_is_not_told(write: Write) -> None:
-    """A setpoint is a current or a voltage by the feedback's mode; no more is said of it than of what is wrong."""
+def test_consequence_of_another_error_is_not_reported(write: Write) -> None:
+    """A setpoint is a current or a voltage, depending on the mode of the feedback, which is wrong here."""
     wrong = 'feedback = 3\ninitial = { zctrl-setpoint = "100 pA" }\n'
     (error,) = errors(write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE))
     assert "feedback" in error.what
@@ -57,7 +57,7 @@ def test_what_only_follows_from_another_error_is_not_told(write: Write) -> None:
     assert "feedback.mode" in error.what
 
 
-def test_a_row_of_parameters_is_looked_at_as_a_whole(write: Write) -> None:
+def test_row_of_parameters_is_checked_as_a_whole(write: Write) -> None:
     wrong = "parameters = { scan-angle = { rnge = [1, 2], sgn = 3 }, scan-speed = { unit = 3 } }\n"
     experiment = write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE)
     said = [error.what for error in errors(experiment)]
@@ -66,19 +66,19 @@ def test_a_row_of_parameters_is_looked_at_as_a_whole(write: Write) -> None:
     assert {error.place.line for error in errors(experiment)} == {line_of(experiment, "parameters")}
 
 
-def test_a_picture_that_is_not_there_hides_nothing_else(write: Write) -> None:
+def test_missing_picture_hides_no_other_error(write: Write) -> None:
     wrong = 'surface = { kind = "file", path = "./none.png" }\ntip = { radus_m = 1.0 }\nfeedback = { mode = "no" }\n'
     said = "\n".join(error.what for error in errors(write(MICROSCOPE + wrong, frame=WITHOUT_MICROSCOPE)))
     for what in ("none.png", "tip.radus_m", "feedback.mode"):
         assert what in said
 
 
-def test_what_an_emulated_controller_is_told_is_found_at_once(write: Write) -> None:
+def test_errors_in_settings_of_an_emulator_are_found_at_once(write: Write) -> None:
     emulated = '[controller]\ncomponent = true\nclass = "AsylumEmulator"\ntip = { radus_m = 1.0 }\n'
     emulated += 'noise = { whit_m = 1.0 }\nfaults = ["no-such"]\n'
     assert len(errors(write(emulated))) == 3
 
 
-def test_a_row_that_is_no_table_is_an_error_and_no_failure(write: Write) -> None:
+def test_row_that_is_no_table_is_an_error(write: Write) -> None:
     experiment = write(MICROSCOPE + "parameters = { tip-bias-voltage = 5 }\n", frame=WITHOUT_MICROSCOPE)
     assert "tip-bias-voltage" in " ".join(error.what for error in errors(experiment))

@@ -1,4 +1,4 @@
-"""[limits] becomes the limits of the scheduler; what contradicts is an error, also against what is planned."""
+"""[limits] becomes the scheduler's limits; contradictions, also with plans, are errors."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_a_small_number_without_a_unit_is_in_si(write: Write) -> None:
     assert not errors(write("[limits]\nregion = { x = [-3e-6, 3e-6], y = [-3e-6, 3e-6] }\n" + BIAS + "max = 3\n"))
 
 
-def test_an_action_among_the_parameters_is_told_where_it_belongs(write: Write) -> None:
+def test_action_among_the_parameters_is_an_error_with_its_place(write: Write) -> None:
     assert "[limits.actions.start-scan]" in only_error(write("[limits.start-scan]\nonly = []\n")).hint
 
 
@@ -120,7 +120,7 @@ SETPOINT = "[limits.zctrl-setpoint]\n"
         ('rate = "1 nA/min"\n', (None, None, None, 1e-9 / 60, "A")),
     ],
 )
-def test_a_limit_of_unknown_dimension_is_in_si_and_says_so(
+def test_limit_of_unknown_dimension_is_in_si_with_a_warning(
     write: Write, text: str, found: tuple[float | None, ...]
 ) -> None:
     experiment = write(SETPOINT + text)
@@ -184,7 +184,7 @@ SIMULATED = '[scheduler]\ncomponent = true\nclass = "Scheduler"\n[microscope]\nc
         ("", "0.9 V", ""),
         ("", "1 nA", "nA can't be converted to V"),
         ('feedback = { mode = "current", setpoint = 1e-10 }\n', "1 nA", ""),
-        ('surface = "lattice"\n', "1 nA", ""),  # where it tunnels, unless said otherwise
+        ('surface = "lattice"\n', "1 nA", ""),  # by default it tunnels
     ],
 )
 def test_a_setpoint_is_limited_in_the_unit_of_the_operating_mode(
@@ -197,7 +197,7 @@ def test_a_setpoint_is_limited_in_the_unit_of_the_operating_mode(
 ADDED = 'actions = { x-high = { set = { tip-bias-voltage = "8 V", scan-angle = 90 } } }\n'
 
 
-def test_what_an_added_action_sets_is_limited_too(write: Write) -> None:
+def test_parameters_set_by_an_added_action_are_limited_too(write: Write) -> None:
     experiment = write(BIAS + 'max = "3 V"\n', frame=SIMULATED + ADDED)
     error = only_error(experiment)
     assert "always refuse x-high: tip-bias-voltage = 8 V is above the highest allowed, 3 V" in error.what
@@ -205,7 +205,7 @@ def test_what_an_added_action_sets_is_limited_too(write: Write) -> None:
     assert error.place.line == line_of(experiment, "actions")
 
 
-def test_what_added_actions_set_reaches_the_scheduler(write: Write) -> None:
+def test_parameters_set_by_added_actions_reach_the_scheduler(write: Write) -> None:
     experiment = write(CORRECTOR + BIAS + 'only = ["repair"]\n', frame=SIMULATED + ADDED)
     assert not errors(experiment)
     limits = from_plain(ExperimentLimits, json.loads(json.dumps(to_plain(experiment.resolved.limits))))
@@ -218,7 +218,7 @@ def test_what_added_actions_set_reaches_the_scheduler(write: Write) -> None:
     assert "only repair" in refusal.reason
 
 
-def test_a_rate_of_a_wrong_unit_is_told_what_a_rate_is(write: Write) -> None:
+def test_rate_with_a_wrong_unit_is_an_error_with_an_example(write: Write) -> None:
     error = only_error(write('[limits.scan-speed]\nrate = "1 um/s^2"\n'))
     assert "1 m/s/s" in error.hint
 

@@ -1,4 +1,4 @@
-"""What components need of the microscope is asked before anything runs."""
+"""Needs of components are compared with the microscope's capabilities before a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ set = { x-spec-kind = "force" }
 """
 
 
-def test_what_the_microscope_lacks_is_named_with_who_needs_it(write: Write) -> None:
+def test_missing_capability_is_named_with_the_component_that_needs_it(write: Write) -> None:
     found = [finding.what for finding in errors(write(SWAPPER, frame=SIMULATED))]
     assert found == [
         "[swapper] needs the action 'x-swap-mode', which [microscope] does not have",
@@ -27,7 +27,7 @@ def test_what_the_microscope_lacks_is_named_with_who_needs_it(write: Write) -> N
     ]
 
 
-def test_what_the_experiment_file_adds_to_the_microscope_is_there(write: Write) -> None:
+def test_parameters_and_actions_added_by_the_file_count_as_capabilities(write: Write) -> None:
     assert errors(write(SWAPPER, frame=SIMULATED + ADDED)) == []
 
 
@@ -35,7 +35,7 @@ def test_a_command_that_is_the_translator_may_have_everything(write: Write) -> N
     assert errors(write(SWAPPER)) == []
 
 
-def test_a_ready_made_component_needs_what_its_settings_say(write: Write) -> None:
+def test_needs_of_a_component_follow_its_settings(write: Write) -> None:
     assert errors(write(SERIES + 'parameters = { scan-speed = "2 um/s" }\n', frame=SIMULATED)) == []
     error = only_error(write(SERIES + 'parameters = { scan-sped = "2 um/s" }\n', frame=SIMULATED))
     assert "[series] needs the parameter 'scan-sped'" in error.what
@@ -51,7 +51,7 @@ def test_a_ready_made_component_needs_what_its_settings_say(write: Write) -> Non
         '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["3 um", "3 um"]\n',
     ],
 )
-def test_all_that_ready_made_components_need_the_simulator_has(write: Write, component: str) -> None:
+def test_simulator_has_all_needs_of_components(write: Write, component: str) -> None:
     experiment = write(component, frame=SIMULATED)
     assert errors(experiment) == []
     declared = [one.declared for one in experiment.resolved.processes.values() if one.declared.needs_actions]
@@ -71,7 +71,7 @@ def warnings(experiment: Experiment) -> list[Finding]:
     return [finding for finding in found if "pixels of the survey" in finding.what]
 
 
-def test_a_survey_too_coarse_for_its_zooms_is_warned_of_where_drift_is_corrected(write: Write) -> None:
+def test_survey_too_coarse_for_its_zooms_is_a_warning_if_drift_is_corrected(write: Write) -> None:
     coarse = SURVEY + "pixels = [128, 128]\n"
     (warning,) = warnings(write(coarse, frame=DRIFTING))
     assert "[survey] a zoom is 12.7 pixels of the survey wide" in warning.what

@@ -1,4 +1,4 @@
-"""[notify]: who is told of what."""
+"""[notify]: targets and occasions of notifications."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def notifier(experiment: Experiment) -> dict[str, object]:
     return dict(start.launch.settings)
 
 
-def test_a_notifier_is_part_of_an_experiment_that_wants_to_tell(write: Write) -> None:
+def test_notifier_is_part_of_an_experiment_with_notify(write: Write) -> None:
     experiment = write(HOOK + 'unsolved_after = "10 min"\n')
     assert notifier(experiment)["unsolved_after"] == 600.0
     assert "notifier" in experiment.component_names
 
 
-def test_without_it_nobody_is_told(write: Write) -> None:
+def test_experiment_without_notify_has_no_notifier(write: Write) -> None:
     assert "notifier" not in write("").component_names
 
 
@@ -39,7 +39,7 @@ def test_the_end_alone_needs_no_component(write: Write) -> None:
     assert "notifier" not in experiment.component_names
 
 
-def test_python_is_the_one_that_runs_us(write: Write) -> None:
+def test_python_is_the_running_interpreter(write: Write) -> None:
     settings = notifier(write('[notify]\ncommand = ["python", "call.py"]\n'))
     assert settings["program"] == [sys.executable, "call.py"]
 
@@ -55,7 +55,7 @@ def test_python_is_the_one_that_runs_us(write: Write) -> None:
         (HOOK + 'weebhook = "x"\n', "weebhook is not a setting"),
     ],
 )
-def test_what_can_not_work_is_an_error(write: Write, wrong: str, said: str) -> None:
+def test_impossible_target_is_an_error(write: Write, wrong: str, said: str) -> None:
     assert any(said in finding.what for finding in errors(write(wrong)))
 
 
@@ -74,7 +74,7 @@ def test_an_error_does_not_repeat_an_address_that_may_be_a_secret(write: Write) 
 
 
 @pytest.mark.parametrize("more", ["", 'command = ["python", "call.py"]\n'])
-def test_what_it_expands_to_reads_back_as_the_same(write: Write, more: str) -> None:
+def test_expanded_file_with_a_notifier_round_trips(write: Write, more: str) -> None:
     experiment = write(HOOK + more)
     settings = notifier(experiment)
     again = write(experiment.expanded(), frame="")
@@ -87,7 +87,9 @@ def test_what_it_expands_to_reads_back_as_the_same(write: Write, more: str) -> N
     'hook = "https://chat.example.org/hooks/1"\n[notify]\nwebhook = "hook"\n',
     '[caller]\ncomponent = true\nclass = "Notifier"\nwebhook = "https://chat.example.org/hooks/1"\n',
 ])  # fmt: skip
-def test_what_a_run_keeps_of_the_file_holds_no_secret(write: Write, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+def test_expanded_file_in_the_run_folder_has_no_secret(
+    write: Write, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
     experiment = write(text)
     kept = experiment.expanded(secrets=False)
     assert "hooks/1" in experiment.expanded()
@@ -105,7 +107,9 @@ def test_two_secrets_are_two_variables(write: Write) -> None:
     assert '"$AFSPM_WEBHOOK_2"' in kept
 
 
-def test_secrets_in_the_environment_are_for_those_who_need_them(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_secrets_in_the_environment_reach_only_processes_that_need_them(
+    write: Write, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("HOOK", "https://chat.example.org/hooks/1")
     pages = '[page]\ncomponent = true\nclass = "Dashboard"\n'
     addresses = (f"tcp://127.0.0.1:{port}" for port in range(21_000, 22_000))

@@ -1,4 +1,4 @@
-"""`afspm check` looks at each plan as a whole: what can't be measured as planned is found before the night."""
+"""`afspm check` checks each plan as a whole, so that impossible measurements are found before the night."""
 
 from __future__ import annotations
 
@@ -49,9 +49,7 @@ REGION = '[limits]\nregion = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }\n'
         ),
     ],
 )
-def test_a_plan_that_can_not_be_is_an_error_at_its_line(
-    write: Write, plan: str, setting: str, what: str, hint: str
-) -> None:
+def test_impossible_plan_is_an_error_at_its_line(write: Write, plan: str, setting: str, what: str, hint: str) -> None:
     experiment = write(plan + setting + "\n", frame=SIMULATED)
     error = only_error(experiment)
     assert what in error.what
@@ -61,7 +59,7 @@ def test_a_plan_that_can_not_be_is_an_error_at_its_line(
 
 
 @pytest.mark.parametrize("setting", ["every = 0", 'every = "0 s"', 'every = "15 min"', "end_when_done = false"])
-def test_a_plan_that_can_be_is_no_error(write: Write, setting: str) -> None:
+def test_possible_plan_is_no_error(write: Write, setting: str) -> None:
     assert errors(write(f"{SERIES}{SIZE}{setting}\n", frame=SIMULATED)) == []
 
 
@@ -77,7 +75,7 @@ def test_a_switch_of_a_section_is_true_or_false(write: Write) -> None:
         (SURVEY + 'zoom = "1 um"\n', 'zoom_parameters = { scan-speed = "20 um/s" }'),
     ],
 )
-def test_parameters_of_a_plan_are_held_against_the_limits(write: Write, plan: str, setting: str) -> None:
+def test_parameters_of_a_plan_are_checked_against_the_limits(write: Write, plan: str, setting: str) -> None:
     experiment = write(plan + setting + '\n[limits.scan-speed]\nmax = "10 um/s"\n', frame=SIMULATED)
     error = only_error(experiment)
     assert "plans what its limits refuse: scan-speed" in error.what
@@ -93,7 +91,7 @@ def test_parameters_of_a_plan_are_held_against_the_limits(write: Write, plan: st
         (SERIES + SIZE + "pixels = [8000, 64]\n", "scan-resolution-x: 8000 px is outside", "[series]"),
     ],
 )
-def test_a_plan_is_held_against_what_the_microscope_takes(write: Write, plan: str, what: str, line: str) -> None:
+def test_plan_is_checked_against_the_microscope(write: Write, plan: str, what: str, line: str) -> None:
     experiment = write(plan, frame=SIMULATED)
     found = errors(experiment)
     assert any("plans what its microscope refuses" in error.what and what in error.what for error in found)
@@ -109,7 +107,7 @@ def test_a_duration_of_the_microscope_is_not_below_zero(write: Write, setting: s
 
 
 @pytest.mark.parametrize("maker", ["Asylum", "Gxsm", "Nanonis", "Nanosurf", "Park"])
-def test_a_controller_is_not_looked_at_without_a_pause(write: Write, maker: str) -> None:
+def test_polling_period_of_zero_is_refused(write: Write, maker: str) -> None:
     microscope = SIMULATED.replace("Simulator", maker)
     assert maker in microscope
     experiment = write("", frame=microscope + 'poll_period_s = "0 s"\n')
@@ -120,10 +118,10 @@ def test_a_tip_is_treated_within_the_limits(write: Write) -> None:
     corrector = '[repair]\ncomponent = true\nclass = "TipCorrector"\nworkshop_center = ["3 um", "0 um"]\n'
     error = only_error(write(corrector + REGION, frame=SIMULATED))
     assert "[repair] plans what its limits refuse: the probe position" in error.what
-    assert error.hint == "moved by (-1 µm, 0 nm) all of it fits"
+    assert error.hint == "it fits if moved by (-1 µm, 0 nm)"
 
 
-def test_values_of_the_start_are_held_against_the_limits(write: Write) -> None:
+def test_initial_values_are_checked_against_the_limits(write: Write) -> None:
     initial = 'initial = { tip-bias-voltage = "5 V", scan-angle = 0.5 }\n'
     limit = '[limits.tip-bias-voltage]\nmax = "3 V"\nonly = []\n'
     experiment = write(limit, frame=SIMULATED + initial)
@@ -133,7 +131,7 @@ def test_values_of_the_start_are_held_against_the_limits(write: Write) -> None:
     assert errors(write(limit.replace("3 V", "6 V"), frame=SIMULATED + initial)) == []
 
 
-def test_a_period_shorter_than_its_scan_is_warned_of(write: Write) -> None:
+def test_period_shorter_than_its_scan_is_a_warning(write: Write) -> None:
     def said(more: str, initial: str = "") -> list[str]:
         return [finding.what for finding in write(SERIES + SIZE + more, frame=SIMULATED + initial).check()]
 
@@ -179,7 +177,7 @@ def test_the_cure_of_a_scan_outside_is_the_nearest_region_that_fits(
 
 def test_the_cure_of_a_grid_outside_is_how_far_it_moves(write: Write) -> None:
     (error,) = {finding.hint for finding in errors(write(GRID + 'center = ["1 um", "0 um"]\n' + REGION))}
-    assert error == "moved by (-500 nm, 0 nm) all of it fits"
+    assert error == "it fits if moved by (-500 nm, 0 nm)"
     (error,) = {finding.hint for finding in errors(write(GRID.replace("[3,", "[5,") + REGION))}
     assert error == "all of it is larger than the region allowed, 4 x 4 µm"
 

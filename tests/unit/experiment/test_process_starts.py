@@ -1,4 +1,4 @@
-"""From the file to launch lines: wiring filled in, the paper's form understood, piecemeal starts."""
+"""From the file to launch lines: default wiring, the paper's form, partial starts."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_a_recorder_is_part_of_every_experiment(write: Write) -> None:
     assert (launch.class_, launch.settings, launch.envelopes) == ("afspm.components.recorder.Recorder", {}, ("",))
 
 
-def test_the_file_may_do_without_a_recorder_or_have_its_own(write: Write) -> None:
+def test_file_may_switch_the_recorder_off_or_have_its_own(write: Write) -> None:
     assert set(starts(write(CORRECTOR + "[record]\non = false\n"))) == {"microscope", "scheduler", "repair"}
     own = '[keeper]\ncomponent = true\nclass = "Recorder"\nscans = false\n'
     assert set(starts(write(CORRECTOR + own))) == {"microscope", "scheduler", "repair", "keeper"}
@@ -115,7 +115,7 @@ def test_the_expanded_file_has_the_recorder_and_means_the_same(write: Write, tmp
     assert load(tmp_path / "again.toml").recorders == ["recorder"]
 
 
-def test_who_listens_to_what_a_component_publishes_is_connected_to_it(write: Write) -> None:
+def test_subscriber_of_a_component_s_envelope_is_connected_to_it(write: Write) -> None:
     found = starts(write(PEAKS + CHOOSER + CORRECTOR + CLASSIFIER))
     peaks = found["peaks"].launch.sockets.publish
     assert peaks is not None
@@ -125,7 +125,7 @@ def test_who_listens_to_what_a_component_publishes_is_connected_to_it(write: Wri
     assert peaks not in found["peaks"].launch.sockets.subscribe
 
 
-def test_listens_to_names_the_others_to_connect_to(write: Write) -> None:
+def test_listens_to_names_the_publishers_to_connect_to(write: Write) -> None:
     text = PEAKS + PEAKS.replace("peaks", "more") + CHOOSER + 'listens_to = ["more"]\n'
     found = starts(write(text))
     sources = found["choose"].launch.sockets.subscribe
@@ -158,7 +158,7 @@ def test_a_command_gets_its_settings_and_the_folder_of_the_file(write: Write) ->
     assert start.launch.envelopes == ("Scan2d",)
 
 
-def test_a_launch_line_is_whole(write: Write) -> None:
+def test_launch_line_is_complete(write: Write) -> None:
     experiment = write(CORRECTOR + 'voltage = "250 mV"\n[problems]\ntip-lost = 9\n[control]\nrequest_timeout = "2 s"\n')
     launch = starts(experiment)["repair"].launch
     assert launch.class_ == "parts.Corrector"
@@ -171,7 +171,7 @@ def test_a_launch_line_is_whole(write: Write) -> None:
     assert str(experiment.folder) in starts(experiment)["repair"].python_path
 
 
-def test_the_scheduler_is_given_what_it_enforces(write: Write) -> None:
+def test_scheduler_gets_the_sections_to_enforce(write: Write) -> None:
     text = (
         CORRECTOR + '[control]\nlease = "10 min"\nstop_scan_on_manual = false\n'
         '[limits]\nregion = { x = ["0 um", "1 um"], y = ["0 um", "1 um"] }\n'
@@ -186,7 +186,7 @@ def test_the_scheduler_is_given_what_it_enforces(write: Write) -> None:
     assert Launch.from_json(launch.to_json()) == launch
 
 
-def test_scheduler_and_translator_are_told_what_a_person_may_adjust(write: Write) -> None:
+def test_scheduler_and_translator_get_the_adjustable_parameters(write: Write) -> None:
     started = starts(write(CORRECTOR + '[control]\nadjustable = ["zctrl-setpoint"]\n'))
     assert started["scheduler"].launch.settings["control"]["adjustable"] == ["zctrl-setpoint"]
     assert started["microscope"].launch.adjustable == ("zctrl-setpoint",)
@@ -200,14 +200,14 @@ def test_a_file_with_errors_starts_nothing(write: Write) -> None:
         starts(write(CORRECTOR + "volage = 3\n"))
 
 
-def test_only_and_without_choose(write: Write) -> None:
+def test_only_and_without_choose_processes(write: Write) -> None:
     experiment = write(CORRECTOR + CLASSIFIER)
     assert set(starts(experiment, without=["watch"])) == {"microscope", "scheduler", "repair", "recorder"}
     with pytest.raises(ConfigError, match="no component 'repiar'"):
         starts(experiment, only=["repiar"])
 
 
-def test_nobody_listens_to_a_component_that_was_left_out(write: Write) -> None:
+def test_component_that_was_left_out_has_no_subscribers(write: Write) -> None:
     experiment = write(PEAKS + CHOOSER)
     found = starts(experiment, without=["peaks"])
     assert found["choose"].launch.sockets.subscribe == (found["scheduler"].launch.sockets.publish,)
@@ -233,7 +233,7 @@ def test_a_piecemeal_start_with_the_addresses_in_the_file(write: Write) -> None:
     assert here["repair"].launch.sockets.control == there["scheduler"].launch.sockets.serve
 
 
-def test_keys_say_whose_to_expect_where(write: Write, tmp_path: Path) -> None:
+def test_keys_name_the_owner_at_each_address(write: Write, tmp_path: Path) -> None:
     generate(tmp_path / "keys", ["microscope", "scheduler", "repair"])
     experiment = write(CORRECTOR + '[security]\nkeys = "keys"\n')
     assert not errors(experiment)
@@ -359,7 +359,7 @@ def test_the_experiment_is_named_by_its_folder_or_file_or_itself(tmp_path: Path)
         assert load(folder / file).name == name
 
 
-def test_messages_of_one_s_own_reach_every_process_as_files_beside_the_experiment(write: Write) -> None:
+def test_user_messages_reach_every_process_as_files_beside_the_experiment(write: Write) -> None:
     text = 'messages = ["crystal.proto", "parts"]\n' + CORRECTOR
     assert "no file 'crystal.proto'" in only_error(write(text)).what
     experiment = write(text)
@@ -368,7 +368,7 @@ def test_messages_of_one_s_own_reach_every_process_as_files_beside_the_experimen
     assert launch.messages == (str(experiment.folder / "crystal.proto"), "parts")
 
 
-def test_a_command_says_if_it_sends_no_heartbeats(write: Write) -> None:
+def test_command_may_declare_that_it_sends_no_heartbeats(write: Write) -> None:
     text = '[other]\ncomponent = true\ncommand = ["python", "x.py"]\n'
     assert starts(write(text))["other"].beats
     start = starts(write(text + "heartbeats = false\n"))["other"]

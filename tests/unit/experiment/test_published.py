@@ -1,4 +1,4 @@
-"""Files of the published implementation: understood, or told line by line what they have become."""
+"""Files of the published implementation are converted, and each line is explained."""
 
 from __future__ import annotations
 
@@ -253,14 +253,14 @@ class = "afspm.components.drift.drift.create_drift_model"
         ('channel = "Phase"', 'channel_id = "channel_id"'),
     ],
 )
-def test_a_setting_of_ours_beside_the_published_one_is_refused(write: Write, ours: str, published_line: str) -> None:
+def test_afspm_setting_beside_its_published_equivalent_is_refused(write: Write, ours: str, published_line: str) -> None:
     text = DRIFT.replace("display_fit = false", f"drift = {{ {ours} }}")
     experiment = published(write, text, PICTURE, SERIES)
     found = [error for error in errors(experiment) if error.place.line == line_of(experiment, published_line)]
     assert [error.hint for error in found] == ["say one of them"]
 
 
-def test_settings_of_ours_join_the_published_ones(write: Write) -> None:
+def test_afspm_settings_are_added_to_published_ones(write: Write) -> None:
     text = DRIFT.replace("display_fit = false", 'drift = { correct_after = "2 h", tracker = { lost_after = 9 } }')
     experiment = published(write, text, PICTURE, SERIES)
     assert errors(experiment) == []
@@ -268,7 +268,7 @@ def test_settings_of_ours_join_the_published_ones(write: Write) -> None:
     assert (drift["correct_after"], drift["tracker"]["lost_after"], drift["tracker"]["w_update"]) == (7200.0, 9, 0.8)
 
 
-def test_what_the_drift_scheduler_is_not_told_stays_as_it_is_here(write: Write) -> None:
+def test_settings_missing_in_the_published_file_keep_their_defaults(write: Write) -> None:
     plain = DRIFT.split("channel_id")[0] + DRIFT[DRIFT.index("\n[rescanner]") :]
     assert "drift" not in published(write, plain, PICTURE, SERIES).resolved.processes["mediator"].settings
 
@@ -281,7 +281,9 @@ def test_what_the_drift_scheduler_is_not_told_stays_as_it_is_here(write: Write) 
         ("gxsm.translator.GxsmTranslator", "read_use_physical_units = true", "Gxsm", None),
     ],
 )
-def test_each_translator_is_ours(write: Write, name: str, settings: str, ours: str, expected: str | None) -> None:
+def test_each_published_translator_has_an_equivalent(
+    write: Write, name: str, settings: str, ours: str, expected: str | None
+) -> None:
     text = f"""
 [xop]
 class = "afspm.components.microscope.translators.asylum.client.XopClient"
@@ -322,7 +324,7 @@ def test_histories_by_size_and_channel_are_rules_of_the_cache(write: Write) -> N
     assert [(rule.channel, rule.history) for rule in rules] == [("Height", 1), ("Height", 3)]
 
 
-def test_a_component_that_calls_published_code_is_refused_with_what_to_write(write: Write) -> None:
+def test_component_that_calls_published_code_is_refused_with_a_replacement(write: Write) -> None:
     analysis = """
 [analysis]
 component = true
@@ -339,7 +341,7 @@ message_received_method = "analysis.analyze"
     assert "afspm.Component" in found[line_of(experiment, 'class = "afspm.components.component.')].hint
 
 
-def test_user_code_that_needs_published_modules_is_never_to_be_had_from_pip(write: Write, tmp_path: Path) -> None:
+def test_missing_published_module_is_not_suggested_for_pip(write: Write, tmp_path: Path) -> None:
     (tmp_path / "roi.py").write_text("from afspm.utils import csv\n", encoding="utf-8")
     text = '[own]\ncomponent = true\nclass = "roi.Experimenter"\nsubscriber = "sub"\n'
     (error,) = errors(published(write, MEDIATOR, PICTURE, text))
@@ -348,7 +350,7 @@ def test_user_code_that_needs_published_modules_is_never_to_be_had_from_pip(writ
     assert "from-the-published-implementation" in error.hint
 
 
-def test_a_variable_that_only_a_second_file_has_is_told(write: Write) -> None:
+def test_variable_that_only_an_overlay_defines_is_a_finding(write: Write) -> None:
     text = WIRING.replace("request_timeout_ms = 5000\n", "")
     (error,) = errors(write(text + MEDIATOR + PICTURE + SERIES, frame=""))
     assert "request_timeout_ms = 'request_timeout_ms' is not a number" in error.what
@@ -396,7 +398,7 @@ def test_a_series_that_a_published_function_took_is_proposed(write: Write, tmp_p
     assert (series["pixels"], series["every"]) == ([256, 128], 5.0)
 
 
-def test_every_line_is_told_what_it_has_become(write: Write) -> None:
+def test_every_line_is_explained(write: Write) -> None:
     experiment = published(write, DRIFT, PICTURE, SCANNING, SHOWN, METADATA)
     told = {line: became for _, line, became in explained(experiment.resolved)}
     assert told["[mediator] update_weight"] == (
@@ -421,7 +423,7 @@ def test_the_time_of_a_scan_is_a_speed(write: Write) -> None:
     assert told["[translator] scan_time_s"] == 'initial.scan-speed = "25.6 um/s"'
 
 
-def test_a_rescanner_without_a_drift_scheduler_is_left_out(write: Write, tmp_path: Path) -> None:
+def test_rescanner_without_a_drift_scheduler_is_dropped(write: Write, tmp_path: Path) -> None:
     rescanner = DRIFT[DRIFT.index("[rescanner]") :]
     experiment = published(write, MEDIATOR, PICTURE, SERIES, rescanner)
     assert errors(experiment) == []

@@ -40,7 +40,7 @@ def test_every_section_and_key_of_a_component_is_on_the_page() -> None:
     assert [key for key in (*OWN_KEYS, *DECLARED_KEYS, *WIRE_KEYS) if f"`{key}" not in PAGE] == []
 
 
-def test_every_setting_of_the_wiring_that_means_something_is_on_the_page() -> None:
+def test_every_used_setting_of_the_wiring_is_on_the_page() -> None:
     kinds = (WiringClass.PUBLISHER, WiringClass.SERVER, WiringClass.ROUTER, WiringClass.CLIENT)
     keys = {key for kind in kinds for key in WIRE_SETTINGS[kind]} - {"get_envelope_for_proto"}
     assert [key for key in keys if f"`{key}`" not in PAGE] == []

@@ -1,4 +1,4 @@
-"""[metadata]: what is written into the files of a run, from the experiment file and from the microscope's class."""
+"""[metadata]: entries in the files of a run, from the experiment file and from the microscope's class."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.experiment import load, run_metadata
+from afspm.experiment import load
 
 SIMULATOR = (
     '[microscope]\ncomponent = true\nclass = "Simulator"\n\n[scheduler]\ncomponent = true\nclass = "Scheduler"\n'
@@ -18,18 +18,18 @@ NANONIS = SIMULATOR.replace("Simulator", "Nanonis")
 def metadata(folder: Path, text: str) -> dict[str, str]:
     file = folder / "e.toml"
     file.write_text(text, encoding="utf-8")
-    return run_metadata.of_run(load(file).resolved)
+    return load(file).resolved.metadata()
 
 
 @pytest.mark.parametrize(("text", "technique"), [(SIMULATOR, "AFM"), (ASYLUM, "AFM"), (NANONIS, None)])
-def test_the_class_of_the_microscope_tells_what_it_knows(tmp_path: Path, text: str, technique: str | None) -> None:
+def test_metadata_come_from_the_class_of_the_microscope(tmp_path: Path, text: str, technique: str | None) -> None:
     told = metadata(tmp_path, text)
     assert told.get("technique") == technique
     assert told["vendor"]
     assert told["software"]
 
 
-def test_what_the_file_says_comes_first(tmp_path: Path) -> None:
+def test_metadata_of_the_file_override_the_class(tmp_path: Path) -> None:
     said = '[metadata]\ntechnique = "STM"\nvendor = "Unisoku"\nsample = "Au(111)"\norcid = "0000-0002-1694-233X"\n\n'
     told = metadata(tmp_path, said + NANONIS)
     assert (told["technique"], told["vendor"], told["sample"]) == ("STM", "Unisoku", "Au(111)")
@@ -46,7 +46,7 @@ def test_what_the_file_says_comes_first(tmp_path: Path) -> None:
         ('smaple = "Au"', "did you mean 'sample'?"),
     ],
 )
-def test_what_is_wrong_is_refused(tmp_path: Path, line: str, why: str) -> None:
+def test_invalid_metadata_are_refused(tmp_path: Path, line: str, why: str) -> None:
     file = tmp_path / "e.toml"
     file.write_text(f"[metadata]\n{line}\n\n{SIMULATOR}", encoding="utf-8")
     (finding,) = load(file).check()

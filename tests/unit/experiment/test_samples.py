@@ -64,7 +64,7 @@ def test_the_laboratory_s_file_of_two_computers_needs_its_keys(tmp_path: Path) -
     assert series.launch.sockets.control == "tcp://192.168.1.20:29002"
 
 
-def test_the_paper_s_form_says_the_same_as_the_short_one() -> None:
+def test_paper_s_form_and_short_form_are_the_same_experiment() -> None:
     short, long = sample("tip_repair").resolved, sample("paper_form").resolved
     for name in ("scheduler", "series", "tip_classifier", "tip_corrector"):
         assert long.processes[name].settings == short.processes[name].settings

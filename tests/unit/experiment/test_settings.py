@@ -1,4 +1,4 @@
-"""A component's settings are checked against its constructor: names, types, units; and reach it in SI."""
+"""Settings of a component are checked against its constructor (names, types, units), and reach it in SI."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_setting_reaches_the_process_in_si_and_as_json(write: Write, setting: 
     json.dumps(settings)
 
 
-def test_a_quantity_that_stays_a_text_is_warned_of(write: Write) -> None:
+def test_quantity_that_stays_a_text_is_a_warning(write: Write) -> None:
     table = '[loose]\ncomponent = true\nclass = "parts.Untyped"\nlabel = "3 times"\ntyped = "1 um"\nsize = "1 um"\n'
     (finding,) = write(table).check()
     assert not finding.is_error
@@ -83,7 +83,7 @@ def test_a_list_of_the_wrong_length_is_an_error(write: Write, size: str, said: s
 
 
 @pytest.mark.parametrize("setting", ["every = '15 mn'", "every = '3 nm'", "every = 'soon'"])
-def test_a_wrong_quantity_is_told_what_to_write(write: Write, setting: str) -> None:
+def test_wrong_quantity_is_an_error_with_an_example(write: Write, setting: str) -> None:
     assert only_error(write(scanner(setting))).hint == 'a time, for example "15 min"'
 
 
@@ -114,7 +114,7 @@ def test_an_unknown_setting_is_an_error_with_the_nearest_name(write: Write) -> N
     assert "'every'" in error.hint
 
 
-def test_a_setting_of_the_class_that_a_second_file_replaces_is_told_where_it_belongs(tmp_path: Path) -> None:
+def test_setting_of_a_class_replaced_by_an_overlay_is_an_error_with_its_place(tmp_path: Path) -> None:
     first, second = tmp_path / "night.toml", tmp_path / "other.toml"
     first.write_text('[a]\ncomponent = true\nclass = "ScanSeries"\nsize = ["1 um", "1 um"]\n')
     second.write_text('[a]\nclass = "Metadata"\n')
@@ -130,7 +130,7 @@ def test_a_missing_setting_is_an_error(write: Write) -> None:
     assert error.place.line == line_of(experiment, "[scan]")
 
 
-def test_a_misspelt_required_setting_is_told_once(write: Write) -> None:
+def test_misspelt_required_setting_is_reported_once(write: Write) -> None:
     error = only_error(write(scanner(size='sise = ["1 um", "1 um"]')))
     assert "'size'" in error.hint
 
@@ -141,7 +141,7 @@ def test_a_class_that_takes_anything_gets_anything(write: Write) -> None:
     assert experiment.resolved.processes["a"].settings == {"whatever": {"x": [1, "two"]}}
 
 
-def test_settings_that_are_handed_on_to_the_base_class_are_checked_by_it(write: Write) -> None:
+def test_settings_passed_on_to_the_base_class_are_checked_by_its_signature(write: Write) -> None:
     text = '[a]\ncomponent = true\nclass = "parts.Derived"\nextra = 1\nsize = ["1 um", "1 um"]\n'
     assert not errors(write(text))
     assert "'every'" in only_error(write(text + "evry = 3\n")).hint
@@ -168,12 +168,14 @@ def test_findings_are_in_the_order_of_the_lines(write: Write) -> None:
         ("broken.X", "SyntaxError", ""),
         ("raising.X", "ZeroDivisionError", ""),
         ("needing.X", "needs 'not_there_at_all'", "install"),
-        ("time.X", "time has no 'X'", "give time.py another name"),
+        ("time.X", "time has no 'X'", "rename time.py"),
         ("leaving.X", "SystemExit: 3 (leaving.py:2)", ""),
         ("afspm.components.planned_scans.ScanSerie", "has no 'ScanSerie'", "ScanSeries"),
     ],
 )
-def test_a_class_that_can_t_be_had_is_an_error(write: Write, tmp_path: Path, name: str, said: str, hint: str) -> None:
+def test_class_that_can_not_be_loaded_is_an_error(
+    write: Write, tmp_path: Path, name: str, said: str, hint: str
+) -> None:
     (tmp_path / "broken.py").write_text("def f(:\n")
     (tmp_path / "raising.py").write_text("1 / 0\n")
     (tmp_path / "time.py").write_text("class X: ...\n")
@@ -208,7 +210,7 @@ more = ["my_plan"]
 """
 
 
-def test_an_intermediary_class_of_one_s_own_is_made_by_the_process(write: Write, tmp_path: Path) -> None:
+def test_user_intermediary_class_is_constructed_in_the_process(write: Write, tmp_path: Path) -> None:
     experiment = write(OBJECT)
     assert experiment.check() == []
     settings = experiment.resolved.processes["planner"].settings

@@ -1,4 +1,4 @@
-"""What must hold between the parts of an experiment, each broken once; and files that break nothing."""
+"""Checks between the parts of an experiment: each broken once, and files without findings."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ WITHOUT_TRANSLATOR = FRAME[: FRAME.index("[microscope]")]
         ("[my series]", "with a space"),
     ],
 )
-def test_habits_from_elsewhere_are_told_what_toml_wants(write: Write, line: str, hint: str) -> None:
+def test_syntax_of_other_languages_is_an_error_with_the_toml_form(write: Write, line: str, hint: str) -> None:
     (finding,) = write(f"{line}\n", frame="").check()
     assert finding.hint == hint or (hint and hint in finding.hint)
 
@@ -64,7 +64,7 @@ def test_a_missing_scheduler_is_the_only_error(write: Write, scheduler: str) -> 
     assert "schedul" in only_error(write(scheduler + CLASSIFIER + drift, frame=WITHOUT_SCHEDULER)).what
 
 
-def test_a_scheduler_that_lacks_component_is_pointed_at(write: Write) -> None:
+def test_scheduler_table_without_component_true_is_named(write: Write) -> None:
     table = '[scheduler]\nclass = "Scheduler"\n'
     experiment = write(table, frame=WITHOUT_SCHEDULER)
     (error,) = errors(experiment)
@@ -83,7 +83,7 @@ BROKEN = {
     ),
     "a name with a dot": (PEAKS.replace("peaks", "my.peaks", 1), FRAME, "[my.peaks] is within a table"),
     "two of one name": (CORRECTOR + CORRECTOR, FRAME, "[repair] is there twice"),
-    "two of nearly one name": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "the same name"),
+    "names differing in case": (CORRECTOR + CORRECTOR.replace("repair", "Repair"), FRAME, "only in upper and lower"),
     "a name with a slash": (CORRECTOR.replace("repair", '"a/b"'), FRAME, "[a/b] can't be the name"),
     "a name that leads elsewhere": (CORRECTOR.replace("repair", '"../b"'), FRAME, "[../b] can't be the name"),
     "no name": (CORRECTOR.replace("repair", '""'), FRAME, "[] can't be the name"),
@@ -200,7 +200,7 @@ BROKEN = {
 EMULATED = '[clock]\nspeed = 60\n[controller]\ncomponent = true\nclass = "parts.Emulated"\n'
 
 
-def test_time_may_be_made_faster_where_the_controller_is_an_emulated_one(write: Write) -> None:
+def test_time_may_be_faster_with_an_emulated_controller(write: Write) -> None:
     assert errors(write(EMULATED, frame=WIRED)) == []
     assert write(EMULATED, frame=WIRED).resolved.simulated
 
@@ -211,7 +211,7 @@ def test_an_emulator_in_the_file_proves_nothing_of_a_translator_that_is_not_wire
     assert any("not simulated" in error for error in map(str, errors(of_another_language)))
 
 
-def test_what_is_started_without_the_emulator_is_not_simulated(write: Write) -> None:
+def test_processes_started_without_the_emulator_are_not_simulated(write: Write) -> None:
     experiment = write(EMULATED, frame=WIRED)
     assert experiment.simulated()
     assert not experiment.simulated(without=["controller"])
@@ -228,30 +228,30 @@ def test_a_translator_is_wired_to_the_emulator_that_is_started_with_it(write: Wr
     assert all(launch.simulated for launch in started.values())
 
 
-def test_an_address_beside_an_emulator_is_said_to_be_of_no_use(write: Write) -> None:
+def test_address_beside_an_emulator_is_a_warning(write: Write) -> None:
     found = write(EMULATED, frame=WIRED + 'address = "127.0.0.1:6501"\n').check()
     assert sum("[microscope] address is not used" in finding.what for finding in found) == 1
 
 
-def test_what_listens_at_addresses_of_its_own_is_no_error(write: Write) -> None:
-    """A page keeps strangers out by itself, and any port that is free is nobody else's."""
+def test_component_that_listens_at_its_own_address_is_no_error(write: Write) -> None:
+    """A page has its own passwords, and each free port is used once."""
     listening = PAGE + 'host = "0.0.0.0"\nport = 9000\n' + PAGE.replace("page", "second") + "port = 0\n"
     listening += LOG + 'at = "tcp://127.0.0.1:9001"\n' + PEAKS + 'publisher = "tcp://127.0.0.1:9002"\n'
     assert errors(write(listening)) == []
 
 
 @pytest.mark.parametrize("secure", ['[security]\nkeys = "."\n', "[security]\ninsecure = true\n"])
-def test_a_log_may_be_collected_from_other_computers_with_keys_or_by_word(write: Write, secure: str) -> None:
+def test_log_may_be_collected_from_other_computers_with_keys_or_insecure(write: Write, secure: str) -> None:
     assert errors(write(LOG + 'at = "tcp://192.168.1.5:9010"\n' + secure)) == []
 
 
-def test_of_a_port_that_is_too_high_it_is_said(write: Write) -> None:
+def test_port_that_is_too_high_is_an_error(write: Write) -> None:
     assert "65535" in only_error(write(PEAKS + 'publisher = "tcp://127.0.0.1:99999"\n')).hint
     assert "65535" in only_error(write(LOG + 'at = "tcp://127.0.0.1:99999"\n')).hint
     assert errors(write(PEAKS + 'publisher = "tcp://127.0.0.1:65535"\n')) == []
 
 
-def test_lines_of_running_scans_are_there_for_those_who_asked_the_microscope_for_them(write: Write) -> None:
+def test_lines_of_running_scans_are_published_unless_live_lines_s_is_zero(write: Write) -> None:
     simulated = FRAME[: FRAME.index("[microscope]")] + '[microscope]\ncomponent = true\nclass = "Simulator"\n'
     watcher = ANYTHING + 'envelopes = ["ScanLines"]\n'
     error = only_error(write(watcher, frame=simulated + "live_lines_s = 0\n"))
@@ -262,7 +262,7 @@ def test_lines_of_running_scans_are_there_for_those_who_asked_the_microscope_for
 
 
 @pytest.mark.parametrize("case", BROKEN, ids=str)
-def test_what_does_not_fit_is_an_error(write: Write, case: str) -> None:
+def test_mismatch_between_parts_is_an_error(write: Write, case: str) -> None:
     text, frame, said = BROKEN[case]
     assert said in only_error(write(text, frame=frame)).what
 
@@ -284,7 +284,7 @@ def test_an_envelope_that_a_rule_of_the_cache_makes_is_published(write: Write) -
     assert errors(write(ANYTHING + 'envelopes = ["wdie_Height"]\n' + rule))
 
 
-def test_a_mapping_that_says_what_is_in_an_envelope_is_fine(write: Write) -> None:
+def test_valid_cache_mapping_has_no_finding(write: Write) -> None:
     assert not errors(write('[cache]\nmapping = "parts.wide"\n'))
 
 
@@ -305,7 +305,7 @@ def test_a_problem_named_in_the_file_is_one(write: Write) -> None:
     assert experiment.resolved.named_problems == {"tip-lost": 10}
 
 
-def test_all_insecure_must_be_said_aloud(write: Write) -> None:
+def test_insecure_allows_open_addresses(write: Write) -> None:
     assert not errors(write(PEAKS + 'publisher = "tcp://*:9000"\n[security]\ninsecure = true\n'))
 
 
@@ -318,7 +318,7 @@ def test_roles_without_keys_are_a_warning(write: Write) -> None:
 
 
 @pytest.mark.parametrize("class_", ["Dashboard", "Gateway"])
-def test_a_role_of_a_person_without_a_password_is_told(write: Write, class_: str) -> None:
+def test_role_of_a_person_without_a_password_is_a_warning(write: Write, class_: str) -> None:
     roles = f'[web]\ncomponent = true\nclass = "{class_}"\n{{}}[control.roles]\nset_mode = ["web:Ada"]\n'
     people = f'people.Ada = "scrypt:{"A" * 24}:{"A" * 44}"\n'
     for more, told in (("", True), (people, False), (people.replace("Ada", "Max"), True)):
@@ -334,18 +334,18 @@ def test_a_text_that_is_nearly_a_variable_is_a_warning(write: Write) -> None:
     assert warning.place.line == line_of(experiment, "channel =")
 
 
-def test_an_intermediary_that_nobody_uses_is_a_warning(write: Write) -> None:
+def test_unused_intermediary_is_a_warning(write: Write) -> None:
     experiment = write('[sub]\nclass = "Subscriber"\n')
     assert not errors(experiment)
     assert any("nothing refers to [sub]" in f.what for f in experiment.check())
 
 
-def test_a_file_that_is_not_there_is_an_error(tmp_path: Path) -> None:
+def test_missing_file_is_an_error(tmp_path: Path) -> None:
     error = only_error(load(tmp_path / "none.toml"))
     assert "can't be read" in error.what
 
 
-def test_of_files_that_can_not_all_be_read_no_part_is_missed(tmp_path: Path) -> None:
+def test_missing_part_is_not_reported_if_a_file_is_unreadable(tmp_path: Path) -> None:
     (tmp_path / "night.toml").write_text("a = [1\n")
     (tmp_path / "other.toml").write_text("[clock]\nspeed = 2.0\n")
     (finding,) = load(tmp_path / "night.toml", tmp_path / "other.toml").check()
@@ -365,7 +365,7 @@ def test_a_byte_order_mark_does_not_matter(tmp_path: Path, write: Write) -> None
     assert not errors(load(file))
 
 
-def test_what_is_expanded_checks_like_the_file_itself(write: Write) -> None:
+def test_expanded_file_has_the_findings_of_the_original(write: Write) -> None:
     experiment = write('where = ["1 um", "1 um"]\n[scan]\ncomponent = true\nclass = "parts.Scanner"\nsize = "where"\n'
         + PEAKS + 'listens_to = []\n[limits]\nmost_pixels = 1000\n')  # fmt: skip
     again = _reload(experiment)

@@ -1,4 +1,4 @@
-"""The line of each key, in every way that TOML lets it be written."""
+"""The line of each key, in every notation of TOML."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def test_every_path_of_any_document_has_a_line(document: dict[str, Any]) -> None
 
 
 @given(DOCUMENTS)
-def test_what_is_written_reads_back_the_same(document: dict[str, Any]) -> None:
+def test_written_toml_round_trips(document: dict[str, Any]) -> None:
     assert tomllib.loads(dumps(document)) == document
 
 

@@ -1,4 +1,4 @@
-"""Which experiments can keep a trace of what is said to the controller."""
+"""Experiments that can trace the traffic with the controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A string that equals a top-level key stands for its value; overlays; only whole strings; no circles."""
+"""A string that equals a top-level key stands for its value; overlays; only whole strings; no cycles."""
 
 from __future__ import annotations
 
@@ -37,18 +37,18 @@ def test_a_dotted_string_stays_a_string(write: Write) -> None:
     assert experiment.resolved.processes["scan"].settings["names"] == ["os.system"]
 
 
-def test_a_circle_is_an_error_told_once_with_its_line(write: Write) -> None:
+def test_reference_cycle_is_reported_once_with_its_line(write: Write) -> None:
     experiment = write('a = "b"\nb = ["c"]\nc = "a"\n' + SCANNER + 'size = ["1 um", "1 um"]\n')
     circle = only_error(experiment)
     assert "a -> b -> c -> a" in circle.what
     assert circle.place.line == 1
 
 
-def test_a_key_that_is_its_own_value_is_a_circle(write: Write) -> None:
+def test_key_that_is_its_own_value_is_a_cycle(write: Write) -> None:
     assert "a -> a" in only_error(write('a = "a"\n')).what
 
 
-def test_an_overlay_changes_only_what_it_holds(write: Write) -> None:
+def test_overlay_changes_only_its_own_keys(write: Write) -> None:
     experiment = write(
         'scan_size = ["1 um", "1 um"]\n' + SCANNER + 'size = "scan_size"\ncount = 5\n',
         'scan_size = ["7 um", "7 um"]\n[scan]\nevery = "2 min"\n',
@@ -74,7 +74,7 @@ def test_an_overlay_replaces_a_list_as_a_whole(write: Write) -> None:
     assert experiment.resolved.processes["scan"].settings["names"] == ["c"]
 
 
-def test_an_error_in_an_overlay_is_told_with_its_file_and_line(write: Write) -> None:
+def test_error_in_an_overlay_has_its_file_and_line(write: Write) -> None:
     experiment = write(SCANNER + 'size = ["1 um", "1 um"]\n', '\n\n[scan]\nevery = "3 V"\n')
     error = only_error(experiment)
     assert error.place.file.endswith("over1.toml")

@@ -1,4 +1,4 @@
-"""What the supervisor decides: busy is not dead, restarts back off and have a budget."""
+"""Decisions about one child: busy is not dead, restarts back off and have a budget."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QUICK = LivenessPolicy(beat_period_s=1.0, missed_beats=3, start_s=10.0, longest_
 
 
 def checked(life: Liveness, until_s: float, from_s: float = 0.0, *, works: bool | None = None) -> ProcessHealth:
-    """Its health at `until_s`, looked at every half second until then."""
+    """Return the health at `until_s`, checked every half second until then."""
     now_s = from_s
     while now_s < until_s:
         life.check(now_s, works=works)
@@ -42,14 +42,14 @@ def checked(life: Liveness, until_s: float, from_s: float = 0.0, *, works: bool 
     return life.check(until_s, works=works)
 
 
-def test_three_missed_beats_are_silence() -> None:
+def test_process_with_three_missed_beats_is_silent() -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(0.0)
     assert checked(life, 2.9) is ProcessHealth.ALIVE
     assert checked(life, 3.0, 2.9) is ProcessHealth.SILENT
 
 
-def test_a_long_step_is_busy_as_long_as_it_was_said_to_take() -> None:
+def test_long_step_is_busy_within_its_declared_limit() -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(1.0, step_age_s=29.0)
     assert life.check(1.0) is ProcessHealth.ALIVE
@@ -60,7 +60,9 @@ def test_a_long_step_is_busy_as_long_as_it_was_said_to_take() -> None:
 
 
 @pytest.mark.parametrize(("age_s", "longest_s"), [(0.0, None), (5.0, 35.0)])
-def test_who_works_without_beating_is_busy_as_long_as_a_step_may_take(age_s: float, longest_s: float | None) -> None:
+def test_process_that_works_without_heartbeats_is_busy_within_the_step_limit(
+    age_s: float, longest_s: float | None
+) -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(0.0, age_s, longest_s)
     assert checked(life, 2.9, works=True) is ProcessHealth.ALIVE
@@ -70,14 +72,14 @@ def test_who_works_without_beating_is_busy_as_long_as_a_step_may_take(age_s: flo
 
 
 @pytest.mark.parametrize("works", [False, None])
-def test_who_neither_beats_nor_works_any_more_is_silent_at_once(works: bool | None) -> None:
+def test_process_that_neither_beats_nor_works_is_silent_at_once(works: bool | None) -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(0.0)
     assert checked(life, 10.0, works=True) is ProcessHealth.BUSY
     assert life.check(10.1, works=works) is ProcessHealth.SILENT
 
 
-def test_who_beats_again_after_it_was_busy_is_alive() -> None:
+def test_process_that_beats_again_after_being_busy_is_alive() -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(0.0)
     assert checked(life, 10.0, works=True) is ProcessHealth.BUSY
@@ -86,7 +88,7 @@ def test_who_beats_again_after_it_was_busy_is_alive() -> None:
     assert checked(life, 30.0 + QUICK.silence_s, 10.5, works=True) is ProcessHealth.FROZEN, "it is the same step"
 
 
-def test_a_beat_after_closing_takes_it_back() -> None:
+def test_heartbeat_after_closing_cancels_it() -> None:
     watch = ChildWatch(ChildPolicy(QUICK))
     watch.begin(0.0)
     watch.beat(Beat(), 0.5)
@@ -97,11 +99,11 @@ def test_a_beat_after_closing_takes_it_back() -> None:
     assert [type(effect) for effect in watch.tick(30.0)] == [ChildLog, KillChild]
 
 
-def test_work_does_not_excuse_from_a_first_beat() -> None:
+def test_first_heartbeat_is_required_even_of_a_working_process() -> None:
     assert checked(Liveness(QUICK, 0.0), 10.0, works=True) is ProcessHealth.SLOW_START
 
 
-def test_process_that_works_on_its_end_has_as_long_as_a_step_may_take() -> None:
+def test_process_that_works_on_its_end_has_the_step_limit() -> None:
     life = Liveness(QUICK, 10.0)
     life.beat(10.0)
     life.closing(11.0)
@@ -110,7 +112,7 @@ def test_process_that_works_on_its_end_has_as_long_as_a_step_may_take() -> None:
     assert checked(life, 41.1, 41.0, works=True) is ProcessHealth.NOT_CLOSING
 
 
-def test_while_we_slept_a_busy_step_did_not_go_on() -> None:
+def test_step_does_not_age_while_the_computer_sleeps() -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(0.0)
     assert checked(life, 10.0, works=True) is ProcessHealth.BUSY
@@ -134,7 +136,7 @@ def test_a_process_that_may_not_begin_yet_is_not_late() -> None:
     assert checked(life, 22.0, 19.0) is ProcessHealth.SILENT, "it has begun"
 
 
-def test_after_its_last_beat_it_has_to_be_gone_soon() -> None:
+def test_closing_process_must_exit_soon() -> None:
     life = Liveness(QUICK, 0.0)
     life.beat(1.0)
     life.closing(2.0)
@@ -142,7 +144,7 @@ def test_after_its_last_beat_it_has_to_be_gone_soon() -> None:
     assert checked(life, 7.0, 6.9) is ProcessHealth.NOT_CLOSING
 
 
-def test_while_we_slept_ourselves_nobody_is_judged() -> None:
+def test_no_process_is_judged_for_time_the_computer_slept() -> None:
     """The computer was suspended for an hour."""
     life = Liveness(QUICK, 0.0)
     life.beat(1.0)
@@ -151,7 +153,7 @@ def test_while_we_slept_ourselves_nobody_is_judged() -> None:
     assert checked(life, 3606.0, 3601.5) is ProcessHealth.SILENT
 
 
-def test_a_process_without_beats_is_only_known_by_its_exit() -> None:
+def test_process_without_heartbeats_is_judged_by_its_exit_only() -> None:
     life = Liveness(QUICK, 0.0, beats=False)
     assert checked(life, 1000.0) is ProcessHealth.ALIVE
     assert life.next_check_s() == 1000.0 + QUICK.beat_period_s, "nobody is to look all the time"
@@ -163,7 +165,7 @@ def test_the_first_restart_is_at_once_and_later_ones_wait_longer_and_longer() ->
     assert delays == [0.0, 0.25, 0.5, 1.0, 2.0, 2.0, 2.0]
 
 
-def test_a_healthy_life_ends_the_row() -> None:
+def test_healthy_life_ends_a_row_of_failures() -> None:
     restarts = RestartBudget(RestartPolicy(healthy_s=30.0))
     for n in range(4):
         restarts.failed(float(n), lived_s=0.1)
@@ -177,7 +179,7 @@ def test_the_budget_is_spent_within_its_window() -> None:
     assert restarts.failed(100.0, 1.0) is not None
 
 
-def test_a_child_is_started_watched_killed_when_frozen_and_started_again() -> None:
+def test_frozen_child_is_killed_and_restarted() -> None:
     watch = ChildWatch(ChildPolicy(QUICK))
     assert watch.begin(0.0) == [StartChild()]
     assert watch.beat(Beat(), 1.0) == []
@@ -189,7 +191,7 @@ def test_a_child_is_started_watched_killed_when_frozen_and_started_again() -> No
     assert watch.phase is ChildPhase.RUNNING
 
 
-def test_a_child_that_works_without_beating_is_left_alone_until_it_stands_still() -> None:
+def test_child_that_works_without_heartbeats_is_killed_only_once_idle() -> None:
     watch = ChildWatch(ChildPolicy(QUICK))
     watch.begin(0.0)
     watch.beat(Beat(), 1.0)
@@ -200,7 +202,7 @@ def test_a_child_that_works_without_beating_is_left_alone_until_it_stands_still(
 
 
 @pytest.mark.parametrize("code", [0, 78, 80])
-def test_one_that_meant_to_end_is_not_started_again(code: int) -> None:
+def test_child_that_ended_on_purpose_is_not_restarted(code: int) -> None:
     watch = ChildWatch(ChildPolicy(QUICK))
     watch.begin(0.0)
     effects = watch.exited(code, 1.0)
@@ -210,20 +212,20 @@ def test_one_that_meant_to_end_is_not_started_again(code: int) -> None:
 
 
 @pytest.mark.parametrize("code", [1, -9, -11, 137, 3, 81])
-def test_one_that_crashed_is(code: int) -> None:
+def test_crashed_child_is_restarted(code: int) -> None:
     watch = ChildWatch(ChildPolicy(QUICK))
     watch.begin(0.0)
     assert StartChild() in watch.exited(code, 1.0)
 
 
-def test_one_that_was_asked_to_stop_had_not_crashed() -> None:
-    """By somebody else it is started again, as it is needed; at the end it is not."""
+def test_child_that_was_asked_to_stop_has_not_crashed() -> None:
+    """A child stopped by another program is restarted, since it is still needed; at the end it is not."""
     watch = ChildWatch(ChildPolicy(QUICK))
     assert watch.died(1)
     assert not watch.died(81)
 
 
-def test_one_that_crashes_again_and_again_is_given_up_loudly() -> None:
+def test_child_that_crashes_repeatedly_is_given_up() -> None:
     watch = ChildWatch(ChildPolicy(QUICK, RestartPolicy(budget=3)))
     watch.begin(0.0)
     now_s, effects = 0.0, []
@@ -238,7 +240,7 @@ def test_one_that_crashes_again_and_again_is_given_up_loudly() -> None:
     assert effects[0].level == "ERROR"
 
 
-def test_a_restart_that_waits_is_not_early() -> None:
+def test_delayed_restart_is_not_early() -> None:
     watch = ChildWatch(ChildPolicy(QUICK, RestartPolicy(first_delay_s=4.0)))
     watch.begin(0.0)
     watch.exited(1, 1.0)
@@ -248,7 +250,7 @@ def test_a_restart_that_waits_is_not_early() -> None:
     assert watch.tick(6.0) == [StartChild()]
 
 
-def test_one_that_we_stop_is_over_however_it_ends() -> None:
+def test_stopped_child_is_over_with_any_exit_code() -> None:
     watch = ChildWatch(ChildPolicy(QUICK))
     watch.begin(0.0)
     watch.stop(1.0)
@@ -256,7 +258,7 @@ def test_one_that_we_stop_is_over_however_it_ends() -> None:
     assert watch.over
 
 
-def test_one_that_waits_for_its_restart_is_not_started_after_a_stop() -> None:
+def test_child_that_waits_for_its_restart_is_not_started_after_a_stop() -> None:
     watch = ChildWatch(ChildPolicy(QUICK, RestartPolicy(first_delay_s=4.0)))
     watch.begin(0.0)
     watch.exited(1, 1.0)
@@ -313,7 +315,7 @@ def ordered(watch: ChildWatch, now_s: float = 100.0) -> list[str]:
     return [type(effect).__name__ for effect in watch.restart(now_s)]
 
 
-def test_one_that_is_ordered_to_be_started_anew_is_killed_and_started_at_once_however_often() -> None:
+def test_ordered_restart_kills_and_starts_at_once_however_often() -> None:
     watch = ChildWatch(ChildPolicy(restart=RestartPolicy(budget=0)))
     watch.begin(0.0)
     for life in range(20):
@@ -327,7 +329,7 @@ def test_one_that_is_ordered_to_be_started_anew_is_killed_and_started_at_once_ho
     ]  # that was no order
 
 
-def test_one_that_has_ended_waits_or_is_given_up_is_started_when_ordered() -> None:
+def test_child_that_ended_waits_or_is_given_up_is_started_by_order() -> None:
     done, waiting, given_up = (ChildWatch(ChildPolicy(restart=RestartPolicy(budget=budget))) for budget in (1, 2, 0))
     for watch in (done, waiting, given_up):
         watch.begin(0.0)
@@ -340,7 +342,7 @@ def test_one_that_has_ended_waits_or_is_given_up_is_started_when_ordered() -> No
     assert [watch.phase for watch in (done, waiting, given_up)] == [ChildPhase.RUNNING] * 3
 
 
-def test_an_order_does_not_undo_the_end() -> None:
+def test_restart_order_does_not_undo_the_end() -> None:
     watch = ChildWatch(ChildPolicy())
     watch.begin(0.0)
     watch.restart(1.0)
@@ -359,7 +361,7 @@ CODE = int(ExitCode.OWN_FAULT)
 
 
 def fails(*faults: OwnFault | None) -> ChildWatch:
-    """One that has ended by these faults in a row."""
+    """Return a child that has exited with these faults in a row."""
     watch = ChildWatch(ChildPolicy())
     watch.begin(0.0)
     for number, fault in enumerate(faults, 1):
@@ -368,7 +370,7 @@ def fails(*faults: OwnFault | None) -> ChildWatch:
     return watch
 
 
-def test_the_same_fault_twice_without_progress_is_not_tried_a_third_time() -> None:
+def test_same_fault_twice_without_progress_is_given_up() -> None:
     assert fails(FAULT).phase is ChildPhase.RUNNING
     assert fails(FAULT, FAULT).phase is ChildPhase.GIVEN_UP
 
@@ -383,11 +385,11 @@ def test_the_same_fault_twice_without_progress_is_not_tried_a_third_time() -> No
     ],
     ids=["progress", "another place", "another error", "a passing error"],
 )
-def test_any_other_end_in_between_begins_anew(second: OwnFault | None) -> None:
+def test_other_exit_in_between_resets_the_fault_count(second: OwnFault | None) -> None:
     assert fails(FAULT, second, FAULT).phase is ChildPhase.RUNNING
 
 
-def test_one_that_a_person_starts_again_may_fail_once_more() -> None:
+def test_child_restarted_by_a_person_may_fail_once_more() -> None:
     watch = fails(FAULT, FAULT)
     assert StartChild() in watch.restart(300.0)
     watch.exited(CODE, 400.0, fault=FAULT)

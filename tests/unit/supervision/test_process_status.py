@@ -1,4 +1,4 @@
-"""The condition of a process, and since when it is in it."""
+"""Condition of a process, and since when it holds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Beat(NamedTuple):
 
 
 class Child(SupervisedChild):
-    """Lives as the supervisor has it live."""
+    """A child whose life the test sets."""
 
     def __init__(self, *, beats: bool = True) -> None:
         super().__init__(ChildSpec("one", Role.TRANSLATOR, beats), ChildWatch(POLICY))
@@ -43,7 +43,7 @@ class Child(SupervisedChild):
         return condition_of(self, now_s, POLICY.liveness)
 
 
-def test_through_its_life() -> None:
+def test_condition_follows_the_life_of_a_process() -> None:
     child = Child()
     assert child.condition(0.0) is Condition.STARTING
     child.start(7)
@@ -66,7 +66,7 @@ def test_through_its_life() -> None:
     assert child.condition(6.5) is Condition.GIVEN_UP
 
 
-def test_one_that_is_done_has_ended_and_one_that_closes_is_not_silent() -> None:
+def test_finished_process_has_ended_and_a_closing_one_is_not_silent() -> None:
     child = Child()
     child.start(7)
     child.beats(1.0, closing=True)
@@ -75,7 +75,7 @@ def test_one_that_is_done_has_ended_and_one_that_closes_is_not_silent() -> None:
     assert child.condition(5.0) is Condition.ENDED
 
 
-def test_one_that_is_killed_to_be_started_again_is_being_restarted() -> None:
+def test_process_killed_for_a_restart_is_restarting() -> None:
     child = Child()
     child.start(7)
     child.beats(1.0)
@@ -83,13 +83,13 @@ def test_one_that_is_killed_to_be_started_again_is_being_restarted() -> None:
     assert child.condition(1.5) is Condition.RESTARTING
 
 
-def test_one_that_sends_no_beats_is_taken_to_be_alive() -> None:
+def test_process_without_heartbeats_counts_as_alive() -> None:
     child = Child(beats=False)
     child.start(7)
     assert child.condition(1e6) is Condition.ALIVE
 
 
-def test_a_change_is_told_once_and_since_when_it_is_so() -> None:
+def test_change_is_reported_once_with_its_time() -> None:
     status, child = ProcessStatus(POLICY.liveness), Child()
     child.start(7)
     (state,), changed = status.states([child], 0.0, 10)

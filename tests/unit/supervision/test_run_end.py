@@ -20,7 +20,7 @@ def test_ctrl_c_asks_at_once_and_kills_within_two_seconds() -> None:
     assert ending.kill_s <= 101.5
 
 
-def test_at_the_end_of_the_experiment_all_may_finish_first() -> None:
+def test_processes_may_finish_after_an_announced_end() -> None:
     ending = RunEnd.begin(EndReason.EXPERIMENT_ENDED, "", 100.0)
     assert ending.deadline_s() == 100.0 + OWN_PACE_S
     assert ending.kill_s == 100.0 + OWN_PACE_S + KILL_AFTER_S
@@ -31,7 +31,7 @@ def test_a_second_ctrl_c_kills_at_once() -> None:
     assert ending.hurried(100.2).step(100.2)[1] is EndStep.KILL
 
 
-def test_so_does_one_that_comes_before_anything_was_done_about_the_first() -> None:
+def test_second_ctrl_c_before_the_first_step_kills_at_once() -> None:
     assert RunEnd.begin(EndReason.STOPPED, "", 100.0).hurried(100.0).step(100.0)[1] is EndStep.KILL
 
 
@@ -40,13 +40,13 @@ def test_ctrl_c_at_the_end_of_the_experiment_asks_first() -> None:
     assert ending.step(100.2, busy=True)[1] is EndStep.ASK
 
 
-def test_a_further_ctrl_c_changes_nothing_about_what_is_killed_already() -> None:
+def test_ctrl_c_after_a_kill_changes_nothing() -> None:
     ending, _ = RunEnd.begin(EndReason.STOPPED, "", 100.0).step(100.0)
     ending, _ = ending.hurried(100.2).step(100.2)
     assert ending.hurried(100.3) == ending
 
 
-def test_who_is_busy_at_the_end_of_the_experiment_is_waited_for_but_not_for_ever() -> None:
+def test_busy_process_is_waited_for_at_the_end_within_a_limit() -> None:
     ending = RunEnd.begin(EndReason.EXPERIMENT_ENDED, "", 100.0)
     now_s, do = 100.0, None
     while do is None:
@@ -59,11 +59,11 @@ def test_who_is_busy_at_the_end_of_the_experiment_is_waited_for_but_not_for_ever
     assert now_s == 100.0 + FAREWELL_S
 
 
-def test_nobody_is_waited_for_after_ctrl_c() -> None:
+def test_busy_process_is_not_waited_for_after_ctrl_c() -> None:
     assert RunEnd.begin(EndReason.STOPPED, "", 100.0).step(100.0, busy=True)[1] is EndStep.ASK
 
 
-def test_who_sees_to_the_tip_is_not_killed_meanwhile_but_not_for_ever() -> None:
+def test_process_that_retracts_the_tip_is_not_killed_within_a_limit() -> None:
     ending, _ = RunEnd.begin(EndReason.STOPPED, "", 100.0).step(100.0)
     kept, do = ending.step(100.0 + KILL_AFTER_S, busy=True)
     assert do is None
@@ -77,7 +77,7 @@ def test_who_sees_to_the_tip_is_not_killed_meanwhile_but_not_for_ever() -> None:
     assert (do, now_s) == (EndStep.KILL, 100.0 + TIP_S)
 
 
-def test_who_has_seen_to_the_tip_has_as_long_to_end_as_everybody_else() -> None:
+def test_process_that_has_retracted_the_tip_has_the_usual_time_to_end() -> None:
     for busy_until_s in (101.4, 105.0):  # before others are killed, and after
         ending, do = RunEnd.begin(EndReason.STOPPED, "", 100.0).step(100.0)
         for tenth in range(1001, 1200):

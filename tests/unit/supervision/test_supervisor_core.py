@@ -64,7 +64,7 @@ class Run:
         self.step(RunBegan())
 
     def step(self, event: SupervisorEvent, after_s: float = 0.0) -> list[tuple[ProcessAction, str]]:
-        """The commands that follow an event."""
+        """Return the commands that follow an event."""
         self.now_s += after_s
         before = len(self.commands)
         self._take(event)
@@ -95,19 +95,19 @@ def test_all_are_started_at_the_beginning() -> None:
     assert Run().commands == [(START, "scope"), (START, "scheduler"), (START, "series")]
 
 
-def test_a_process_that_crashes_is_started_again() -> None:
+def test_crashing_process_is_restarted() -> None:
     run = Run()
     assert run.exits("series", 1, "it breaks") == [(START, "series")]
     assert run.core.children["series"].last_exit == "crashed: it breaks"
 
 
-def test_the_exit_of_a_process_before_is_no_news() -> None:
+def test_exit_of_an_earlier_process_is_ignored() -> None:
     run = Run()
     run.exits("series", 1)
     assert run.step(Exited("series", run.pids["series"] - 1, 1)) == []
 
 
-def test_without_a_translator_the_run_is_lost_and_without_a_component_it_goes_on() -> None:
+def test_run_is_lost_without_a_translator_and_goes_on_without_a_component() -> None:
     run = Run()
     run.exits("series", ExitCode.CONFIG, "no such channel")
     assert run.core.ending is None
@@ -117,7 +117,7 @@ def test_without_a_translator_the_run_is_lost_and_without_a_component_it_goes_on
     assert run.core.ending.why is EndReason.LOST
 
 
-def test_a_translator_that_ends_without_a_word_has_crashed() -> None:
+def test_translator_that_ends_unannounced_has_crashed() -> None:
     run = Run()
     run.beat()
     assert run.exits("scope", ExitCode.DONE) == [(START, "scope")]
@@ -140,7 +140,7 @@ def test_one_signal_asks_all_to_end_and_a_second_kills() -> None:
     assert run.core.is_over
 
 
-def test_what_can_not_be_killed_is_left() -> None:
+def test_process_that_can_not_be_killed_is_abandoned() -> None:
     run = Run(ChildSpec("series"))
     run.step(EndSignal(signal.SIGTERM))
     for _ in range(2):
@@ -149,7 +149,7 @@ def test_what_can_not_be_killed_is_left() -> None:
     assert run.core.is_over
 
 
-def test_at_the_end_of_the_experiment_who_died_with_something_to_finish_is_started_once_more() -> None:
+def test_component_that_died_unfinished_at_the_end_is_restarted_once() -> None:
     run = Run()
     run.beat()
     assert run.exits("scheduler", ExitCode.ENDED) == [(CLOSE, "scope")]
@@ -175,7 +175,7 @@ def test_a_component_that_works_on_a_step_is_waited_for_at_the_end() -> None:
     assert run.lines[-1].text == "waiting for series to finish; Ctrl-C ends it now"
 
 
-def test_components_wait_for_the_answer_of_the_scheduler_but_not_for_ever() -> None:
+def test_components_wait_for_the_scheduler_s_answer_within_a_limit() -> None:
     run = Run(awaits_scheduler=True)
     run.beat("scheduler")
     run.step(TimePassed(), SCHEDULER_ANSWERS_WITHIN_S - 0.1)
@@ -187,7 +187,7 @@ def test_components_wait_for_the_answer_of_the_scheduler_but_not_for_ever() -> N
 
 
 @pytest.mark.parametrize(("works", "killed"), [(True, []), (False, [(KILL, "series")]), (None, [(KILL, "series")])])
-def test_one_that_does_not_beat_is_killed_unless_it_is_seen_to_work(
+def test_process_without_heartbeats_is_killed_unless_seen_to_work(
     works: bool | None, killed: list[tuple[ProcessAction, str]]
 ) -> None:
     run = Run(ChildSpec("series"))
@@ -199,7 +199,7 @@ def test_one_that_does_not_beat_is_killed_unless_it_is_seen_to_work(
     assert run.step(TimePassed(), 0.9) == killed
 
 
-def test_an_order_starts_one_anew_that_was_given_up() -> None:
+def test_restart_order_starts_a_process_that_was_given_up() -> None:
     run = Run()
     run.exits("series", ExitCode.CONFIG)
     assert run.step(RestartOrdered("series")) == [(START, "series")]
@@ -208,7 +208,7 @@ def test_an_order_starts_one_anew_that_was_given_up() -> None:
     assert (report.starts, report.ordered, report.given_up) == (2, 1, False)
 
 
-def test_a_start_that_fails_is_tried_again_until_it_is_given_up() -> None:
+def test_failing_start_is_retried_until_given_up() -> None:
     core = SupervisorCore([ChildSpec("series")], POLICY)
     core.step(RunBegan(), 0.0)
     start = ProcessCommand(START, "series")
@@ -220,7 +220,7 @@ def test_a_start_that_fails_is_tried_again_until_it_is_given_up() -> None:
     assert core.is_over
 
 
-def test_there_is_nothing_to_wait_for_before_the_next_deadline() -> None:
+def test_next_deadline_lies_within_the_silence_limit() -> None:
     run = Run(ChildSpec("series"))
     run.beat("series")
     run.step(TimePassed())
@@ -240,7 +240,7 @@ PLANS = (ChildSpec("series", acts=True), ChildSpec("grid", acts=True))
 
 
 class IdleRun(Run):
-    """A run of two plans and a classifier; `rest` lets time pass while everything else is at rest."""
+    """A run of two plans and a classifier; `rest` lets time pass without events."""
 
     def __init__(self, *, ends_idle: bool) -> None:
         super().__init__(*SPECS[:2], *PLANS, ChildSpec("classifier"), ends_idle=ends_idle)
@@ -330,7 +330,7 @@ def test_a_run_does_not_end_while_a_component_starts_again_or_a_plan_is_restarte
     assert run.others == []
 
 
-def test_a_scheduler_that_refuses_to_end_is_asked_again() -> None:
+def test_refused_end_of_the_experiment_is_requested_again() -> None:
     run = IdleRun(ends_idle=True)
     run.exits("series", ExitCode.DONE)
     run.exits("grid", ExitCode.DONE)
@@ -357,7 +357,7 @@ def test_the_recorder_leaves_after_the_other_components_and_before_the_scheduler
 
 
 def killed_after_s(run: Run, processor_share: float, *, works: bool | None = True) -> float:
-    """Return how long after it was asked to end `series` is killed, which gets a share of a processor."""
+    """Return the time from the request to end until `series`, with a share of a processor, is killed."""
     run.step(EndSignal(signal.SIGINT))
     assert run.step(TimePassed()) == [(CLOSE, "series")]
     asked_s = run.now_s
@@ -369,7 +369,7 @@ def killed_after_s(run: Run, processor_share: float, *, works: bool | None = Tru
     raise AssertionError("it is never killed")
 
 
-def test_process_that_works_on_its_end_has_longer_on_a_busy_computer_but_not_for_ever() -> None:
+def test_process_that_works_on_its_end_has_longer_on_a_busy_computer_within_a_limit() -> None:
     assert killed_after_s(_only_series(), 0.0, works=False) == pytest.approx(KILL_AFTER_S, abs=0.2)
     assert killed_after_s(_only_series(), 0.0, works=None) == pytest.approx(KILL_AFTER_S, abs=0.2)
     slow = killed_after_s(_only_series(), CLOSES_WITHIN_S / 8.0)
@@ -377,7 +377,7 @@ def test_process_that_works_on_its_end_has_longer_on_a_busy_computer_but_not_for
     assert killed_after_s(_only_series(), CLOSES_WITHIN_S / 60.0) == pytest.approx(TIP_S, abs=0.3)
 
 
-def test_process_that_goes_round_for_ever_is_killed_soon_where_the_computer_is_idle() -> None:
+def test_process_in_an_endless_loop_is_killed_soon_on_an_idle_computer() -> None:
     assert killed_after_s(_only_series(), 1.0) <= CLOSES_WITHIN_S + KILL_AFTER_S + 0.2
 
 
@@ -387,8 +387,8 @@ def _only_series() -> Run:
     return run
 
 
-def test_component_that_is_started_again_at_the_end_has_time_on_a_busy_computer() -> None:
-    """Four seconds before the end it was killed: it starts slowly, then draws the night."""
+def test_component_restarted_at_the_end_has_time_on_a_busy_computer() -> None:
+    """It was killed four seconds before the end: it starts slowly, then draws the night."""
     run = Run()
     run.beat()
     run.exits("series", -9)

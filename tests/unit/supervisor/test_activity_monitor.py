@@ -1,4 +1,4 @@
-"""Whether a process stands still, as it is seen from outside."""
+"""Activity of a process as the operating system shows it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CLOCK = ExperimentClock.real()
 
 
 def judged(signs: Callable[[float], ActivitySample | None], until_s: float = 10.0) -> bool | None:
-    """What it is found to do at the end of a time in which one looks again and again."""
+    """Return the verdict at the end of a series of samples."""
     now = [0.0]
     vital = ActivityMonitor(1, LATELY_S, lambda pid: signs(now[0]))
     works = vital.work(now[0])
@@ -28,39 +28,39 @@ def judged(signs: Callable[[float], ActivitySample | None], until_s: float = 10.
     return works
 
 
-def test_who_uses_processor_time_works() -> None:
+def test_process_that_uses_processor_time_works() -> None:
     assert judged(lambda now_s: ActivitySample(100.0 + now_s)) is True
     assert judged(lambda now_s: ActivitySample(2.0 * LEAST_SHARE * now_s)) is True
 
 
-def test_who_only_waits_stands_still_whatever_it_did_before() -> None:
+def test_process_that_only_waits_is_idle_despite_earlier_work() -> None:
     assert judged(lambda now_s: ActivitySample(100.0)) is False
     assert judged(lambda now_s: ActivitySample(min(now_s, 8.0))) is False
     assert judged(lambda now_s: ActivitySample(0.2 * LEAST_SHARE * now_s)) is False
 
 
-def test_who_waits_for_a_disk_works_though_that_is_not_seen_at_every_look() -> None:
+def test_process_that_waits_for_a_disk_in_some_samples_works() -> None:
     assert judged(lambda now_s: ActivitySample(0.0, waits_for_disk=round(now_s) % 2 == 0)) is True
     assert judged(lambda now_s: ActivitySample(0.0, waits_for_disk=now_s < 8.0)) is False
 
 
-def test_who_would_work_if_the_processor_were_free_works() -> None:
+def test_runnable_process_without_processor_time_works() -> None:
     assert judged(lambda now_s: ActivitySample(0.001 * now_s, runs=True)) is True
     assert judged(lambda now_s: ActivitySample(0.001 * now_s, runs=now_s < 9.5)) is True
     assert judged(lambda now_s: ActivitySample(0.001 * now_s, runs=now_s < 8.0)) is False
 
 
-def test_who_was_stopped_stands_still_at_once() -> None:
+def test_suspended_process_is_idle_at_once() -> None:
     assert judged(lambda now_s: ActivitySample(now_s, stopped=now_s > 9.9)) is False
 
 
-def test_a_single_look_tells_nothing_and_what_can_not_be_seen_neither() -> None:
+def test_single_or_missing_sample_gives_no_answer() -> None:
     assert ActivityMonitor(1, LATELY_S, lambda pid: ActivitySample(100.0)).work(0.0) is None
     assert judged(lambda now_s: None) is None
     assert judged(lambda now_s: ActivitySample(now_s) if now_s < 9.9 else None) is None
 
 
-def test_nobody_looks_all_the_time() -> None:
+def test_samples_are_taken_at_intervals() -> None:
     looks = 0
 
     def look(pid: int) -> ActivitySample:
@@ -75,7 +75,7 @@ def test_nobody_looks_all_the_time() -> None:
 
 
 @pytest.mark.skipif(sys.platform not in ("linux", "win32"), reason="nothing can be seen there")
-def test_what_the_system_says_of_ourselves() -> None:
+def test_sample_of_this_process_is_plausible() -> None:
     before = of_process(os.getpid())
     sum(range(10**7))
     after = of_process(os.getpid())
@@ -86,12 +86,12 @@ def test_what_the_system_says_of_ourselves() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc")
-def test_of_who_is_not_there_nothing_is_seen() -> None:
+def test_missing_process_has_no_sample() -> None:
     assert of_process(2**22 + 1) is None
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere threads are no processes")
-def test_the_state_of_each_thread_is_seen() -> None:
+def test_state_of_each_thread_is_sampled() -> None:
     over = threading.Event()
     thread = threading.Thread(target=over.wait)
     thread.start()

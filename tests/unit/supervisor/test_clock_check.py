@@ -1,4 +1,4 @@
-"""A warning, once, when the clock on the wall leaves that of the run."""
+"""One warning when the wall clock departs from the run's clock."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from afspm.supervisor.supervisor import TOLERANCE_S, ClockCheck
         (-TOLERANCE_S / 2, None),
     ],
 )
-def test_when_the_clock_on_the_wall_is_set_that_is_said_once(
+def test_change_of_the_wall_clock_is_warned_of_once(
     monkeypatch: pytest.MonkeyPatch, step_s: float, said: str | None
 ) -> None:
     wall_s = time.time
@@ -32,7 +32,7 @@ def test_when_the_clock_on_the_wall_is_set_that_is_said_once(
     assert check.warning() == ""
 
 
-def test_of_a_time_that_passes_faster_nothing_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_faster_simulated_time_is_not_warned_of(monkeypatch: pytest.MonkeyPatch) -> None:
     wall_s = time.time
     check = ClockCheck(ExperimentClock.starting_now(speed=60.0))
     monkeypatch.setattr(time, "time", lambda: wall_s() + 3600.0)

@@ -1,4 +1,4 @@
-"""A run is not resumed by the name of a file that says something else by now."""
+"""A run is not resumed by the name of a file that has changed since."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ size = ["1 um", "1 um"]
 
 @pytest.fixture
 def night(tmp_path: Path) -> Path:
-    """An experiment file of which, with an overlay, there is a run that was cut off."""
+    """An experiment file, with an overlay, whose run was cut off."""
     file, overlay = tmp_path / "night.toml", tmp_path / "series.toml"
     file.write_text(NIGHT, encoding="utf-8")
     overlay.write_text(OVERLAY, encoding="utf-8")
@@ -52,7 +52,7 @@ def night(tmp_path: Path) -> Path:
     return file
 
 
-def test_by_the_name_of_files_that_are_as_they_were_it_is_found(night: Path) -> None:
+def test_run_is_found_by_its_unchanged_files(night: Path) -> None:
     assert resume.find(night).folder == night.parent / "runs" / "night-1"
     night.write_text("# reading it again\n" + NIGHT.replace("60.0", "6e1"), encoding="utf-8")
     assert resume.find(night).folder == night.parent / "runs" / "night-1"
@@ -68,9 +68,7 @@ def test_by_the_name_of_files_that_are_as_they_were_it_is_found(night: Path) -> 
         ("[limits]", "[lmits]", r"\[limits\] is gone"),
     ],
 )
-def test_where_the_file_was_edited_that_is_refused_with_what_may_be_done(
-    night: Path, before: str, after: str, said: str
-) -> None:
+def test_edited_file_is_refused_with_a_remedy(night: Path, before: str, after: str, said: str) -> None:
     night.write_text(NIGHT.replace(before, after), encoding="utf-8")
     with pytest.raises(ConfigError, match=said) as refused:
         resume.find(night)
@@ -78,25 +76,25 @@ def test_where_the_file_was_edited_that_is_refused_with_what_may_be_done(
     assert f"`afspm run {night} {night.parent / 'series.toml'}` begins a new run" in refused.value.hint
 
 
-def test_an_overlay_that_was_edited_is_seen_as_well(night: Path) -> None:
+def test_edited_overlay_is_refused_too(night: Path) -> None:
     (night.parent / "series.toml").write_text(OVERLAY.replace("1 um", "5 um"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"\[series\] size"):
         resume.find(night)
 
 
-def test_an_overlay_that_is_gone_is_missed(night: Path) -> None:
+def test_missing_overlay_is_refused(night: Path) -> None:
     (night.parent / "series.toml").unlink()
     with pytest.raises(ConfigError, match=r"\[series\] is gone"):
         resume.find(night)
 
 
-def test_by_its_folder_it_goes_on_as_it_was_begun_whatever_was_edited(night: Path) -> None:
+def test_run_named_by_its_folder_resumes_with_its_original_file(night: Path) -> None:
     night.write_text(NIGHT.replace("1 um", "100 nm"), encoding="utf-8")
     found = resume.find(night.parent / "runs" / "night-1")
     assert "100 nm" not in found.experiment.expanded()
 
 
-def test_what_differs_is_named() -> None:
+def test_differences_are_named() -> None:
     before = {"name": "a", "limits": {"z": 1, "region": 2}, "old": {"component": True}, "same": {"x": 1}}
     now = {"name": "b", "limits": {"z": 2, "region": 2, "current": 3}, "same": {"x": 1}, "new": {"component": True}}
     assert differing(before, now) == ["name", "[limits] z, current", "[old] is gone", "[new] is new"]

@@ -12,7 +12,7 @@ from afspm.supervisor.ports import CAN_HOLD, HIGHEST, LONGEST_FOLDER, LOWEST, Fr
 from afspm.transport.network import HAS_PRIVATE_SOCKETS
 
 
-def test_no_port_is_given_twice() -> None:
+def test_each_port_is_handed_out_once() -> None:
     ports = FreePorts()
     given = [ports.take() for _ in range(50)]
     assert len(set(given)) == 50
@@ -29,7 +29,7 @@ def test_an_address_names_the_host() -> None:
 
 
 @pytest.mark.skipif(not CAN_HOLD, reason="ports can't be held here")
-def test_a_port_is_nobody_else_s_before_it_is_bound_while_it_is_bound_and_between_two_who_bind_it() -> None:
+def test_port_is_held_before_during_and_between_binds() -> None:
     address = ("127.0.0.1", FreePorts().take())
 
     def is_free() -> bool:
@@ -48,9 +48,7 @@ def test_a_port_is_nobody_else_s_before_it_is_bound_while_it_is_bound_and_betwee
 
 
 @pytest.mark.skipif(not HAS_PRIVATE_SOCKETS, reason="there are no unix sockets")
-def test_socket_folder_is_for_its_owner_alone_and_short_whatever_the_environment_says(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_socket_folder_is_private_and_short_in_any_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     deep = tmp_path / ("a" * LONGEST_FOLDER)
     deep.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
@@ -71,7 +69,7 @@ def test_socket_folder_is_for_its_owner_alone_and_short_whatever_the_environment
     [(True, False, ("ipc", "ipc")), (False, False, ("tcp", "ipc")), (False, True, ("tcp", "tcp"))],
 )
 @pytest.mark.parametrize("has", [True, False])
-def test_new_addresses_are_unix_sockets_where_they_are_wanted_and_there(
+def test_new_addresses_are_unix_sockets_if_private_and_available(
     monkeypatch: pytest.MonkeyPatch, private: bool, tcp: bool, schemes: tuple[str, str], has: bool
 ) -> None:
     if has and not HAS_PRIVATE_SOCKETS:

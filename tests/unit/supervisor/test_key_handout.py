@@ -1,4 +1,4 @@
-"""Each process gets its own keys alone, whether they are the file's or made for the run."""
+"""Each process gets only its own keys, of the file or made for the run."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def lines(found: KeyHandout) -> dict[str, Mapping[str, Any]]:
     return {start.launch.name: start.launch.keys or {} for start in found.starts}
 
 
-def test_each_gets_its_own_pair_and_the_public_keys_of_whom_it_has_to_know(tmp_path: Path) -> None:
+def test_each_process_gets_its_own_pair_and_the_public_keys_of_its_peers(tmp_path: Path) -> None:
     found = handed(experiment(tmp_path))
     keys = lines(found)
     secrets = {name: own["secret"] for name, own in keys.items()}
@@ -119,25 +119,25 @@ def test_plain_sockets_of_a_bridge_leave_a_run_its_keys(tmp_path: Path) -> None:
     assert all("secret" in own for own in lines(found).values())
 
 
-def test_none_are_made_where_the_file_says_so(tmp_path: Path) -> None:
+def test_no_keys_are_made_if_the_file_is_insecure(tmp_path: Path) -> None:
     found = handed(experiment(tmp_path, "[security]\ninsecure = true\n"))
     assert found.guest is None
     assert not any("secret" in own for own in lines(found).values())
 
 
-def test_none_are_made_where_others_are_started_elsewhere_that_know_the_address(tmp_path: Path) -> None:
+def test_no_keys_are_made_if_peers_elsewhere_know_the_address(tmp_path: Path) -> None:
     assert "secret" in lines(handed(experiment(tmp_path, router=WRITTEN)))["series"]
     assert "secret" in lines(handed(experiment(tmp_path), without=["other"]))["series"]
     assert "secret" not in lines(handed(experiment(tmp_path, router=WRITTEN), without=["other"]))["series"]
 
 
-def test_a_scheduler_of_another_language_is_asked_without(tmp_path: Path) -> None:
+def test_scheduler_in_another_language_is_asked_without_keys(tmp_path: Path) -> None:
     text = FILE.format(router="").replace('class = "Scheduler"', 'command = ["python", "s.py"]\nrole = "scheduler"')
     (tmp_path / "experiment.toml").write_text(text, encoding="utf-8")
     assert not any(lines(handed(load(tmp_path / "experiment.toml"))).values())
 
 
-def test_of_keys_of_the_file_each_gets_its_own_too(tmp_path: Path) -> None:
+def test_each_process_gets_only_its_own_keys_of_the_file(tmp_path: Path) -> None:
     generate(tmp_path / "keys", ["microscope", "scheduler", "series", "other", "supervisor"])
     found = handed(experiment(tmp_path, '[security]\nkeys = "keys"\n'))
     own = lines(found)["series"]
@@ -161,7 +161,7 @@ def test_a_secret_that_others_may_read_is_refused(tmp_path: Path) -> None:
         handed(experiment(tmp_path, '[security]\nkeys = "keys"\n'))
 
 
-def test_who_may_read_the_run_folder_finds_the_key_for_guests_as_long_as_the_run_lasts(tmp_path: Path) -> None:
+def test_run_folder_has_the_guests_key_while_the_run_lasts(tmp_path: Path) -> None:
     found = handed(experiment(tmp_path))
     file = tmp_path / "state" / GUEST_KEYS
     with found.laid_down(tmp_path):

@@ -1,4 +1,4 @@
-"""What a process says without end is left out, but for the beginning, something now and then, and the last of it."""
+"""Endless output of a process is dropped, except its beginning, samples of it, and its end."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ def flooded(now_s: float = 0.0) -> OutputLimit:
     return thinning
 
 
-def test_a_component_that_says_a_little_all_night_is_heard_in_full() -> None:
+def test_moderate_output_all_night_is_kept_in_full() -> None:
     thinning, period_s = OutputLimit(0.0), COST / BYTES_PER_S
     assert all(thinning.passes(LINE, i * period_s) for i in range(100_000))
 
 
-def test_much_may_be_said_at_once() -> None:
+def test_burst_of_output_is_kept() -> None:
     thinning = OutputLimit(0.0)
     assert all(thinning.passes(LINE, 0.0) for _ in range(AT_ONCE // COST))
     assert not thinning.passes(LINE, 0.0)
@@ -38,7 +38,7 @@ def test_a_night_of_printing_is_no_more_than_the_disk_can_take() -> None:
     assert AT_ONCE < kept < AT_ONCE + 1.5 * BYTES_PER_S * hours_s
 
 
-def test_a_line_without_end_comes_in_pieces_that_are_left_out_as_well() -> None:
+def test_endless_line_comes_in_pieces_that_are_dropped_too() -> None:
     thinning = flooded()
     for _ in range(100):
         assert not thinning.passes(b"." * 65_536, 1.0)
@@ -47,7 +47,7 @@ def test_a_line_without_end_comes_in_pieces_that_are_left_out_as_well() -> None:
     assert left_out == 100
 
 
-def test_the_last_of_what_was_left_out_goes_on_and_the_rest_is_counted() -> None:
+def test_last_dropped_lines_are_kept_and_the_rest_counted() -> None:
     thinning = flooded()
     for i in range(1000):
         assert not thinning.passes(b"line %d\n" % i, 1.0)
@@ -59,7 +59,7 @@ def test_the_last_of_what_was_left_out_goes_on_and_the_rest_is_counted() -> None
     assert left_out + len(last) == 1 + 1000 + 2
 
 
-def test_after_the_pause_it_is_heard_again() -> None:
+def test_output_passes_again_after_the_pause() -> None:
     thinning = flooded()
     assert not thinning.passes(LINE, PAUSE_S - 0.1)
     thinning.go_on()

@@ -1,4 +1,4 @@
-"""What follows the end of a run."""
+"""Notification, report and summary after the end of a run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from afspm.supervisor.supervisor import ProcessReport, RunOutcome
 
 
 class Log:
-    """Keeps what is written."""
+    """Stores the written lines."""
 
     def __init__(self) -> None:
         self.lines: list[tuple[int, str]] = []
@@ -33,7 +33,7 @@ class Log:
 
 
 def told(folder: Path, why: EndReason, on: tuple[str, ...] = OCCASIONS) -> list[dict[str, object]]:
-    """What a command is told of a run that ended so."""
+    """Return the notification that a command gets about a run with this end."""
     file = folder / "told.txt"
     code = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
     reports = (ProcessReport("judge", 3, True, "exit code 1"), ProcessReport("series", 1, False, "done"))
@@ -52,18 +52,18 @@ def told(folder: Path, why: EndReason, on: tuple[str, ...] = OCCASIONS) -> list[
         (EndReason.LOST, ("end",), "end"),
     ],
 )
-def test_the_end_is_told_with_how_it_ended(tmp_path: Path, why: EndReason, on: tuple[str, ...], what: str) -> None:
+def test_notification_of_the_end_has_its_reason(tmp_path: Path, why: EndReason, on: tuple[str, ...], what: str) -> None:
     (notice,) = told(tmp_path, why, on)
     assert (notice["what"], notice["experiment"], notice["run"]) == (what, "night", str(tmp_path))
     assert notice["text"] == "the microscope is given up; given up: judge"
 
 
-def test_who_does_not_want_to_know_is_not_told(tmp_path: Path) -> None:
+def test_end_is_not_notified_unless_chosen(tmp_path: Path) -> None:
     assert told(tmp_path, EndReason.EXPERIMENT_ENDED, ("unsolved-problem",)) == []
 
 
 class TenSeconds:
-    """A clock on which each try takes ten seconds."""
+    """A clock on which each attempt takes ten seconds."""
 
     def __init__(self) -> None:
         self.t_s = -10.0
@@ -76,7 +76,7 @@ class TenSeconds:
         return 0
 
 
-def test_what_can_not_be_told_is_tried_again_and_then_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_failed_notification_is_retried_then_abandoned(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(notifications, "FIRST_DELAY_S", 0.01)
     log, count = Log(), tmp_path / "count"
     code = "import sys; open(sys.argv[1], 'a').write('x'); sys.exit('no network')"
@@ -96,7 +96,7 @@ def test_the_report_is_written_by_another_process(tmp_path: Path) -> None:
     assert log.lines[-1] == (logging.INFO, f"the report is {tmp_path / REPORT_FILE}")
 
 
-def test_without_a_record_there_is_none_and_no_word_of_it(tmp_path: Path) -> None:
+def test_run_without_a_record_has_no_report_and_no_warning(tmp_path: Path) -> None:
     log = Log()
     post_run.report(tmp_path, log)  # type: ignore[arg-type]
     assert log.lines == []
@@ -112,8 +112,8 @@ def test_a_report_that_fails_is_a_warning(tmp_path: Path) -> None:
     assert text.startswith("no report: ")
 
 
-def test_people_are_told_before_the_report_is_made(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """That may take two minutes, and who is in a hurry presses Ctrl-C."""
+def test_notification_precedes_the_report(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The report may take two minutes, and a person may press Ctrl-C before."""
     done: list[str] = []
     monkeypatch.setattr(post_run, "tell", lambda *_: done.append("told"))
     monkeypatch.setattr(post_run, "report", lambda *_: done.append("reported"))

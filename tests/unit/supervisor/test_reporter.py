@@ -1,4 +1,4 @@
-"""What is handed to a reporter whose scheduler takes nothing stays within bounds, and nobody waits for it."""
+"""The queue of a reporter without a scheduler stays bounded, and delays no caller."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from afspm.wire import encode
 
 @pytest.fixture
 def reporter() -> Reporter:
-    """One that was not started: nothing takes what it is given."""
+    """A reporter that was not started, so that its queue only grows."""
     return Reporter(Launch("supervisor:lab"), ExperimentClock.real(), "lab")
 
 
-def test_the_oldest_lines_go_and_that_is_said(reporter: Reporter) -> None:
+def test_oldest_lines_are_dropped_and_counted(reporter: Reporter) -> None:
     for n in range(reporting.MOST_LINES + 7):
         reporter.line("one", logging.INFO, f"line {n}")
     lines = reporter._queue.take_lines()
@@ -40,12 +40,12 @@ def test_a_batch_is_no_longer_than_the_scheduler_takes(reporter: Reporter) -> No
     assert len(encode(LogLines(lines))[1]) <= LONGEST_ANNOUNCEMENT
 
 
-def test_what_is_for_developers_is_left_out(reporter: Reporter) -> None:
+def test_debug_lines_are_not_reported(reporter: Reporter) -> None:
     reporter.line("one", logging.DEBUG, "started, process 7")
     assert reporter._queue.take_lines() == ()
 
 
-def test_orders_that_can_not_be_read_are_told_and_do_not_end_it(reporter: Reporter) -> None:
+def test_unreadable_orders_are_logged_and_reporting_goes_on(reporter: Reporter) -> None:
     told: list[reporting.ReporterEvent] = []
     reporter.post = told.append
     reporter._answered(RELAY_REQUEST, Response(ControlResponse.SUCCESS, b"\xff"))
@@ -67,7 +67,7 @@ def test_orders_that_can_not_be_read_are_told_and_do_not_end_it(reporter: Report
         (Response(ControlResponse.FAILURE, b"", "no"), []),
     ],
 )
-def test_use_of_the_microscope_is_reported_only_where_the_scheduler_can_say(
+def test_use_of_the_microscope_is_reported_only_if_the_scheduler_knows(
     reporter: Reporter, response: Response, reported: list[reporting.ReporterEvent]
 ) -> None:
     told: list[reporting.ReporterEvent] = []
@@ -85,5 +85,5 @@ def test_a_refusal_to_end_is_reported(reporter: Reporter) -> None:
     assert told == [EndRefused("not now")]
 
 
-def test_one_that_was_not_started_can_be_closed(reporter: Reporter) -> None:
+def test_reporter_that_was_not_started_can_be_closed(reporter: Reporter) -> None:
     reporter.close()

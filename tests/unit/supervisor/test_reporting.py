@@ -1,4 +1,4 @@
-"""Who is told of the processes: the scheduler, wherever it runs, if it is one of ours."""
+"""Processes are reported to the scheduler, wherever it runs, if it is afspm's."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def starts(made: Experiment, *only: str) -> list[ProcessStart]:
     return made.launches(take_address=lambda: "tcp://127.0.0.1:29110", only=only)
 
 
-def test_a_scheduler_that_is_started_here_is_told(tmp_path: Path) -> None:
+def test_local_scheduler_gets_reports(tmp_path: Path) -> None:
     made = experiment(tmp_path)
     reporter = reporter_of(made, starts(made), CLOCK)
     assert isinstance(reporter, Reporter)
@@ -51,7 +51,7 @@ def test_a_scheduler_that_is_started_here_is_told(tmp_path: Path) -> None:
     assert reporter._launch.name == f"supervisor:{reporter._supervisor}"
 
 
-def test_a_part_tells_the_scheduler_of_the_whole_under_a_name_of_its_own(tmp_path: Path) -> None:
+def test_part_reports_to_the_remote_scheduler_under_its_own_name(tmp_path: Path) -> None:
     made = experiment(tmp_path)
     whole, part = (reporter_of(made, starts(made, *only), CLOCK) for only in ((), ("series",)))
     assert isinstance(whole, Reporter)
@@ -61,14 +61,12 @@ def test_a_part_tells_the_scheduler_of_the_whole_under_a_name_of_its_own(tmp_pat
 
 
 @pytest.mark.parametrize("only", [(), ("series",)])
-def test_a_scheduler_of_another_language_is_not_asked_what_it_does_not_know(
-    tmp_path: Path, only: tuple[str, ...]
-) -> None:
+def test_scheduler_in_another_language_gets_no_unknown_requests(tmp_path: Path, only: tuple[str, ...]) -> None:
     made = experiment(tmp_path, 'command = ["python", "scheduler.py"]\nrole = "scheduler"')
     assert reporter_of(made, starts(made, *only), CLOCK) is None
 
 
-def test_with_keys_it_expects_the_scheduler_s(tmp_path: Path) -> None:
+def test_reporter_with_keys_expects_the_scheduler_s_key(tmp_path: Path) -> None:
     generate(tmp_path / "keys", ["microscope", "scheduler", "series", "recorder", "supervisor"])
     made = experiment(tmp_path, more='[security]\nkeys = "keys"\n')
     reporter = reporter_of(made, starts(made), CLOCK)

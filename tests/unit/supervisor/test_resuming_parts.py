@@ -1,4 +1,4 @@
-"""Of an experiment of several parts, each is resumed with the processes that it had."""
+"""Each part of an experiment on several computers is resumed with its own processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from afspm.basics.errors import ConfigError
 from afspm.experiment import Role, load
 from afspm.experiment.experiment import load_expanded
 from afspm.supervisor import run as running
-from afspm.supervisor.resume import ResumableRun, _own, _wait_until_gone
+from afspm.supervisor.resume import ResumableRun, _resumed_identity, _wait_until_gone
 from afspm.supervisor.run import ONLY, RUN, WITHOUT, RunOptions, dry_run, facts_to_resume
 
 PARTS = """
@@ -56,7 +56,7 @@ command = ["python", "call.py"]
         RunOptions(without=("microscope", "scheduler")),
     ],
 )
-def test_a_part_is_resumed_with_what_it_had(options: RunOptions, tmp_path: Path) -> None:
+def test_part_is_resumed_with_its_own_processes(options: RunOptions, tmp_path: Path) -> None:
     (tmp_path / "night.toml").write_text(PARTS, encoding="utf-8")
     experiment = load(tmp_path / "night.toml")
     starts = dry_run(experiment, options)
@@ -73,7 +73,7 @@ def test_a_part_is_resumed_with_what_it_had(options: RunOptions, tmp_path: Path)
         facts = facts_to_resume(expanded, starts, again)
 
 
-def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path) -> None:
+def test_component_added_at_a_resume_runs_in_that_life(tmp_path: Path) -> None:
     overlay = tmp_path / "overlay.toml"
     overlay.write_text('[dashboard]\ncomponent = true\nclass = "Dashboard"\n', encoding="utf-8")
     file, part = tmp_path / "experiment.toml", RunOptions(only=("microscope", "scheduler"))
@@ -93,7 +93,7 @@ def test_what_was_added_when_it_was_resumed_is_there_in_that_life(tmp_path: Path
 
 
 def test_all_processes_are_asked_at_once_whether_they_are_gone(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Where it takes seconds to be refused, one after the other would take longer than anybody waits."""
+    """On Windows each refused connection takes seconds, so they are made at the same time."""
     all_asked = threading.Barrier(12, timeout=10.0)
 
     def refused(address: tuple[str, int], timeout: float) -> None:
@@ -126,8 +126,8 @@ class = "Scheduler"
 """
 
 
-def test_without_its_emulator_an_experiment_does_not_have_the_time_of_a_simulation(tmp_path: Path) -> None:
-    """The translator would talk to whatever is at its address: nothing is started."""
+def test_experiment_without_its_emulator_does_not_have_simulated_time(tmp_path: Path) -> None:
+    """The translator would talk to any controller at its address, so nothing starts."""
     (tmp_path / "night.toml").write_text(EMULATED, encoding="utf-8")
     options = RunOptions(runs=tmp_path / "runs", without=("controller",))
     with pytest.raises(ConfigError, match="nothing here proves that its microscope is simulated"):
@@ -144,7 +144,7 @@ def test_simulated_time_goes_on_where_other_computers_have_parts_of_the_run(
     before = ExperimentClock(1000.0, 5000.0, 60.0)
     facts = {"simulated": True, RUN: "a", "clock": {**before.as_dict(), "monotonic": "of an earlier boot"}}
     found = ResumableRun(tmp_path, "night", experiment, facts, (tmp_path,))
-    clock = _own(experiment, RunOptions(only=only), found).clock
+    clock = _resumed_identity(experiment, RunOptions(only=only), found).clock
     if only:
         assert clock.now_s() == pytest.approx(before.now_s(), abs=60.0)
     else:  # nothing has happened meanwhile

@@ -1,4 +1,4 @@
-"""What run.json tells a script or notebook that wants to join."""
+"""Contents of run.json for scripts and notebooks that join."""
 
 from __future__ import annotations
 
@@ -36,9 +36,7 @@ class = "Metadata"
 
 
 @pytest.mark.parametrize("only", [(), ("microscope", "scheduler"), ("metadata",)])
-def test_with_keys_a_guest_knows_whose_to_expect_whatever_runs_on_this_computer(
-    tmp_path: Path, only: tuple[str, ...]
-) -> None:
+def test_guest_with_keys_expects_the_scheduler_s_key_on_any_computer(tmp_path: Path, only: tuple[str, ...]) -> None:
     file = tmp_path / "experiment.toml"
     file.write_text(EXPERIMENT)
     generate(tmp_path / "keys", ["microscope", "scheduler", "metadata"])

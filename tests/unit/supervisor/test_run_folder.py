@@ -30,7 +30,7 @@ def test_two_runs_of_one_second_do_not_share_a_folder(tmp_path: Path) -> None:
         assert (tmp_path / "latest").resolve() == second
 
 
-def test_where_no_link_can_be_made_a_file_names_the_newest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_file_names_the_newest_run_if_links_can_not_be_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object, **__: object) -> None:
         raise OSError("a required privilege is not held by the client")
 
@@ -45,7 +45,7 @@ def test_a_name_cannot_lead_out_of_the_folder(tmp_path: Path) -> None:
     assert folder.parent == (tmp_path / "runs").resolve()
 
 
-def test_where_no_folder_can_be_made_the_error_says_so(tmp_path: Path) -> None:
+def test_error_names_a_folder_that_can_not_be_made(tmp_path: Path) -> None:
     (tmp_path / "runs").write_text("a file")
     with pytest.raises(FileError, match="--runs"):
         run_folder.create(tmp_path / "runs", "night", STARTED)
@@ -58,9 +58,7 @@ def test_run_json_is_replaced_as_a_whole(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["run.json"]
 
 
-def test_what_a_run_is_resumed_by_is_on_the_disk_before_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_run_json_is_on_the_disk_before_its_final_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     there: list[bool] = []
     real = os.fsync
 

@@ -33,7 +33,7 @@ def test_a_word_that_only_begins_like_a_level_is_text() -> None:
     assert LineReader().read("stderr", "INFORMATION about it") == (logging.WARNING, "INFORMATION about it")
 
 
-def test_what_a_component_prints_is_information() -> None:
+def test_stdout_of_a_component_is_information() -> None:
     assert LineReader().read("stdout", "ERROR of 3 nm") == (logging.INFO, "ERROR of 3 nm")
 
 
@@ -55,7 +55,7 @@ def test_file_is_synced_so_that_its_lines_outlive_a_power_cut(tmp_path: Path, mo
         assert tmp_path.stat().st_ino in synced
 
 
-def test_the_file_has_every_line_and_the_terminal_those_of_its_level(tmp_path: Path) -> None:
+def test_file_has_every_line_and_the_terminal_lines_of_its_level(tmp_path: Path) -> None:
     terminal = io.StringIO()
     log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
     log.write("scheduler", logging.DEBUG, "a detail")
@@ -68,7 +68,7 @@ def test_the_file_has_every_line_and_the_terminal_those_of_its_level(tmp_path: P
     assert "experiment ERROR a scan with µm failed" in terminal.getvalue()
 
 
-def test_the_file_says_the_experiments_time_where_it_is_another(tmp_path: Path) -> None:
+def test_file_has_the_experiment_time_if_different_from_real_time(tmp_path: Path) -> None:
     log = RunLog(tmp_path / "log.txt", ExperimentClock.starting_now(start_s=1e9), terminal=io.StringIO())
     log.write("scheduler", logging.INFO, "begin")
     log.close()
@@ -84,15 +84,15 @@ def test_a_full_disk_does_not_end_the_run() -> None:
     assert "going on" in terminal.getvalue()
 
 
-def test_a_terminal_that_is_gone_does_not_end_the_run(tmp_path: Path) -> None:
+def test_closed_terminal_does_not_end_the_run(tmp_path: Path) -> None:
     log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=_Gone())
     log.write("scheduler", logging.INFO, "still here")
     log.close()
     assert "still here" in (tmp_path / "log.txt").read_text(encoding="utf-8")
 
 
-def test_a_terminal_that_takes_nothing_more_holds_up_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Somebody has marked text in it, or pressed Ctrl-S."""
+def test_blocked_terminal_delays_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Text is marked in the terminal, or Ctrl-S was pressed."""
     monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
     terminal = _Stopped()
     log = RunLog(tmp_path / "log.txt", ExperimentClock.real(), terminal=terminal)
@@ -104,7 +104,7 @@ def test_a_terminal_that_takes_nothing_more_holds_up_nobody(tmp_path: Path, monk
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="a pipe that nobody reads stands in for a disk that hangs")
-def test_a_disk_that_hangs_holds_up_nobody_and_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hanging_disk_delays_nothing_and_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("afspm.supervisor.log.SHOWN_WITHIN_S", 0.01)
     monkeypatch.setattr("afspm.supervisor.log.SLOW_S", 0.05)
     file, told = tmp_path / "log.txt", threading.Event()

@@ -20,7 +20,7 @@ REPORTS = (
 )
 
 
-def test_it_says_what_ran_what_was_restarted_and_what_was_given_up(tmp_path: Path) -> None:
+def test_summary_lists_processes_restarts_and_processes_given_up(tmp_path: Path) -> None:
     told = summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "the experiment has ended", REPORTS, 3725.0), tmp_path)
     assert told == [
         "the experiment has ended, after 1 h 02 min",
@@ -58,6 +58,6 @@ def test_a_table_that_can_not_be_read_is_no_reason_to_fail(tmp_path: Path) -> No
     assert summary(RunOutcome(EndReason.EXPERIMENT_ENDED, "", (), 1.0), tmp_path)[-1] == f"everything is in {tmp_path}"
 
 
-def test_who_stops_a_run_is_told_how_it_goes_on(tmp_path: Path) -> None:
+def test_summary_of_a_stopped_run_names_the_command_to_resume(tmp_path: Path) -> None:
     told = summary(RunOutcome(EndReason.STOPPED, "stopped by Ctrl-C", (), 1.0), tmp_path)
     assert told[-2:] == [f"everything is in {tmp_path}", f"`afspm run --resume {tmp_path}` goes on with it"]

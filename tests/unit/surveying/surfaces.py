@@ -1,4 +1,4 @@
-"""Surfaces with particles whose places and heights are known."""
+"""Surfaces with particles of known places and heights."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REGION = Region((0.0, 0.0), (SIDE_M, SIDE_M))
 
 @dataclass(frozen=True)
 class Ground:
-    """What particles lie on: slope, rms of hills, of offsets of the lines and of noise in m, and scars."""
+    """Ground of particles: slope, rms of hills, of line offsets and of noise in m, and scars."""
 
     slope: float = 0.0
     hills_m: float = 0.0
@@ -27,7 +27,7 @@ class Ground:
 
 
 def strewn(seed: int, count: int = 60) -> tuple[Floats, Floats]:
-    """Places (n, 2) of particles that don't hide each other, and radii."""
+    """Return places (n, 2) of particles that don't hide each other, and radii."""
     chance = np.random.default_rng(seed)
     places: list[Floats] = []
     while len(places) < count:
@@ -41,7 +41,7 @@ def scanned(
     places_m: Floats, radii_m: Floats, ground: Ground = Ground(), *, pixels: int = 128, seed: int = 0,
     region: Region = REGION,
 ) -> Scan:  # fmt: skip
-    """The heights of spheres on their ground, as wide as a tip makes them."""
+    """Return the heights of spheres on their ground, dilated by a tip."""
     chance = np.random.default_rng(seed)
     x_m, y_m = region.pixels_m((pixels, pixels))
     values = np.zeros((pixels, pixels))

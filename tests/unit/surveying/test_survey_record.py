@@ -1,4 +1,4 @@
-"""The table of a survey, and its picture, whatever became of the targets."""
+"""Table and picture of a survey, for every outcome of its targets."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def measured(visit: Visit, *curves: str) -> None:
 
 @pytest.fixture
 def record() -> SurveyRecord:
-    """One of each outcome."""
+    """A record with one target of each outcome."""
     targets = [Target((float(x), float(y)), 2.0 * float(r)) for (x, y), r in zip(PLACES, RADII, strict=True)]
     made = SurveyRecord(scanned(PLACES, RADII), targets, ("top", "beside"))
     measured(made.visits[0], "top", "beside")
@@ -44,7 +44,7 @@ def test_each_target_has_an_outcome(record: SurveyRecord) -> None:
     ]  # fmt: skip
 
 
-def test_the_table_says_where_how_high_and_which_files(record: SurveyRecord, tmp_path: Path) -> None:
+def test_table_has_positions_heights_and_files(record: SurveyRecord, tmp_path: Path) -> None:
     record.visits[0].curves["beside"] = replace(
         record.visits[0].curves["beside"], filename=str(tmp_path / "a" / "b.dat")
     )
@@ -73,7 +73,7 @@ def test_the_picture_is_drawn_with_as_many_targets_as_there_are(tmp_path: Path, 
     assert height >= 1000
 
 
-def test_one_of_each_outcome_is_drawn(record: SurveyRecord, tmp_path: Path) -> None:
+def test_each_outcome_is_drawn(record: SurveyRecord, tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     draw_survey(record, tmp_path / "survey.svg")
     drawn = (tmp_path / "survey.svg").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""Particles are found where they are, on grounds that are not flat, and nothing is found where none is."""
+"""Particles are found at their places on uneven ground, and none on bare ground."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_on_bare_ground_nothing_is_found(ground: Ground) -> None:
         assert find_particles(scanned(np.empty((0, 2)), np.empty(0), ground, seed=seed)) == []
 
 
-def test_they_come_highest_first_with_their_heights() -> None:
+def test_particles_are_sorted_by_height() -> None:
     scan = scanned(at((-1e-6, 0.0), (1e-6, 1e-6), (0.0, -1e-6)), np.array([60e-9, 90e-9, 75e-9]), TILTED)
     targets = find_particles(scan)
     assert [round(1e6 * target.position_m[0]) for target in targets] == [1, 0, -1]
@@ -55,25 +55,25 @@ def test_they_come_highest_first_with_their_heights() -> None:
     assert len(find_particles(scan, min_height=140e-9)) == 2
 
 
-def test_two_that_touch_are_two_unless_they_are_nearer_than_the_separation() -> None:
+def test_touching_particles_are_two_unless_nearer_than_the_separation() -> None:
     scan = scanned(at((0.0, 0.0), (260e-9, 0.0)), np.array([80e-9, 95e-9]))
     assert len(find_particles(scan)) == 2
     (only,) = find_particles(scan, separation_m=300e-9)
     assert math.dist(only.position_m, (260e-9, 0.0)) < PIXEL_M
 
 
-def test_one_whose_top_may_lie_beyond_the_border_is_left_out() -> None:
+def test_particle_with_its_top_beyond_the_border_is_left_out() -> None:
     scan = scanned(at((SIDE_M / 2 + 20e-9, 0.0), (1e-6, 0.0)), np.array([90e-9, 60e-9]))
     assert [round(target.position_m[0] * 1e6) for target in find_particles(scan)] == [1]
 
 
-def test_positions_are_those_of_a_turned_scan_elsewhere() -> None:
+def test_positions_follow_the_rotation_and_centre_of_the_scan() -> None:
     region = Region((3e-6, -2e-6), (SIDE_M, SIDE_M), math.radians(30))
     (target,) = find_particles(scanned(at((3.5e-6, -1e-6)), np.array([80e-9]), region=region))
     assert math.dist(target.position_m, (3.5e-6, -1e-6)) < PIXEL_M / 2
 
 
-def test_what_was_not_measured_is_no_target() -> None:
+def test_missing_pixels_are_no_target() -> None:
     scan = scanned(at((-1e-6, -1e-6), (1e-6, 1e-6)), np.array([60e-9, 80e-9]))
     values = scan.values.copy()
     values[80:] = np.nan
@@ -88,7 +88,7 @@ def test_a_particle_that_fills_its_zoom_is_found_in_its_middle() -> None:
     assert math.dist(found[0].position_m, (0.0, 0.0)) < 5e-9
 
 
-def test_beside_a_particle_is_where_no_neighbour_is() -> None:
+def test_place_beside_a_particle_avoids_its_neighbours() -> None:
     region = Region((0.0, 0.0), (600e-9, 600e-9))
     zoom = scanned(at((0.0, 0.0), (200e-9, 0.0), (-200e-9, 0.0)), np.array([50e-9] * 3), TILTED, region=region)
     x, y = lowest_beside(zoom, (0.0, 0.0), 200e-9)
@@ -105,7 +105,7 @@ def test_the_ground_of_a_flattened_scan_is_at_zero() -> None:
     assert np.ptp([np.median(line) for line in flat]) < 4e-9
 
 
-def test_the_nearest_is_none_where_all_are_too_far() -> None:
+def test_nearest_is_none_if_all_are_too_far() -> None:
     targets = [Target((0.0, 0.0)), Target((3.0, 0.0))]
     assert nearest(targets, (2.0, 0.0), 1.5) == targets[1]
     assert nearest(targets, (9.0, 0.0), 1.5) is None

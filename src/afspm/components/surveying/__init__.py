@@ -1,4 +1,4 @@
-"""Surveys: a wide scan, the targets found in it, and what was measured at each; for components and scripts alike."""
+"""Surveys, for components and scripts: a wide scan, the targets found in it, and the measurements at each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A survey as a picture: the wide scan with its numbered targets, their zooms, and the curves under each."""
+"""Picture of a survey: the wide scan with its numbered targets, their zooms, and the curves under each."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ def draw_survey(record: SurveyRecord, path: str | Path, *, title: str = "", simu
     """Draw a survey with its numbered targets, the zooms of the first fifteen and their curves.
 
     Args:
-        path: of the picture; its ending names the format.
-        simulated: written on it, so that the picture is not taken for a measurement.
+        path: of the picture; its suffix gives the format.
+        simulated: whether to mark the picture, so that it is not taken for a measurement.
     """
     _Picture(record).save(Path(path), title, simulated=simulated)
 

@@ -1,4 +1,4 @@
-"""The record of a survey: its targets and what was measured at each, as a table and a picture."""
+"""Record of a survey: its targets and the measurements at each, as a table and a picture."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from afspm.storage.atomic import write_atomic
 
 
 class Outcome(Enum):
-    """The fate of a target."""
+    """Outcome of the visit to a target."""
 
     MEASURED = "measured"
     REFUSED = "refused"
-    """All of it or a part: the reason says why."""
+    """Zoom or curves were refused, for the reason in the table."""
     INCOMPLETE = "incomplete"
     """The survey ended before the last curve."""
     NOT_REACHED = "not-reached"
@@ -28,16 +28,16 @@ class Outcome(Enum):
 
 @dataclass(eq=False)
 class Visit:
-    """A target and what was measured at it.
+    """A target and the measurements at it.
 
     Attributes:
         number: counts from 1, in the order of the targets.
-        center_m: (x, y) that curves are taken relative to: where the survey shows the target, or its zoom.
-        zoom: None: it was not taken, or not yet.
+        center_m: (x, y) from which offsets of curves are counted: the target's position in the survey, or in its zoom.
+        zoom: None: not taken, or not yet.
         curves: by their names.
-        refusals: why something was refused.
-        registration: how the position of the zoom on the sample is known, where drift is corrected; None: it is not.
-        position_sd_m: standard deviation of that position; None: not known.
+        refusals: reasons of refusals.
+        registration: source of the zoom's position on the sample, if drift is corrected; None: it is not.
+        position_sd_m: standard deviation of that position; None: unknown.
     """
 
     number: int
@@ -55,8 +55,8 @@ class SurveyRecord:
 
     Args:
         survey: the wide scan.
-        targets: in the order in which they are visited.
-        curves: the names of the curves of each target.
+        targets: in the order of their visits.
+        curves: names of the curves of each target.
 
     Attributes:
         visits: one for each target; fill them in as they are measured.
@@ -68,7 +68,7 @@ class SurveyRecord:
         self.visits = [Visit(number, target, target.position_m) for number, target in enumerate(targets, start=1)]
 
     def outcome(self, visit: Visit) -> Outcome:
-        """Return what became of a target."""
+        """Return the outcome of a visit."""
         if visit.refusals:
             return Outcome.REFUSED
         if visit.zoom is None:
@@ -78,10 +78,8 @@ class SurveyRecord:
     def write(self, path: str | Path) -> None:
         """Write the table: a row for each target, with the controller's files of its zoom and curves.
 
-        `registration` and `position_sd` say how its position is known, where drift is corrected: registered, coarse, or
-        by dead reckoning (refused, failed, new).
-
-        Files in the folder of the table, or below it, are named from there.
+        If drift is corrected, `registration` and `position_sd` give the source and error of its position: registered,
+        coarse, or by dead reckoning (refused, failed, new). Paths of files in the table's folder are relative to it.
 
         Raises:
             OSError: the disk is full …

@@ -1,6 +1,6 @@
 """Targets in a scan: particles found with scikit-image, highest first, and places beside them. Pure.
 
-A scan is levelled first: a curved surface that particles don't lead astray, the offset of each line, scars.
+A scan is levelled first: a curved surface, fitted so that particles have little weight, the offset of each line, scars.
 """
 
 from __future__ import annotations
@@ -21,13 +21,16 @@ from afspm.model.levelling import levelled
 Floats = NDArray[np.float64]
 
 _MAD: Final = 1.4826
-"""From the median of absolute deviations to a standard deviation."""
+"""Factor from the median of absolute deviations to a standard deviation."""
 _SIGMAS: Final = 6.0
-"""Least height above the noise, where none is given: of 128 x 128 pixels of noise none is so high."""
+"""Default least height in units of the noise: in 128 x 128 pixels of noise none is that high."""
 _WIDEST: Final = 0.2
-"""Of the scan's shorter side, where no width is given: what is wider is ground."""
+"""Default width above which features count as ground, as a share of the scan's shorter side."""
+# least standard deviation of the blur
 _LEAST_BLUR_PX: Final = 0.6
+# shortest rise along a line that counts as a scar
 _SCAR_PX: Final = 4
+# every 5 degrees
 _DIRECTIONS: Final = 72
 
 
@@ -37,7 +40,7 @@ class Target:
 
     Attributes:
         position_m: (x, y), in the frame of the scan that it was found in.
-        height: above the ground around it, in the unit of the scan; None: not known.
+        height: above the ground around it, in the unit of the scan; None: unknown.
     """
 
     position_m: XY
@@ -57,18 +60,18 @@ def find_particles(
     Particles whose top lies on the border are left out, and so are scars: disturbed stretches of single lines.
 
     Args:
-        count: at most so many; None: all.
+        count: largest number of particles; None: all.
         min_height: above the ground, in the unit of the scan; None: six times the noise.
-        separation_m: of two that are nearer to each other, only the higher counts.
-        widest_m: what is wider is ground; None: a fifth of the scan's shorter side.
+        separation_m: of two particles that are nearer to each other only the higher counts.
+        widest_m: wider features count as ground; None: a fifth of the scan's shorter side.
 
     Raises:
         ConfigError: scikit-image is not installed.
-        InvalidValue: too little was measured to level it.
+        InvalidValue: too few pixels were measured to level the scan.
     """
     pixel_m = _pixel_m(scan)
     widest_m = _WIDEST * min(scan.region.size_m) if widest_m is None else widest_m
-    # a particle as wide as the scan can't be told from ground that is bent
+    # a particle as wide as the scan looks like curved ground
     order = 2 if widest_m < min(scan.region.size_m) else 1
     heights = _smooth(flattened(scan, order), _blur_px(separation_m, pixel_m))
     above = _above_ground(heights, [widest_m / size for size in pixel_m])
@@ -84,15 +87,15 @@ def find_particles(
 
 
 def nearest(targets: Iterable[Target], to_m: XY, within_m: float) -> Target | None:
-    """Return the target nearest to a place; None if none lies within that distance."""
+    """Return the target nearest to a place; None if none lies within the distance."""
     near = [target for target in targets if math.dist(target.position_m, to_m) <= within_m]
     return min(near, key=lambda target: math.dist(target.position_m, to_m), default=None)
 
 
 def lowest_beside(scan: Scan, center_m: XY, distance_m: float) -> XY:
-    """Return the place at a distance from another where the scan is lowest, e.g. the bare ground beside a particle.
+    """Return the lowest place at a distance from a centre, e.g. the bare ground beside a particle.
 
-    Directions that leave the scan don't count; where all do, the place is the one with larger x.
+    Directions that leave the scan don't count; if all do, the place is the one with larger x.
     """
     angles = np.linspace(0.0, math.tau, _DIRECTIONS, endpoint=False)
     x_m = center_m[0] + distance_m * np.cos(angles)
@@ -104,9 +107,9 @@ def lowest_beside(scan: Scan, center_m: XY, distance_m: float) -> XY:
 
 
 def flattened(scan: Scan, order: int) -> Floats:
-    """Return the values without a surface of this order, which particles don't lead astray, and the lines' offsets.
+    """Return the values less a robust polynomial surface of this order, and less the offset of each line.
 
-    The ground is at 0; NaN where nothing was measured.
+    The ground is at 0; NaN where not measured.
     """
     flat = levelled(scan.values, order, "huber")
     for _ in range(3):

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from afspm.experiment.document import Document
     from afspm.experiment.findings import SourceLocation
     from afspm.experiment.parts import ExperimentParts
-    from afspm.experiment.resolution import ResolvedExperiment
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
     from afspm.experiment.toml_lines import Settings
 
 

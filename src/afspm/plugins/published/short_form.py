@@ -19,8 +19,8 @@ from afspm.plugins.published.files import INSTEAD, last
 from afspm.transport.network import is_local
 
 if TYPE_CHECKING:
-    from afspm.experiment.resolution import ResolvedExperiment
-    from afspm.experiment.wiring import WiringKeys
+    from afspm.experiment.resolved_experiment import ResolvedExperiment
+    from afspm.experiment.wiring_classes import WiringKeys
 
 _VARIABLES: Final[tuple[str, ...]] = ("name", "messages")
 _FILLED_IN: Final = "filled in: processes on one computer find each other"

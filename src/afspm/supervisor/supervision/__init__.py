@@ -1,1 +1,1 @@
-"""Decisions of the supervisor: whether a process lives, when it is started again, how a run ends. Pure."""
+"""Decisions of the supervisor: liveness, restarts, and the end of a run. Pure."""

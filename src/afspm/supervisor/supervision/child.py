@@ -1,4 +1,4 @@
-"""Supervision of one child: start it, watch it, start it again, give it up, let it end."""
+"""Supervision of one child: start, watch, restart, give up, end."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from afspm.supervisor.supervision.restart import RestartBudget, RestartPolicy
 
 @dataclass(frozen=True)
 class ChildPolicy:
-    """Patience and restarts of one child."""
+    """Liveness and restart policies of one child."""
 
     liveness: LivenessPolicy = field(default_factory=LivenessPolicy)
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     beats: bool = True
     """Whether it sends heartbeats."""
     final_codes: Collection[int] = frozenset({ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED})
-    """Exit codes after which it is not started again. Who was asked to stop, and not by us, is needed as before."""
+    """Exit codes after which it is not restarted. Not ORPHAN: a child stopped by another program is still needed."""
     quiet_codes: Collection[int] = frozenset({ExitCode.CONFIG, ExitCode.ENDED})
-    """Those of them that others tell: who gives it up for its settings, the scheduler that the experiment has ended."""
+    """Final codes that need no log line: refused settings are logged when it is given up, the end by the scheduler."""
 
 
 class HeartbeatReport(Protocol):
-    """The content of a heartbeat; None where the process does not say."""
+    """Content of a heartbeat; None for values that the process does not send."""
 
     @property
     def closing(self) -> bool: ...
@@ -39,19 +39,19 @@ class HeartbeatReport(Protocol):
 
 
 class ChildPhase(Enum):
-    """Where a child is in its life."""
+    """Phase of a child's life."""
 
     IDLE = auto()
     """Not started yet."""
     RUNNING = auto()
     KILLING = auto()
-    """It did not live any more as it should; its end is awaited."""
+    """It was killed as dead or frozen; its exit is awaited."""
     WAITING = auto()
-    """It crashed and is started again when its delay is over."""
+    """It crashed; it is restarted after the delay."""
     STOPPING = auto()
-    """We asked it to end."""
+    """It was asked to end."""
     DONE = auto()
-    """It ended, on purpose or by our wish."""
+    """It has ended, on purpose or because it was asked to."""
     GIVEN_UP = auto()
 
 
@@ -62,21 +62,21 @@ class StartChild:
 
 @dataclass(frozen=True, slots=True)
 class KillChild:
-    """End the process by force; its exit will be told."""
+    """Kill the process; its exit follows as an event."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class GiveUpChild:
-    """It is not started again: say so loudly. The scheduler, who is told of each process, waits for it no more."""
+    """Restart the process no more, and log it. The scheduler stops waiting for it, too."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class ChildLog:
-    """Tell people; `level` is a name of the logging module."""
+    """Log a line; `level` is a name of `logging`."""
 
     level: str
     text: str
@@ -93,7 +93,7 @@ _WHY = {
 
 
 class ChildWatch:
-    """One child, over all its lives. Every method takes the real monotonic time and returns what to do, in order."""
+    """One child, over all its lives. Methods take the real monotonic time, and return effects in order."""
 
     def __init__(self, policy: ChildPolicy | None = None) -> None:
         self._policy = policy or ChildPolicy()
@@ -101,27 +101,25 @@ class ChildWatch:
         self._liveness: Liveness | None = None
         self._began_s = 0.0
         self._again_s = 0.0
-        self._is_ordered = False  # its end is, and that it is started again at once
-        self._fault: OwnFault | None = None  # by which the life before ended
+        self._is_ordered = False  # whether a restart was ordered: its exit is expected
+        self._fault: OwnFault | None = None  # that ended the previous life
         self.phase = ChildPhase.IDLE
 
     @property
     def over(self) -> bool:
-        """It runs no more and will not be started again."""
+        """Whether the child has ended and will not be restarted."""
         return self.phase in (ChildPhase.DONE, ChildPhase.GIVEN_UP)
 
     def died(self, code: int) -> bool:
-        """Return whether a process that ended with this code had not finished."""
+        """Return whether an exit code means that the process had not finished."""
         return code not in (*self._policy.final_codes, ExitCode.ORPHAN)
 
     def begin(self, now_s: float) -> list[ChildEffect]:
-        """Start it, the first time or after it was over."""
         if self.phase not in (ChildPhase.IDLE, ChildPhase.DONE, ChildPhase.GIVEN_UP):
             return []
         return self._start(now_s)
 
     def beat(self, beat: HeartbeatReport, now_s: float) -> list[ChildEffect]:
-        """Take in a heartbeat."""
         if self._liveness is None:
             return []
         if beat.closing:
@@ -131,12 +129,12 @@ class ChildWatch:
         return self.tick(now_s)
 
     def waits(self, now_s: float) -> None:
-        """Count the time of its start from now: it is there, and may not begin yet."""
+        """Restart the time allowed for its start: the process exists, but must still wait."""
         if self._liveness is not None:
             self._liveness.waits(now_s)
 
     def exited(self, code: int, now_s: float, how: str = "", fault: OwnFault | None = None) -> list[ChildEffect]:
-        """Take in its end, by an exit code or, below zero, a signal; `how` says it for people."""
+        """Process an exit: by code, or by signal if below zero; `how` describes it for people."""
         how = how or f"exit code {code}"
         phase, self._liveness = self.phase, None
         if phase in (ChildPhase.STOPPING, ChildPhase.DONE):
@@ -154,7 +152,7 @@ class ChildWatch:
         return self._failed(now_s, how)
 
     def start_failed(self, why: str, now_s: float) -> list[ChildEffect]:
-        """Take in that there is no process: the command is missing, the computer has no memory left …"""
+        """Process a start that failed: the command is missing, memory is exhausted …"""
         self._liveness = None
         if self.phase is ChildPhase.STOPPING:
             self.phase = ChildPhase.DONE
@@ -162,7 +160,7 @@ class ChildWatch:
         return self._failed(now_s, f"could not be started: {why}")
 
     def restart(self, now_s: float) -> list[ChildEffect]:
-        """Start it anew by order, whatever it does now. That is no failure: it costs no restart."""
+        """Restart the child by order, in any phase. This is no failure, and uses no restart of the budget."""
         if self.phase is ChildPhase.STOPPING:
             return []
         self._fault = None
@@ -174,7 +172,7 @@ class ChildWatch:
         return [said, *self._start(now_s)]
 
     def stop(self, now_s: float) -> list[ChildEffect]:
-        """Restart it no more: its end is wanted, and the caller has asked it to."""
+        """Restart the child no more: the caller has asked it to end."""
         if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
             self.phase = ChildPhase.STOPPING
         elif self.phase in (ChildPhase.IDLE, ChildPhase.WAITING):
@@ -182,10 +180,10 @@ class ChildWatch:
         return []
 
     def tick(self, now_s: float, *, works: bool | None = None) -> list[ChildEffect]:
-        """Take in that time has passed.
+        """Process deadlines that have passed.
 
         Args:
-            works: whether the process was seen to work lately, though it does not beat; None: that is not known.
+            works: whether the process was seen to work recently although it sends no heartbeats; None: unknown.
         """
         if self.phase is ChildPhase.WAITING and now_s >= self._again_s:
             return self._start(now_s)
@@ -200,7 +198,7 @@ class ChildWatch:
         return [ChildLog("WARNING", f"killed: {why}"), KillChild(why)]
 
     def deadline_s(self) -> float | None:
-        """Return when `tick` is due at the latest; None: it is not."""
+        """Return when `tick` is due at the latest; None if there is no deadline."""
         if self.phase is ChildPhase.WAITING:
             return self._again_s
         if self.phase is ChildPhase.RUNNING and self._liveness is not None:

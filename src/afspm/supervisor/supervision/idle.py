@@ -1,4 +1,4 @@
-"""The end of a run in which nothing that acts is left: all plans are done, or the last was given up. Decisions only."""
+"""End of a run that is idle: all plans are done, or the last one was given up. Decisions only."""
 
 from __future__ import annotations
 
@@ -10,21 +10,22 @@ from afspm.supervisor.supervision.child import ChildPhase
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import SupervisedChild
 
-IDLE_AFTER_S = 10.0  # real time; a component that ends the experiment at its last scan, or repairs the tip, comes first
+IDLE_AFTER_S = 10.0  # real time; for a component to end the experiment after its last scan, or to begin a repair
+# a person may hold the microscope for hours: ask at this interval
 ASK_AGAIN_S = 5.0
 
 
 @dataclass(slots=True)
 class IdleWatch:
-    """The watch for a run in which nothing that acts is left.
+    """Watch for an idle run: no process with a plan is left.
 
     Attributes:
-        ends: whether the run ends then.
-        since_s: when the last plan was over and everything else at rest, in real monotonic time; None: it is not so.
-        asked_s: when the scheduler was asked last whether the microscope is in use.
-        is_logged, is_postponed: whether that was logged.
+        ends: whether an idle run ends.
+        since_s: since when the run is idle, in real monotonic time; None: it is not.
+        asked_s: when the scheduler was last asked whether the microscope is in use.
+        is_logged, is_postponed: whether idleness, and its postponement, were logged.
         is_ending: whether the scheduler was asked to end the experiment.
-        starts: how often processes were started by then.
+        starts: number of process starts up to then.
     """
 
     ends: bool = False
@@ -36,13 +37,13 @@ class IdleWatch:
     starts: int = 0
 
     def look(self, children: Collection[SupervisedChild], now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether nothing that acts has been left for a while."""
+        """Return whether the run has been idle for IDLE_AFTER_S."""
         acting = [child for child in children if child.spec.acts]
         starts_before, self.starts = self.starts, sum(child.starts for child in children)
         if not acting or not all(child.is_over for child in acting):
             self.since_s, self.is_logged, self.is_postponed, self.is_ending = None, False, False, False
             return False
-        if self.is_ending:  # components are at work on what they finish
+        if self.is_ending:  # components are finishing
             return True
         if self.starts != starts_before or any(_is_at_work(child, now_s, liveness) for child in children):
             self.since_s = None
@@ -52,14 +53,14 @@ class IdleWatch:
         return now_s >= self.since_s + IDLE_AFTER_S
 
     def asks(self, now_s: float) -> bool:
-        """Return whether it is time to ask whether the microscope is in use; that counts as asked."""
+        """Return whether to ask now if the microscope is in use, and note the time."""
         if not self.ends or self.is_ending or now_s < self.asked_s + ASK_AGAIN_S:
             return False
         self.asked_s = now_s
         return True
 
     def deadline_s(self) -> float | None:
-        """Return when to look again; None: no time by itself."""
+        """Return when to look again; None if only an event can change anything."""
         if self.since_s is None or self.is_ending or (self.is_logged and not self.ends):
             return None
         return max(self.since_s + IDLE_AFTER_S, self.asked_s + ASK_AGAIN_S)
@@ -72,7 +73,6 @@ def describe_idle(children: Collection[SupervisedChild]) -> str:
 
 
 def _is_at_work(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> bool:
-    """Return whether a process starts, is to be restarted, does not beat, or is a component at work on a step."""
     if child.is_over or child.spec.acts:
         return False
     if child.life is None or child.watch.phase is not ChildPhase.RUNNING:

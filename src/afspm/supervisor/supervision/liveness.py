@@ -1,6 +1,6 @@
-"""Liveness of a process by its heartbeats: busy is not dead, and late is not dead if this computer slept.
+"""Liveness of a process by its heartbeats: busy is not dead, nor is late if this computer slept.
 
-Nor is dead who does not beat and is seen to work: something in it keeps the thread that beats from its turn.
+A process without heartbeats that is seen to work is alive, too: some code keeps its heartbeat thread from running.
 """
 
 from __future__ import annotations
@@ -10,32 +10,32 @@ from enum import Enum, auto
 
 
 class ProcessHealth(Enum):
-    """The state of health of a process."""
+    """Health of a process."""
 
     STARTING = auto()
     ALIVE = auto()
     SLOW_START = auto()
-    """It has not sent a first beat within the time that a start may take."""
+    """No first heartbeat within the limit for a start."""
     BUSY = auto()
-    """Its beats have stopped, but it is seen to work, and for no longer than it declared that a step may take."""
+    """Heartbeats have stopped, but it is seen to work, within the limit for one step."""
     SILENT = auto()
-    """Its beats have stopped: the whole process hangs."""
+    """Heartbeats have stopped: the whole process hangs."""
     FROZEN = auto()
-    """It beats, or works, but its current step has taken longer than it declared that one may."""
+    """Its current step exceeds the limit for one step."""
     NOT_CLOSING = auto()
-    """It said that it is closing and is still there."""
+    """It announced that it closes, but still runs."""
 
 
 @dataclass(frozen=True)
 class LivenessPolicy:
-    """Patience with a process; all in real seconds.
+    """Time limits for a process; all in real seconds.
 
     Attributes:
-        beat_period_s: between two beats.
-        missed_beats: after how many that did not come it counts as dead.
-        start_s: how long it may take to the first beat.
-        longest_step_s: how long a step may take, where a process doesn't say.
-        closing_s: how long closing may take.
+        beat_period_s: between two heartbeats.
+        missed_beats: number of missing heartbeats after which the process counts as dead.
+        start_s: limit until the first heartbeat.
+        longest_step_s: limit for one step, unless the process declares its own.
+        closing_s: limit for closing.
     """
 
     beat_period_s: float = 1.0
@@ -50,10 +50,10 @@ class LivenessPolicy:
 
 
 class Liveness:
-    """The heartbeats of one life of a process.
+    """Heartbeats of one life of a process.
 
     Args:
-        beats: whether it sends any; one that does not is only known by its exit.
+        beats: whether it sends any; without them only its exit shows that it is dead.
     """
 
     def __init__(self, policy: LivenessPolicy, now_s: float, *, beats: bool = True) -> None:
@@ -67,36 +67,37 @@ class Liveness:
         self._frozen = False
 
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
-        """Take in a beat, with the age of the current step, and how long one may take.
+        """Process a heartbeat, with the age of the current step and the limit for one step.
 
-        Also after it was said that it closes, which then was not so, or not said by it.
+        A heartbeat after `closing` cancels it: then the process was not closing, or another one announced it.
         """
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = ProcessHealth.ALIVE
         self._frozen = step_age_s > longest_s
-        self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # where it had no step, one may begin now
+        self._step_began_s, self._longest_s = now_s - step_age_s, longest_s  # an idle process may begin a step now
         self._deadline_s = now_s + self._policy.silence_s
 
     def waits(self, now_s: float) -> None:
-        """Count the time that its start may take from now: it may not begin yet."""
+        """Restart the time allowed for its start: the process must still wait."""
         if self._vital is ProcessHealth.STARTING:
             self._deadline_s = now_s + self._policy.start_s
 
     def closing(self, now_s: float) -> None:
-        """Take in that it is closing on purpose."""
+        """Process its announcement that it closes on purpose."""
         self._vital = ProcessHealth.NOT_CLOSING
         self._step_began_s, self._longest_s = now_s, self._policy.longest_step_s
         self._deadline_s = now_s + self._policy.closing_s
 
     def check(self, now_s: float, *, works: bool | None = None) -> ProcessHealth:
-        """Return how it is. To be asked at least once a beat period, since we can't judge while we sleep ourselves.
+        """Return the health. Call it at least once a beat period: a longer gap counts as sleep of this computer.
 
         Args:
-            works: whether it was seen to work lately; None: that is not known.
+            works: whether the process was seen to work recently; None: unknown.
         """
         asleep_s = now_s - self._checked_s - self._policy.beat_period_s
         self._checked_s = now_s
-        if asleep_s > self._policy.beat_period_s:  # a suspended computer: its beats wait to be read, or it slept too
+        # this computer was suspended: heartbeats wait to be read, or the process slept, too
+        if asleep_s > self._policy.beat_period_s:
             self._deadline_s += asleep_s
             self._step_began_s += asleep_s
         if self._frozen and self._vital is ProcessHealth.ALIVE:
@@ -114,9 +115,9 @@ class Liveness:
         )
 
     def next_check_s(self) -> float:
-        """Return when to check at the latest."""
+        """Return when to call `check` at the latest."""
         next_s = self._checked_s + self._policy.beat_period_s
-        # a deadline that has passed was seen: it works on without beating
+        # a deadline that has passed was handled: the process works on without heartbeats
         is_due = not self._has_no_deadline and self._deadline_s > self._checked_s
         return min(self._deadline_s, next_s) if is_due else next_s
 

@@ -1,4 +1,4 @@
-"""The condition of each process, as the supervisor publishes it."""
+"""Condition of each process, as the supervisor publishes it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import ChildLife, SupervisedChild
 
 SILENT_PERIODS = 2.5
-"""Beat periods without a beat after which a process counts as silent; a little later it is killed."""
+"""Beat periods without a heartbeat after which a process is shown as silent; a little later it is killed."""
 
 _WITHOUT_PROCESS = {
     ChildPhase.IDLE: ProcessCondition.STARTING,
@@ -21,7 +21,7 @@ _WITHOUT_PROCESS = {
 
 
 class ProcessStatus:
-    """Remembers since when each process is in its condition."""
+    """Since when each process has been in its condition."""
 
     def __init__(self, liveness: LivenessPolicy) -> None:
         self._liveness = liveness
@@ -53,14 +53,13 @@ class ProcessStatus:
         return tuple(found), changed
 
     def _alive_since_ns(self, name: str, pid: int, now_ns: int) -> int:
-        """Return since when a process is alive: one at work on a step, or late with a beat, was alive as well."""
+        # a process at work on a step, or late with a beat, counts as alive
         if self._alive.get(name, (0, 0))[0] != pid:
             self._alive[name] = (pid, now_ns)
         return self._alive[name][1]
 
 
 def condition_of(child: SupervisedChild, now_s: float, liveness: LivenessPolicy) -> ProcessCondition:
-    """Return the process condition to report."""
     life = child.life
     if child.given_up:
         return ProcessCondition.GIVEN_UP

@@ -1,4 +1,4 @@
-"""When to start a crashed process again: at once the first time, later each time it fails soon, and not for ever."""
+"""Restarts of a crashed process: at once the first time, then with back-off, and within a budget."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class RestartPolicy:
-    """The frequency and delay of restarts; all in real seconds.
+    """Budget and back-off of restarts; all in real seconds.
 
     Attributes:
-        budget: how many restarts within `window_s`; one more and it is given up.
+        budget: number of restarts allowed within `window_s`; at one more the process is given up.
         first_delay_s: before the second restart in a row; the first is at once.
-        factor: each further one waits that much longer,
+        factor: growth of the delay with each further restart,
         longest_delay_s: up to this.
         healthy_s: a life longer than this ends a row of failures.
     """
@@ -27,7 +27,7 @@ class RestartPolicy:
 
 
 class RestartBudget:
-    """The restarts of one child."""
+    """Restarts of one child."""
 
     def __init__(self, policy: RestartPolicy) -> None:
         self._policy = policy
@@ -35,7 +35,7 @@ class RestartBudget:
         self._row = 0
 
     def failed(self, now_s: float, lived_s: float) -> float | None:
-        """Take in a crash after `lived_s`; return how long to wait before the next start. None: give it up."""
+        """Process a crash after `lived_s`; return the delay before the next start. None: give the process up."""
         policy = self._policy
         while self._times_s and now_s - self._times_s[0] >= policy.window_s:
             self._times_s.popleft()

@@ -1,4 +1,4 @@
-"""The end of a run: when processes are asked to end, killed and left. Decisions only."""
+"""End of a run: when to ask processes to end, when to kill them, when to leave them. Decisions only."""
 
 from __future__ import annotations
 
@@ -11,40 +11,40 @@ from afspm.model import Role
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import SupervisedChild
 
-OWN_PACE_S = 1.5  # after the end of the experiment: everybody has heard it, and may finish a file
-AGAIN_S = 0.25  # somebody is busy with a step that it may take: ask later
-FAREWELL_S = 60.0  # but not for ever
-KILL_AFTER_S = 1.5  # after being asked, or after having finished what may be finished then
-TIP_S = 15.0  # after being asked: a process that retracts the tip, or works on its end, ends by itself before
+OWN_PACE_S = 1.5  # after the announcement of the end, for a component to finish a file
+AGAIN_S = 0.25  # a process is busy within its limit: look again
+FAREWELL_S = 60.0  # limit on waiting for busy processes before they are asked
+KILL_AFTER_S = 1.5  # after being asked, or after finishing
+TIP_S = 15.0  # after being asked, for a process that retracts the tip, or is seen to work on its end
 LEAVE_AFTER_S = 3.0  # after being killed
 
 
 class EndReason(Enum):
-    """The reason for which a run ended."""
+    """Reason why a run ended."""
 
     EXPERIMENT_ENDED = auto()
     ALL_DONE = auto()
     STOPPED = auto()
     LOST = auto()
-    """A process that the experiment can't do without was given up, or all were."""
+    """An essential process was given up, or all processes were."""
     PLANS_DONE = auto()
-    """All components that act are done, and none of them ended the experiment."""
+    """All components with plans are done, and none ended the experiment."""
     PLANS_LOST = auto()
-    """Nothing that acts is left, as a component that does was given up."""
+    """The last component with a plan was given up."""
 
     @property
     def is_announced(self) -> bool:
-        """Return whether all processes know of the end by the scheduler, and finish by themselves."""
+        """Whether the scheduler announces the end to all processes, which then finish by themselves."""
         return self in (EndReason.EXPERIMENT_ENDED, EndReason.PLANS_DONE)
 
     @property
     def is_final(self) -> bool:
-        """Return whether there is nothing to resume."""
+        """Whether the run can't be resumed."""
         return self in (EndReason.EXPERIMENT_ENDED, EndReason.ALL_DONE, EndReason.PLANS_DONE)
 
     @property
     def exit_code(self) -> int:
-        """Of `afspm run`."""
+        """Exit code of `afspm run`."""
         return _EXIT_CODES[self]
 
 
@@ -59,26 +59,26 @@ _EXIT_CODES = {
 
 
 class EndStep(Enum):
-    """The next step with processes that still run."""
+    """Next step with processes that still run."""
 
     ASK = auto()
-    """Close their stdin: they end cleanly."""
+    """Close their standard input, so that they end cleanly."""
     KILL = auto()
     LEAVE = auto()
-    """Not even killing ends them (a driver hangs in the system): say so, and go."""
+    """Killing does not end them (a driver hangs in the kernel): log it, and leave them."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunEnd:
-    """A run that is ending: those that still run are asked to end, then killed, then left.
+    """A run that is ending: processes that still run are asked to end, then killed, then left.
 
     Attributes:
-        ask_s, kill_s: when, in real monotonic time.
-        latest_s: until when those who are busy may be waited for before they are asked.
-        last: what has been done already.
-        in_haste: somebody wants it to be over now.
-        busy_s: when somebody was last seen to be busy after being asked.
-        began_s: when it began to end.
+        ask_s, kill_s: when to ask and to kill, in real monotonic time.
+        latest_s: until when busy processes are waited for before they are asked.
+        last: the last step taken.
+        in_haste: whether a person wants the run to end now.
+        busy_s: when a process was last seen busy after it was asked.
+        began_s: when the end began.
     """
 
     why: EndReason
@@ -93,14 +93,17 @@ class RunEnd:
 
     @classmethod
     def begin(cls, why: EndReason, text: str, now_s: float) -> RunEnd:
-        """Begin to end. Where the experiment itself ended, all know and close by themselves: not disturbed at first."""
+        """Return the end that begins now.
+
+        After an announced end, processes first have OWN_PACE_S to close by themselves.
+        """
         if not why.is_announced:
             return cls(why, text, ask_s=now_s, kill_s=now_s + KILL_AFTER_S, latest_s=now_s, began_s=now_s)
         ask_s = now_s + OWN_PACE_S
         return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S, began_s=now_s)
 
     def hurried(self, now_s: float) -> RunEnd:
-        """Return the end in haste: those not asked yet are, those that were are killed."""
+        """Return the end in haste: processes are asked now, or killed if they were asked already."""
         if self.last in (EndStep.KILL, EndStep.LEAVE):
             return self
         if self.last is None and self.why is not EndReason.STOPPED:
@@ -108,7 +111,7 @@ class RunEnd:
         return replace(self, kill_s=now_s, last=EndStep.ASK, in_haste=True)
 
     def deadline_s(self) -> float | None:
-        """Return when `step` has something to do next; None: never again."""
+        """Return when `step` has the next thing to do; None: never again."""
         match self.last:
             case None:
                 return self.ask_s
@@ -120,12 +123,12 @@ class RunEnd:
                 return None
 
     def step(self, now_s: float, *, busy: bool = False) -> tuple[RunEnd, EndStep | None]:
-        """Return what the time has come for, if anything, and the ending after it.
+        """Return the end after this moment, and the step that is due, if any.
 
         Args:
-            busy: somebody still works on a step, within what it declared: before they are asked, a component (a picture
-                of the night, say), and then a translator, which does not leave before the tip is safe, or any process
-                that is seen to work on its end.
+            busy: whether a process still works on a step, within the limit it declared. Before processes are asked this
+                is a component (drawing a picture of the night, say); afterwards a translator, which does not leave
+                before the tip is safe, or any process that is seen to work on its end.
         """
         deadline_s = self.deadline_s()
         seen = replace(self, busy_s=now_s) if busy and self.last is EndStep.ASK else self
@@ -145,9 +148,9 @@ class RunEnd:
 def unfinished(
     ending: RunEnd, children: Mapping[str, SupervisedChild], now_s: float, liveness: LivenessPolicy
 ) -> list[str]:
-    """Return which processes have something to finish; a translator may have it after it was asked to end: the tip."""
+    """Return the processes that have something to finish; for a translator also after it was asked: the tip."""
     is_asked, has_ended = ending.last is not None, ending.why.is_announced
-    # a scheduler on another computer may be there
+    # a scheduler on another computer counts as alive
     can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)
     found = []
     for name, child in children.items():

@@ -1,4 +1,4 @@
-"""The state of one supervised process: its lives, its heartbeats, and how it ended."""
+"""State of one supervised process: its lives, its heartbeats, and its exits."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from afspm.supervisor.supervision.child import ChildWatch, HeartbeatReport
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 
 LATE_START_S = 15.0
-"""Time that a process started at the end has to come up, while it is not seen to work; and then to hear what it
-missed."""
+"""Real time for a process that restarts during the end: to send its first heartbeat unless it is seen to work, and
+then to receive the packets that it missed."""
 CLOSES_WITHIN_S = 1.5
-"""Processor time that a process has for its end, after it was asked to."""
+"""Processor time that a process may use for its end, after it was asked to end."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class ChildSpec:
     """A process to supervise.
 
     Attributes:
-        beats: whether it sends heartbeats; one that does not is only known by its exit.
-        leaves_last: whether it stays until the other components have ended, to record what they say at the end.
-        acts: whether it follows a plan of its own, as a series does, or that is not known; the others react.
+        beats: whether it sends heartbeats; without them only its exit shows that it is dead.
+        leaves_last: whether it stays until the other components have ended, to record their last packets.
+        acts: whether it follows a plan of its own, as a series does, or that is unknown; the others react.
     """
 
     name: str
@@ -33,19 +33,19 @@ class ChildSpec:
 
     @property
     def essential(self) -> bool:
-        """True where the experiment can't go on without it."""
+        """Whether the experiment can't go on without the process."""
         return self.role is not Role.COMPONENT
 
 
 @dataclass(slots=True)
 class ChildLife:
-    """A process that runs: one life of a child.
+    """One life of a child: a running process.
 
     Attributes:
         beat: its last heartbeat, at `beat_s`; None before the first.
-        first_beat_s: when the first came.
-        works: whether it is seen to work though it does not beat; None: that is not known.
-        processor_s: the processor time that it has used; `asked_processor_s`: had used when it was asked to end.
+        first_beat_s: time of its first heartbeat.
+        works: whether it is seen to work although it sends no heartbeats; None: unknown.
+        processor_s: processor time used; `asked_processor_s`: that used until it was asked to end.
     """
 
     pid: int
@@ -62,18 +62,17 @@ class ChildLife:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """Return when its next beat, or its end, is so late that the operating system is asked what it does."""
+        """Return when its next heartbeat, or its end, is so late that the operating system is asked about it."""
         if self.beat is None:
             return None
         return self.beat_s + (liveness.closing_s if self.beat.closing else liveness.silence_s) / 2.0
 
     def is_overdue(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether that time has come."""
         due_s = self.overdue_s(liveness)
         return due_s is not None and now_s >= due_s
 
     def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether it works on a step, as its last beat says or is seen, and for no longer than it declared."""
+        """Return whether it works on a step, by its last heartbeat or as seen, within the limit it declared."""
         if self.beat is None or self.beat.closing:
             return False
         longest_s, age_s = self.beat.longest_step_s or liveness.longest_step_s, self.beat.step_age_s or 0.0
@@ -84,16 +83,16 @@ class ChildLife:
 
     @property
     def is_ending(self) -> bool:
-        """Return whether it still works on its end: on a busy computer what takes a second may take ten.
+        """Whether it still works on its end: on a busy computer one second of work may take ten.
 
-        One that goes round for ever uses up its processor time at once where the computer is idle.
+        A process in an endless loop uses up its allowance of processor time quickly if the computer is idle.
         """
         if not self.works or self.processor_s is None or self.asked_processor_s is None:
             return False
         return self.processor_s - self.asked_processor_s < CLOSES_WITHIN_S
 
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether it should have beaten long ago, and does not work either."""
+        """Return whether its heartbeat is long overdue and it does not work either."""
         beating = self.beat is not None and not self.beat.closing
         return beating and now_s - self.beat_s >= liveness.silence_s and not self.is_busy(now_s, liveness)
 
@@ -103,9 +102,9 @@ class SupervisedChild:
     """A process over all its lives.
 
     Attributes:
-        starts, ordered: how often it was started, and how often of that by a person's order.
-        rescued: it was started once more though the experiment had ended.
-        last_exit: how it ended last, in words.
+        starts, ordered: number of starts, and of those ordered by a person.
+        rescued: whether it was started once more after the end of the experiment.
+        last_exit: description of its last exit.
     """
 
     spec: ChildSpec
@@ -124,8 +123,8 @@ class SupervisedChild:
     def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
         """Return whether it may have something left to do.
 
-        It starts, has not beaten for a moment, is frozen and can be started again, or was started again and has yet to
-        hear what it missed, if it still can.
+        True if it starts, has not sent a heartbeat for a moment, is frozen and can be restarted, or was restarted and
+        has yet to receive the packets that it missed, if it still can.
         """
         life = self.life
         if life is None or not self.spec.beats or self.spec.role is not Role.COMPONENT:
@@ -133,15 +132,15 @@ class SupervisedChild:
         if life.beat is None:
             return bool(life.works) or now_s - life.started_s < LATE_START_S
         given_up = self.rescued and life.is_silent(now_s, liveness)
-        # between two steps of its start it looks as if it had nothing to do
-        begins_anew = can_hear and self.starts > 1 and now_s - life.first_beat_s < LATE_START_S
+        # between two steps of its start it looks idle
+        is_restarting = can_hear and self.starts > 1 and now_s - life.first_beat_s < LATE_START_S
         is_late = now_s - life.beat_s > 1.5 * liveness.beat_period_s
-        return not life.is_closing and not given_up and (begins_anew or is_late)
+        return not life.is_closing and not given_up and (is_restarting or is_late)
 
 
 @dataclass(frozen=True)
 class ProcessReport:
-    """The fate of one process; `ordered` counts the starts that a person ordered."""
+    """Fate of one process; `ordered` counts the starts that a person ordered."""
 
     name: str
     starts: int

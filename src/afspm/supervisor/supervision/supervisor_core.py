@@ -1,4 +1,4 @@
-"""The supervisor's decisions about all processes of a run. Pure: events and real monotonic times in, effects out."""
+"""Decisions of the supervisor about all processes of a run. Pure: events and real monotonic times in, effects out."""
 
 from __future__ import annotations
 
@@ -47,15 +47,15 @@ from afspm.supervisor.supervision.supervisor_events import (
 )
 
 SCHEDULER_ANSWERS_WITHIN_S = 15.0
-"""Time after which components no longer wait for the scheduler to answer."""
+"""Time after which components start although the scheduler has not answered."""
 
 
 class SupervisorCore:
-    """Decides what to start, kill, ask to end and log.
+    """Decides which processes to start, kill and ask to end, and what to log.
 
     Args:
-        awaits_scheduler: components begin only when the scheduler has answered.
-        ends_idle: whether the run ends when nothing that acts is left.
+        awaits_scheduler: whether components begin only after the scheduler has answered.
+        ends_idle: whether the run ends once no process with a plan is left.
 
     Attributes:
         ending: how the run ends; None while it goes on.
@@ -82,11 +82,10 @@ class SupervisorCore:
 
     @property
     def is_over(self) -> bool:
-        """True when the run has ended and nothing of it runs any more."""
         return self.ending is not None and not any(child.life for child in self.children.values())
 
     def step(self, event: SupervisorEvent, now_s: float) -> list[SupervisorEffect]:
-        """Take in an event at a real monotonic time; returns what to do, in order."""
+        """Process an event at a real monotonic time; return the effects in order."""
         self._now_s = now_s
         match event:
             case RunBegan():
@@ -127,11 +126,11 @@ class SupervisorCore:
         return effects
 
     def may_start(self, name: str) -> bool:
-        """Return whether a process that is to be started still is: the run may have ended meanwhile."""
+        """Return whether a process may still be started: the run may have ended since."""
         return self.ending is None or self.children[name].rescued
 
     def deadline_s(self) -> float | None:
-        """Return when `TimePassed` is due at the latest; None: it is not."""
+        """Return when `TimePassed` is due at the latest; None if there is no deadline."""
         if self.ending is not None:
             found = [self.ending.deadline_s()]
         else:
@@ -142,9 +141,10 @@ class SupervisorCore:
         return min((s for s in found if s is not None), default=None)
 
     def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
-        """Return the processes to be looked at from outside, with their ids, and the time over which to judge them.
+        """Return the ids of processes to sample from outside, by name, and the time span over which to judge them.
 
-        Those are whose beat is late, at the end of a run also those that start, and all that were asked to end.
+        These are processes whose heartbeat is late, at the end of a run also starting ones, and all that were asked to
+        end.
         """
         overdue: dict[str, int] = {}
         for name, child in self.children.items():
@@ -158,7 +158,6 @@ class SupervisorCore:
         return overdue, self._liveness.silence_s / 2.0
 
     def reports(self) -> tuple[ProcessReport, ...]:
-        """Return what became of each process."""
         return tuple(
             ProcessReport(name, child.starts, child.given_up, child.last_exit, child.ordered)
             for name, child in self.children.items()
@@ -200,8 +199,7 @@ class SupervisorCore:
             else:
                 self._log(child.spec.name, "DEBUG", child.last_exit)
         elif code == ExitCode.DONE and child.spec.role is Role.TRANSLATOR and not life.is_closing:
-            # a program of another language that has caught an error of its own ends like that; one that closes on
-            # purpose says so
+            # a program in another language ends like this after an error that it caught; a regular end is announced
             told = f"{how} before the end of the experiment, without announcing it"
             self._apply(child, child.watch.exited(ExitCode.CRASHED, self._now_s, told))
         else:
@@ -219,8 +217,7 @@ class SupervisorCore:
         else:
             self._end(EndReason.EXPERIMENT_ENDED, "the experiment has ended")
 
-    def _look_whether_idle(self) -> None:
-        """End a run in which nothing that acts is left, unless the microscope is in use, or the file says to stay."""
+    def _check_idle(self) -> None:
         if not self._idle.look(self.children.values(), self._now_s, self._liveness):
             return
         if not self._idle.is_logged:
@@ -264,10 +261,10 @@ class SupervisorCore:
             else:
                 self._end(EndReason.ALL_DONE, "all components are done")
         if self.ending is None:
-            self._look_whether_idle()
+            self._check_idle()
 
     def _await_scheduler(self) -> None:
-        """A scheduler that beats and does not answer us, for want of a key perhaps, may answer components."""
+        # a scheduler that beats but does not answer us (for want of a key, perhaps) may still answer the components
         if not self._awaits_scheduler:
             return
         for child in self._with_role(Role.COMPONENT):
@@ -317,22 +314,21 @@ class SupervisorCore:
             child.watch.stop(self._now_s)
             if is_missing and self._may_be_rescued(child):
                 self._rescue(child)
-            # the scheduler tells all others that the experiment has ended; a translator does not listen to it
+            # the scheduler announces the end to all others; a translator does not subscribe to it
             if child.spec.role is Role.TRANSLATOR and child.life:
                 self._command(ProcessAction.CLOSE_INPUT, child)
-        # a run that ended as it should is told of by its summary, in a moment
+        # the summary reports a regular end in a moment
         levels = {EndReason.STOPPED: "INFO", EndReason.LOST: "CRITICAL", EndReason.PLANS_LOST: "CRITICAL"}
         self._log(LOGGED_AS, levels.get(why, "DEBUG"), text)
 
     # --- the end ---
 
     def _may_be_rescued(self, child: SupervisedChild) -> bool:
-        """Return whether it is started once more though the experiment has ended: it had not finished when it died."""
+        # a component that dies after the end of the experiment had not finished: it gets one more start to do so
         return self._has_just_ended and child.spec.beats and child.spec.role is Role.COMPONENT and not child.rescued
 
     @property
     def _has_just_ended(self) -> bool:
-        """True while the experiment itself has ended, and nobody has been asked to leave."""
         ending = self.ending
         return ending is not None and ending.why.is_announced and ending.last is None
 
@@ -366,10 +362,8 @@ class SupervisorCore:
                 child.life = None
 
     def _release_scheduler(self) -> None:
-        """Kill components that are frozen; once all others have ended let the recorder go, then the scheduler.
-
-        One that is busy is not: it would have END_WITHIN_S for what it has yet to write.
-        """
+        # Order: components, then the recorder, then the scheduler, so that the last packets are published and recorded.
+        # Frozen components are killed; a busy one keeps END_WITHIN_S for what it has yet to write.
         left = [child for child in self.children.values() if child.life is not None]
         recorders = [child for child in left if child.spec.leaves_last]
         others = [child for child in left if child.spec.role is not Role.SCHEDULER and child not in recorders]

@@ -1,4 +1,4 @@
-"""Events that the supervisor's decisions take in, and the effects that come out."""
+"""Events for the supervisor's decisions, and the effects that come out."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from afspm.supervisor.supervision.child import HeartbeatReport
 
 @dataclass(frozen=True, slots=True)
 class RunBegan:
-    """Everything is to be started."""
+    """The run begins: all processes start."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessStarted:
-    """The operating system has made the process."""
+    """The operating system has created the process."""
 
     name: str
     pid: int
@@ -26,7 +26,7 @@ class ProcessStarted:
 
 @dataclass(frozen=True, slots=True)
 class StartFailed:
-    """There is no process."""
+    """The operating system could not create the process."""
 
     name: str
     why: str
@@ -34,7 +34,7 @@ class StartFailed:
 
 @dataclass(frozen=True, slots=True)
 class Beaten:
-    """A heartbeat came."""
+    """A heartbeat arrived."""
 
     name: str
     report: HeartbeatReport
@@ -42,10 +42,10 @@ class Beaten:
 
 @dataclass(frozen=True, slots=True)
 class ActivitySeen:
-    """The operating system was asked whether a process that does not beat works; None: it can't tell.
+    """The operating system was asked whether a process without heartbeats works; None: unknown.
 
     Attributes:
-        processor_s: the processor time that it has used in its life; None: that is not known.
+        processor_s: processor time used since the process started; None: unknown.
     """
 
     name: str
@@ -55,7 +55,7 @@ class ActivitySeen:
 
 @dataclass(frozen=True, slots=True)
 class Exited:
-    """A child is gone; a negative code is the number of the signal that ended it, as in `subprocess`."""
+    """A child has exited; a negative code is the number of the signal that ended it, as in `subprocess`."""
 
     name: str
     pid: int
@@ -66,7 +66,7 @@ class Exited:
 
 @dataclass(frozen=True, slots=True)
 class EndSignal:
-    """A person, or the system, wants the run to end."""
+    """A person, or the system, ends the run."""
 
     number: int
 
@@ -77,19 +77,19 @@ class EndSignal:
 
 @dataclass(frozen=True, slots=True)
 class RestartOrdered:
-    """A process is to be started anew."""
+    """A person orders a restart of a process."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class SchedulerAnswered:
-    """The scheduler of this run has answered: components may ask it."""
+    """The scheduler of this run has answered: components may send it requests."""
 
 
 @dataclass(frozen=True, slots=True)
 class UseReported:
-    """The scheduler answered whether the microscope is in use; `why`: empty if it is not."""
+    """The scheduler answered whether the microscope is in use; `why` is empty if it is not."""
 
     why: str
 
@@ -103,7 +103,7 @@ class EndRefused:
 
 @dataclass(frozen=True, slots=True)
 class TimePassed:
-    """The deadline came, or anything else happened."""
+    """The deadline came, or any other event."""
 
 
 SupervisorEvent = (
@@ -128,9 +128,9 @@ class ProcessAction(Enum):
     START = auto()
     """`ProcessStarted` or `StartFailed` follows."""
     KILL = auto()
-    """End it, and all that it has started, now."""
+    """Kill it, and the processes that it has started."""
     CLOSE_INPUT = auto()
-    """Ask it to end by closing its standard input."""
+    """Ask it to end, by closing its standard input."""
     ABANDON = auto()
     """Wait for it no longer: it can't be killed."""
 
@@ -145,22 +145,22 @@ class ProcessCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseComponents:
-    """Components that wait for the scheduler may begin."""
+    """Let components that wait for the scheduler begin."""
 
 
 @dataclass(frozen=True, slots=True)
 class AskUse:
-    """Ask the scheduler whether the microscope is in use; `UseReported` follows if the scheduler can say."""
+    """Ask the scheduler whether the microscope is in use; `UseReported` follows if the scheduler knows."""
 
 
 @dataclass(frozen=True, slots=True)
 class EndExperiment:
-    """Have the scheduler end the experiment; `EndRefused` follows if it does not."""
+    """Ask the scheduler to end the experiment; `EndRefused` follows if it refuses."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriteLog:
-    """Write a line to the log in the name of a process; `level` is a name of the logging module."""
+    """Log a line under the name of a process; `level` is a name of `logging`."""
 
     name: str
     level: str
@@ -189,11 +189,11 @@ _WINDOWS_REASONS = {
     0xC0000374: "damaged heap",
     0xC0000409: "aborted",
 }
-"""Of the system's own exit codes, those that are met: what a signal is elsewhere."""
+"""Exit codes of Windows itself that occur in practice; they correspond to signals elsewhere."""
 
 
 def describe_exit(code: int) -> str:
-    """Return why a process ended, as its exit code says."""
+    """Return a description of an exit code."""
     if code in _WINDOWS_REASONS:
         return f"killed by Windows: {_WINDOWS_REASONS[code]} (0x{code:08X})"
     if code < 0:

@@ -1,4 +1,4 @@
-"""`afspm test-translator` and `emulate`: for those who connect a microscope."""
+"""`afspm test-translator`, `test-client` and `emulate`: for developers of drivers and clients."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_translator(
             typer.echo(check.listed)
         return
     if not files:
-        raise typer.BadParameter("an experiment file is wanted", param_hint="FILE")
+        raise typer.BadParameter("give an experiment file", param_hint="FILE")
     console = Console(file=sys.stdout, highlight=False)
     options = CheckOptions(files, names_in(without), runs, speed, names_in(only), si(frame, "m") if frame else None)
     if not yes and not _is_simulated(options):
@@ -90,7 +90,7 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
         begun.append(report)
         show_beginning(report, console)
 
-    # whoever ends it has everything put back first
+    # SIGTERM, like Ctrl-C, first restores all settings
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         report = run(options, begin, done=lambda result: show_result(result, console))
@@ -102,6 +102,48 @@ def _check(options: CheckOptions, console: Console, copy: Path | None) -> None:
     if copy is not None:
         report.write(copy)
     if not report.passed:
+        raise typer.Exit(1)
+
+
+def check_client(
+    command: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="-- COMMAND ARGUMENTS…", help="The client's conformance program.", show_default=False),
+    ] = None,
+    only: Annotated[
+        list[str] | None, opt("Only checks with this in their name.", "--only", "-k", metavar="PART")
+    ] = None,
+    report: Annotated[
+        Path | None, opt("Write the report here, too; JUnit's XML if FILE ends with .xml.", "--report", metavar="FILE")
+    ] = None,
+    runs: Runs = RUNS,
+    listed: Annotated[bool, typer.Option("--list", help="List the checks, and do none.")] = False,
+) -> None:
+    """Test a client in another language by its behaviour in experiments on the simulated microscope.
+
+    Starts the client's conformance program again and again, with real and with scripted schedulers, and sends it steps.
+    Ends with 0 if nothing was wrong.
+    """
+    import sys
+
+    from rich.console import Console
+
+    from afspm.testing.clients.client_suite import CLIENT_SUITE
+    from afspm.testing.clients.runner import judge, show_client_end
+    from afspm.testing.conformance import show_result
+
+    if listed:
+        for check in CLIENT_SUITE.checks():
+            typer.echo(check.listed)
+        return
+    if not command:
+        raise typer.BadParameter("give the client's conformance program", param_hint="-- COMMAND")
+    console = Console(file=sys.stdout, highlight=False)
+    result = judge(command, runs, only or (), lambda one: show_result(one, console))
+    show_client_end(result, console)
+    if report is not None:
+        result.write(report)
+    if not result.passed:
         raise typer.Exit(1)
 
 
@@ -119,11 +161,11 @@ def emulate(
     usual: Annotated[
         bool, typer.Option("--usual", help="Listen where the vendor's own controller does, for clients that expect it.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Everything left to chance follows from it.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers.")] = 1,
     speed: Annotated[float, typer.Option(min=1e-6, help="Experiment seconds in a real second.")] = 1.0,
     fault: Annotated[
         list[str] | None,
-        opt("What goes wrong, and when.", metavar="KIND[@SECONDS][,count=N][,duration=SECONDS]"),
+        opt("A fault, and its time.", metavar="KIND[@SECONDS][,count=N][,duration=SECONDS]"),
     ] = None,
     folder: Annotated[
         Path | None, opt("For its files. Default: emulated-NAME", "--folder", "-o", metavar="DIR")
@@ -134,9 +176,9 @@ def emulate(
 ) -> None:
     """Emulate a vendor's controller: its own protocol, simulated physics behind it.
 
-    Runs until Ctrl-C. It listens on this computer only, at a free port unless it is told another: whoever connects
-    to the vendor's usual port may expect a real controller there. A replay ends with 1 if something else was asked
-    than what was recorded.
+    Runs until Ctrl-C. Listens on this computer only, and at a free port unless you give one: a client that connects to
+    the vendor's usual port may expect a real controller there. A replay ends with 1 if a request differs from the
+    recorded one.
     """
     from afspm.simulation.emulation.emulator import emulator_names, find_emulator
 
@@ -180,7 +222,7 @@ def _emulate(emulator: Emulator, speed: float, folder: Path) -> None:
         typer.echo(f"SIMULATED {emulator.vendor} controller: {where}")
 
     try:
-        with signals.caught(lambda _: emulator.stop(), -1):  # puts back the descriptor of `listening` as well
+        with signals.caught(lambda _: emulator.stop(), -1):  # also restores the wakeup descriptor set by `listening`
             emulator.run(ExperimentClock.starting_now(speed=speed), folder.resolve(), log, listening)
     except Crashed as crash:
         typer.echo(f"SIMULATED crash: {crash}", err=True)
@@ -193,11 +235,7 @@ def _described(name: str, class_: type[Emulator]) -> str:
 
 
 def _settings(given: list[str]) -> dict[str, object]:
-    """`a=1`, `a.b="x"`, `a=word`: as in TOML, but that a word needs no quotes.
-
-    Raises:
-        ConfigError: not of that form.
-    """
+    # `a=1`, `a.b="x"`, `a=word`: as in TOML, but a word needs no quotes.
     import tomllib
 
     from afspm.basics.errors import ConfigError

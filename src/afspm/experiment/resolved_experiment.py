@@ -1,0 +1,164 @@
+"""The resolved experiment: all that is known of it before it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from afspm.client.component import Component
+from afspm.experiment import capabilities
+from afspm.experiment.capabilities import MicroscopeCapabilities
+from afspm.experiment.class_loader import ComponentDeclaration
+from afspm.experiment.document import Document
+from afspm.experiment.parts import EMULATED, SIMULATED, ExperimentPart, ExperimentParts
+from afspm.experiment.planned_measurements import PlannedMeasurements
+from afspm.experiment.sections import ExperimentSections
+from afspm.experiment.toml_lines import Settings
+from afspm.experiment.wiring_classes import BoundSocket, Wiring, WiringKeys
+from afspm.model import ProblemNames, Role
+from afspm.scheduler.publishing.envelopes import CacheSettings
+from afspm.scheduler.safety.limits import ExperimentLimits
+
+
+@dataclass
+class ResolvedProcess:
+    """One process, resolved.
+
+    Attributes:
+        component: its class, loaded from `class_path`; None and empty for a command, or a class that can't be loaded.
+        settings: arguments of its constructor: in SI, of JSON's types.
+        wrong: settings that were refused; None if all are right.
+    """
+
+    part: ExperimentPart
+    wires: WiringKeys
+    role: Role = Role.COMPONENT
+    declared: ComponentDeclaration = field(default_factory=ComponentDeclaration)
+    settings: Settings = field(default_factory=dict)
+    component: type | None = None
+    class_path: str = ""
+    wrong: frozenset[str] | None = None
+
+    @property
+    def name(self) -> str:
+        return self.part.name
+
+    @property
+    def acts(self) -> bool:
+        """Whether it follows a plan of its own: a script that solves no problems does; True for a command (unknown)."""
+        if self.component is None or not issubclass(self.component, Component):
+            return self.component is None
+        return self.component.run is not Component.run and not self.declared.solves
+
+    def declares(self, attribute: str) -> bool:
+        """Return whether a flag of its class is true."""
+        return getattr(self.component, attribute, False) is True
+
+    @property
+    def is_microscope(self) -> bool:
+        """Whether it is a simulated microscope, by its class (of a command: by its table)."""
+        return self.part.own.get(SIMULATED) is True if self.part.command else self.declares(SIMULATED)
+
+    @property
+    def envelopes(self) -> tuple[str, ...] | None:
+        """Prefixes that it subscribes to: those of the file, else those of its class; None: all."""
+        wanted = self.part.own.get("envelopes", self.wires.envelopes)
+        if wanted is None:
+            return self.declared.listens
+        return (wanted,) if isinstance(wanted, str) else tuple(map(str, wanted))
+
+    def capabilities(self) -> MicroscopeCapabilities | None:
+        """Return a translator's capabilities; None if they can't be known before it runs."""
+        return None if self.component is None else capabilities.of_class(self.component, self.settings)
+
+
+@dataclass
+class ResolvedExperiment:
+    """An experiment, resolved.
+
+    Attributes:
+        processes: by name, in the order of the file.
+        listening: sockets that components bind by settings of their own, beside the wiring.
+        plans: by component, as far as its settings fix them.
+    """
+
+    parts: ExperimentParts
+    document: Document
+    sections: ExperimentSections
+    messages: tuple[str, ...]
+    named_problems: dict[str, int]
+    processes: dict[str, ResolvedProcess] = field(default_factory=dict)
+    net: Wiring = field(default_factory=Wiring)
+    listening: list[BoundSocket] = field(default_factory=list)
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    caching: CacheSettings = field(default_factory=CacheSettings)
+    plans: dict[str, PlannedMeasurements] = field(default_factory=dict)
+
+    @property
+    def problems(self) -> ProblemNames:
+        return ProblemNames(self.named_problems)
+
+    def metadata(self) -> dict[str, str]:
+        """Return the metadata of a run: [metadata] of the file, completed by the microscope's class."""
+        given = {name: value for name, value in self.sections.metadata.model_dump().items() if value is not None}
+        translators = self.with_role(Role.TRANSLATOR)
+        return (_metadata_of_class(translators[0]) if translators else {}) | given
+
+    def error(self, what: str, *path: str | int, hint: str = "") -> None:
+        self.document.error(what, *path, hint=hint)
+
+    def warning(self, what: str, *path: str | int, hint: str = "") -> None:
+        self.document.warning(what, *path, hint=hint)
+
+    def with_role(self, role: Role) -> list[ResolvedProcess]:
+        return [process for process in self.processes.values() if process.role is role]
+
+    def declaring(self, attribute: str) -> list[str]:
+        """Return the names of the processes with a flag of their class that is true."""
+        return [name for name, process in self.processes.items() if process.declares(attribute)]
+
+    @property
+    def keys_folder(self) -> Path | None:
+        """Folder of [security] keys, absolute; None if no keys are used."""
+        keys = self.sections.security.keys
+        return None if keys is None else self.document.folder_of("security", "keys") / keys
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the microscope is certain to be simulated, if the whole file is started on this computer."""
+        return self.simulated_with(self.processes)
+
+    def simulated_with(self, started: Collection[str]) -> bool:
+        """Return whether the microscope is certain to be simulated, if these processes are started together.
+
+        Either the translator is the microscope itself, or it is wired to an emulator that is started with it.
+        """
+        translators = self.with_role(Role.TRANSLATOR)
+        return bool(translators) and all(
+            translator.is_microscope or bool(self.controller_of(translator.name, started)) for translator in translators
+        )
+
+    def controller_of(self, translator: str, started: Collection[str]) -> str:
+        """Return the name of the emulator that a translator is wired to; empty if none is started with it.
+
+        Always empty for a translator written in another language: nothing proves which controller it talks to.
+        """
+        process = self.processes[translator]
+        if process.is_microscope or process.part.command or translator not in started:
+            return ""
+        return next((name for name in self.emulators if name in started), "")
+
+    @property
+    def emulators(self) -> list[str]:
+        return self.declaring(EMULATED)
+
+
+def _metadata_of_class(translator: ResolvedProcess) -> dict[str, str]:
+    from afspm.translator.driver import Driver
+
+    kind = translator.component
+    if kind is None or not issubclass(kind, Driver):
+        return {}
+    about = {"vendor": kind.maker, "software": kind.software, "technique": kind.technique(translator.settings)}
+    return {name: text for name, text in about.items() if text}
