@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from afspm.model import RegistrationOutcome
-from afspm.plugins.drift.drift_table import COLUMNS, DriftTable, drift_row
+from afspm.plugins.drift.drift_pictures import COLUMNS, DriftTable, drift_row
 from afspm.plugins.drift.record import DriftRecord
 from afspm.wire.generated.drift_pb2 import DriftMapping
 

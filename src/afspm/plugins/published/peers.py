@@ -18,7 +18,7 @@ from afspm.basics.launch import Launch
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
 from afspm.model.events import PERSON
 from afspm.plugins.published import version_1
-from afspm.plugins.published.pacing import Pacing
+from afspm.plugins.published.version_1 import Pacing
 from afspm.transport.control_client import ControlClient
 from afspm.transport.frames import receive_frames, send_frames, send_packet
 from afspm.transport.late_joiners import PublishedHistory

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,9 +13,13 @@ from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.cli.arguments import MEANWHILE, RUNS, Where, opt
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from afspm.experiment import Experiment
+    from afspm.plugins.web.dashboard import Dashboard
     from afspm.plugins.web.dashboard.recorded import RecordedSettings
     from afspm.supervisor.resume import ResumableRun
+    from afspm.transport.port import Port
 
 NAME_OF_CLASS = "Dashboard"
 
@@ -165,10 +169,9 @@ def _join(folder: Path, settings: Plain) -> int:
     from afspm.cli.joining import looking
     from afspm.experiment.process_starts import DASHBOARD
     from afspm.plugins.web.dashboard import Dashboard
-    from afspm.plugins.web.dashboard.joining import join, url_in
     from afspm.record.run_json import read_run_json
 
-    url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
+    url = _url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0
@@ -176,10 +179,71 @@ def _join(folder: Path, settings: Plain) -> int:
     with looking(folder):
         pass  # somebody is there
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-    code = join(folder, Dashboard(**settings), DASHBOARD)
+    code = _run_as_guest(folder, Dashboard(**settings), DASHBOARD)
     if code == ExitCode.ENDED:
         stay(folder, DASHBOARD, settings)
     return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
+
+
+def _url_in(processes: object, folder: Path, name: str) -> str | None:
+    from afspm.basics.errors import FileError
+    from afspm.record.run_json import STATE_DIR
+    from afspm.storage.memory import Memory
+
+    if not isinstance(processes, dict) or name not in processes:
+        return None
+    try:
+        url = Memory(folder / STATE_DIR / f"{name}.json").get("url")
+    except FileError:
+        return None
+    return url if isinstance(url, str) else None
+
+
+def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
+    # returns a component's exit code; the name needs the role `operate` to command the microscope in MANUAL
+    import dataclasses
+    import logging
+
+    from afspm.basics.clock import ExperimentClock
+    from afspm.client.connect import guest_of
+    from afspm.record.run_json import STATE_DIR
+    from afspm.transport.process.context import ProcessActivity, ProcessContext, new_session
+    from afspm.transport.zmq_port import open_port
+    from afspm.wire.message_types import register_all
+
+    launch = guest_of(folder, name)
+    register_all(launch.messages)
+    launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
+    clock = ExperimentClock.from_dict(launch.clock)
+    port = open_port(launch, clock)
+    context = ProcessContext(
+        launch,
+        clock,
+        open_port=lambda: port,
+        log=logging.getLogger(f"afspm.{name}"),
+        activity=ProcessActivity(clock),
+        session=new_session(launch.run),
+    )
+    with _ended_by_ctrl_c(port):
+        return dashboard.run_process(context)
+
+
+@contextmanager
+def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
+    # a dashboard that joins has no parent process: a signal stands for the parent's end
+    import signal
+
+    from afspm.transport.port import ParentGone
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        port.wake_up(ParentGone())
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _serve_recorded(folder: Path, settings: Plain) -> None:

@@ -17,8 +17,7 @@ from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.content import Content, Contents
-from afspm.plugins.web.dashboard.notes_panel import NotesPanel
-from afspm.plugins.web.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPanel
+from afspm.plugins.web.dashboard.panels import ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
 from afspm.plugins.web.dashboard.sign_in import SIGN_IN
 from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
 from afspm.plugins.web.dashboard.steering_session import SteeringSession

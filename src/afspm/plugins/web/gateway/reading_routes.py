@@ -13,7 +13,8 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from afspm.basics.clock import iso_utc
-from afspm.model import ControlMode, ControlState, Spectrum, names
+from afspm.model import ControlMode, ControlResponse, ControlState, Spectrum, names
+from afspm.model import Response as ModelResponse
 from afspm.model.line_levelling import Levelling
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.models import (
@@ -29,14 +30,17 @@ from afspm.plugins.web.gateway.models import (
     ValueFormat,
     event_kinds,
 )
-from afspm.plugins.web.gateway.parameter_cache import ParameterCache
-from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, refused
 from afspm.plugins.web.gateway.services import GatewayServices
 from afspm.plugins.web.gateway.stream import MOST_STREAMS, server_sent
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.record.overview import ScanSummary, SpectrumSummary
 
 NEWEST = "newest"
+FRESH_S = 1.0
+MOST_KEPT = 200
+_KNOWN = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS)
+_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
 _ACTIONS = (*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)
 Which = Annotated[str, Path(pattern=r"^([0-9]{1,20}|newest)$", examples=[NEWEST], description="an id, or `newest`")]
 Parameter = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["scan-speed"])]
@@ -55,6 +59,39 @@ _EVENTS: dict[int | str, dict[str, object]] = {
         "content": {"text/event-stream": {"schema": {"type": "string"}}},
     }
 }
+
+
+class ParameterCache:
+    """Asks for parameters, one client for all that want the same."""
+
+    def __init__(self, services: GatewayServices) -> None:
+        self._services = services
+        self._asked: dict[str, tuple[float, asyncio.Task[ModelResponse]]] = {}
+        self._lacking: set[str] = set()
+
+    async def all(self) -> list[ParameterModel]:
+        """Return the known parameters that the microscope has."""
+        wanted = [name for name in _KNOWN if name not in self._lacking]
+        responses = await asyncio.gather(*map(self._response, wanted))
+        self._lacking.update(name for name, one in zip(wanted, responses, strict=True) if one.code in _LACKING)
+        return [views.parameter_model(name, one) for name, one in zip(wanted, responses, strict=True) if one.ok]
+
+    async def one(self, name: str) -> ParameterModel:
+        """Return a parameter. Raises RefusedRequest if it can't be read."""
+        response = await self._response(name)
+        if not response.ok:
+            raise refused(response)
+        return views.parameter_model(name, response)
+
+    async def _response(self, name: str) -> ModelResponse:
+        now_s = asyncio.get_running_loop().time()
+        known = self._asked.get(name)
+        if known is None or now_s - known[0] >= FRESH_S:
+            while len(self._asked) >= MOST_KEPT:
+                del self._asked[next(iter(self._asked))]
+            task = asyncio.ensure_future(self._services.read(lambda commands: commands.get(name)))
+            known = self._asked[name] = now_s, task
+        return await asyncio.shield(known[1])
 
 
 class ReadingRoutes:
