@@ -1,4 +1,4 @@
-"""`DriftPictures`: what drift did in the night, and how well it was followed, as figures."""
+"""`DriftTable` and `DriftPictures`: the drift of a night as a table, and as figures."""
 
 from __future__ import annotations
 
@@ -34,10 +34,9 @@ _ALBUM = "afspm.plugins.drift.figures.album"
 class DriftTable(Component):
     """Writes `drift_correction.csv`: for each scan the offset between tip and sample coordinates, and its rate.
 
-    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads
-    the table. `outcome` says how the position of a scan is known: registered, coarse, or by dead reckoning (refused,
-    failed, new), with the variances that it then has. Whatever is killed, there is one header and no row is there
-    twice.
+    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads the
+    table. `outcome` is how the position of a scan was determined: registered, coarse, or by dead reckoning (refused,
+    failed, new); the variances belong to it. After a kill and restart, header and rows are still written only once.
 
     Args:
         file: its name in the run folder.
@@ -61,7 +60,7 @@ class DriftTable(Component):
 
 
 def drift_row(message: Any) -> list[str]:
-    """Return a DriftMapping as a row."""
+    """Return the row of a DriftMapping, in the order of `COLUMNS`."""
     time_ns = message.timestamp.ToNanoseconds()
     drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
     xx, xy, _, yy = message.covariance or (math.nan,) * 4  # of a scan before anything was known
@@ -87,15 +86,17 @@ def _text(value: float) -> str:
 
 @dataclass(frozen=True)
 class TabledScan:
-    """A scan of the table: its file, and whether components had sample coordinates at its time."""
+    """A scan in the table: its file, and whether components used sample coordinates at its time."""
 
     file: str
     correcting: bool
 
 
 def parts(told: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
-    """Name, start and stop of the scans without and with correction. The one that was taken while correction was
-    switched on, and may have been asked for before, is in neither."""
+    """Return name, start and stop of the scans without and with correction.
+
+    The first scan with correction is in neither part: it may have been requested before correction was switched on.
+    """
     first_on = next((k for k, one in enumerate(told) if one.correcting), len(told))
     found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(told))]
     return [part for part in found if part[2] > part[1]]
@@ -123,18 +124,17 @@ class _AsSaved(Sequence["DriftScan"]):
 
 
 class DriftPictures(DriftTable):
-    """Writes the table of `DriftTable`, and when the experiment ends draws the figures of drift in the run folder.
+    """Writes the table of `DriftTable`, and draws the figures of drift in the run folder when the experiment ends.
 
-    While the experiment goes on, it compares each scan with the first by itself, once for the scans before correction
-    was switched on and once for those after: what is left of drift then, estimated apart from what the scheduler
-    follows. Where the microscope is simulated, the true errors are drawn too. It reads the files that the microscope
-    saves.
+    During the experiment each scan is compared with the first scan of its part, without and with correction. This
+    estimates the remaining drift independently of the scheduler's tracker. For a simulated microscope the true errors
+    are drawn, too. Scans are read from the files that the microscope saves.
 
     Args:
-        channel: of the scans that are compared.
-        estimator: that compares them.
-        features: an estimator of matched features, for the figure of those; by default "brief" where `afspm[features]`
-            is installed.
+        channel: of the compared scans.
+        estimator: for the comparison.
+        features: an estimator that matches features, for the figure of matches; by default "brief" where
+            `afspm[features]` is installed.
         title: above the figure of the offset.
         file: the table's name in the run folder.
     """
@@ -213,7 +213,6 @@ class DriftPictures(DriftTable):
             self.log.info("drawn: %s", path)
 
     def _parts(self, told: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[RunPart]:
-        """With what was estimated off-line."""
         from afspm.plugins.drift.figures.album import RunPart
         from afspm.plugins.drift.offline import against_first
 
@@ -225,7 +224,7 @@ class DriftPictures(DriftTable):
         return made
 
     def _matched(self, told: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
-        """The first scan and the last without correction that has features in common with it: drift is seen best."""
+        # drift shows best between the first scan and the last one without correction that shares features with it
         from afspm.plugins.drift.estimators import estimator
 
         try:
@@ -241,7 +240,7 @@ class DriftPictures(DriftTable):
         return None
 
     def _compared(self, first: TabledScan, other: TabledScan) -> Registration:
-        """Of two scans, which are compared only once."""
+        # each pair is registered once: a registration takes too long to repeat at the end
         from afspm.plugins.drift.estimators import estimator
         from afspm.plugins.drift.registration import Registration
 
@@ -256,8 +255,7 @@ class DriftPictures(DriftTable):
         return self._pairs[pair]
 
     def _frame_of(self, told: TabledScan) -> DriftScan | None:
-        """Where and when it was taken, without the values, of a night's worth of which there may be too many to be
-        kept; None: it can't be had."""
+        # place and time without the values: the values of a whole night may not fit into memory
         try:
             scan = self._scan(told)
             return replace(scan, values=np.broadcast_to(np.nan, scan.values.shape))
@@ -266,13 +264,13 @@ class DriftPictures(DriftTable):
             return None
 
     def _tell(self, error: Exception) -> None:
-        """Once in a night: of a channel that is not there each scan would say the same."""
+        # once a night: a missing channel would be reported for each scan
         if not self._has_told:
             self.log.error("a scan is left out of the pictures: %s", error)
         self._has_told = True
 
     def _scan(self, told: TabledScan) -> DriftScan:
-        """As the microscope saved it, in tip coordinates."""
+        # as the microscope saved it, in tip coordinates
         from afspm.plugins.drift.study.scan_series import drift_scan
         from afspm.storage.formats import read
 
@@ -283,7 +281,6 @@ class DriftPictures(DriftTable):
         raise FileError(f"has no channel {self.channel!r}", where=told.file)
 
     def _told(self) -> list[TabledScan]:
-        """Return the scans of the table."""
         path = Path(self.run_dir) / self.file
         if not path.exists():
             return []

@@ -1,4 +1,4 @@
-"""Parts of drift correction by name: ready-made ones, and users' own as "module.Name"."""
+"""Parts of drift correction by name: afspm's, and a user's own as "module.Name"."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
 
     Args:
         what: "estimator" or "tracker".
-        spec: a name that a package declares or "module.Name", or a table with that as its `class` and the settings of
-            it (only `class` names code).
+        spec: a name that a package declares or "module.Name"; or a table with such a name as its `class` and with the
+            settings (only `class` names code).
         default: where the table has no class.
         arguments: given before the settings.
 
     Raises:
-        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+        ConfigError: no such name, class or setting, a meaningless setting, or a missing library.
     """
     settings = {"class": spec} if isinstance(spec, str) else dict(spec)
     name = settings.pop("class", default)

@@ -1,4 +1,4 @@
-"""`Rescanner`: takes the scans again that the Drift Compensated Scheduler asks for (paper, "Overarching Workflow")."""
+"""`Rescanner`: takes the rescans that the Drift Compensated Scheduler requests (paper, "Overarching Workflow")."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ _IN_WORDS = {
 
 
 class Rescanner(Component):
-    """Takes a region again on a `DriftRescan`: as it was, in the other direction, or wider.
+    """Scans a region again on a `DriftRescan`: unchanged, in the other direction, or wider.
 
-    Meanwhile thermal-drift is flagged, so that nobody else scans. It tries a few times. A scan that still lies too far
-    off is then told, and the experiment goes on; where the sample is not found again a person is needed, for which it
-    flags device-malfunction.
+    Meanwhile thermal-drift is flagged, so that no other component scans. After some attempts without success it logs an
+    error and the experiment goes on. If the sample is not found again, it flags device-malfunction and a person is
+    needed.
 
     Args:
         attempts: scans for one request; in the other direction there is one.
-        widen: by how much each search is wider than the one before it.
-        most_pixels: of a side of a search, whose pixels are those of the scans before as far as this allows.
-        problem: what it solves.
+        widen: factor from each search region to the next.
+        most_pixels: largest side of a search in pixels; up to this bound the pixel size stays.
+        problem: the problem that it solves.
     """
 
     solves: ClassVar = ("thermal-drift",)

@@ -1,4 +1,4 @@
-"""`afspm drift study`, what it does: nights, while a bar grows, and a table of what they say."""
+"""The work of `afspm drift study`: simulate nights with a progress bar, and print a table of the results."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _shown(outcomes: Iterator[TaskOutcome], total: int) -> Iterator[TaskOutcome]
 
 
 def show(rows: Sequence[Summary], console: Console) -> None:
-    """The table, what it means, and what it says of the defaults."""
+    """Print the table, its legend, the failed nights, and the verdict on the defaults."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("settings", overflow="fold", min_width=14)
     for name in ("n", COLUMNS[BY], "quartiles", *(name for key, name in COLUMNS.items() if key != BY)):

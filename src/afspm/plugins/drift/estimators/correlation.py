@@ -1,4 +1,4 @@
-"""Registration by plain cross-correlation: the shift at which what both scans know looks most alike."""
+"""Registration by plain normalised cross-correlation."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Correlation:
     """Masked normalised cross-correlation (Padfield 2012), by FFT, its peak refined by a parabola. Translation only.
 
     Attributes:
-        coefficient: least at the peak.
-        height: of the peak, in standard deviations of all other shifts.
-        rival: the highest of all other shifts, beside the peak, at most.
-        overlap: of the smaller scan, at least; two thirds of it are enough with a prior.
+        coefficient: least accepted peak.
+        height: least height of the peak, in standard deviations of all other shifts.
+        rival: largest accepted ratio of the next peak to the peak.
+        overlap: least overlap, as share of the smaller scan; with a prior, two thirds of it are enough.
 
     Raises:
-        ConfigError: a setting that makes no sense.
+        ConfigError: a meaningless setting.
     """
 
     coefficient: float = 0.4

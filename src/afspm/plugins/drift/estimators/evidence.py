@@ -1,7 +1,7 @@
-"""Evidence of matched features: the probability of their agreement by chance, and the uncertainty of the displacement.
+"""Evidence of matched features: the probability of agreement by chance, and the uncertainty of the displacement.
 
-Against chance their number counts; against a periodic surface that no other displacement has nearly as many; against
-one feature that happens to look alike that they lie in several places.
+The number of matches excludes chance. No rival displacement with nearly as many matches excludes a periodic surface.
+Matches in several places exclude a single look-alike feature.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _DEVIATIONS_MAX = 25.0  # squared, from what was expected
 
 @dataclass(frozen=True, eq=False)
 class ConsensusEvidence:
-    """Matched features, and the pairs of them that agree.
+    """Matched features, with the pairs that agree on a transform.
 
     `a` and `b` are (n, 2) in tip coordinates, m; `pixel_m` is the common pixel.
     """
@@ -51,13 +51,13 @@ class ConsensusEvidence:
 
     @property
     def radius_m(self) -> float:
-        """Distance from the transform within which a pair agrees with it."""
+        """Largest distance of an agreeing pair from the transform."""
         return max(self.consensus.radius, _RADIUS_PX * self.pixel_m)
 
 
 @dataclass(frozen=True)
 class Standards:
-    """The standards that evidence must meet; see `Features`."""
+    """Thresholds for the evidence; see `Features`."""
 
     false_alarms: float
     inlier_share: float
@@ -75,7 +75,7 @@ def weighed(
     covariance: Array,
     center: Array,
 ) -> tuple[dict[str, float], str]:
-    """Return figures of merit by name, and the reason for a refusal (empty: none)."""
+    """Return figures of merit by name, and the reason for a refusal (empty: accepted)."""
     inlier, transform = evidence.consensus.inlier, evidence.consensus.transform
     off = transform(evidence.a[inlier]) - evidence.b[inlier]
     figures = {

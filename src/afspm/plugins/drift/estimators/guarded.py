@@ -1,7 +1,7 @@
 """A guard around any estimator: distinguishes errors from refusals, reports errors and bridges them.
 
-A refusal says that two scans can't be registered. An error says nothing about the scans: it is reported with the pair,
-and a plain correlation takes the place of the estimate where it is known where to look, and that is sure of its peak.
+A refusal means that two scans can't be registered. An error means nothing about the scans: it is reported with the
+pair. A plain correlation then takes its place, if there is a prior and the peak is clear.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _log = logging.getLogger("afspm.plugins.drift")
 
 @dataclass(frozen=True)
 class PairFailure:
-    """An error of an estimator over a pair of scans.
+    """An error of an estimator with a pair of scans.
 
     Attributes:
         estimator: its name.
@@ -53,16 +53,15 @@ Report = Callable[[PairFailure], None]
 
 
 def log_failure(failure: PairFailure) -> None:
-    """Log a failure as an error."""
     _log.error("%s", failure)
 
 
 class Guarded:
-    """Runs an estimator so that no caller needs to be careful.
+    """Runs an estimator so that no caller needs to check its result.
 
-    An exception, and a result that is none, of wrong shapes, or accepted with values that can't be, are failures: see
-    `Registration.failure`. A displacement with which the scans would share nothing, and a sample that is mirrored or
-    much stretched, are refused. The estimator gets copies, so that changes to them do not reach later comparisons.
+    An exception, a result of the wrong type or shape, and impossible accepted values are failures: see
+    `Registration.failure`. A displacement without overlap, and a mirrored or much stretched sample, are refused. The
+    estimator receives copies of the values, so that its changes do not reach later comparisons.
 
     Args:
         report: called with each failure.

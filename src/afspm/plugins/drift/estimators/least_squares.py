@@ -1,4 +1,4 @@
-"""Registration by generalised least squares over all pixels (an outline is in `LeastSquares`)."""
+"""Registration by generalised least squares over all pixels (outline: `LeastSquares`)."""
 
 from __future__ import annotations
 
@@ -48,17 +48,17 @@ else displaces them. The factor of the ellipses, which grows with doubt, would l
 class LeastSquares:
     """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q + creep of the lines.
 
-    1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
-    2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
-    3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, through a filter and weighted by rows
-       as their `noise` asks.
-    4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `nuisances`: averaged over what
-       shear, turn, calibration and creep there may be.
-    5. `acceptance`: is it a match at all?
+    1. `prepare`: flatten rows, clip outliers, refuse scans without information. `grid`: a common pixel.
+    2. `search` and `score`: candidates by normalised cross-correlation, and the likeliest of them.
+    3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, filtered and weighted by rows
+       according to their `noise`.
+    4. `covariance`: the uncertainty from noise, enlarged by doubt; `nuisances`: the average over possible shear,
+       rotation, calibration and creep.
+    5. `acceptance`: refuse what may be no match.
 
     Args:
-        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel; twice as
-            large where a displacement is expected.
+        wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled where a
+            displacement is expected.
 
     Raises:
         ConfigError: it is not between 0 and 1.

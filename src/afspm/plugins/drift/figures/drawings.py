@@ -1,4 +1,4 @@
-"""The figures of drift: one function each, which returns a matplotlib figure."""
+"""The figures of drift: one function for each matplotlib figure."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from afspm.plugins.drift.registration import DriftScan, Matches
 def draw_offsets(
     record: DriftRecord, *, truth_m: Array | None = None, switched_on_s: float | None = None, title: str = ""
 ) -> Figure:
-    """As in the paper's experiment: how far the sample has come, and how its velocity changes.
+    """Draw the displacement of the sample and its change over time, as in the paper's experiment.
 
     Args:
         record: of the run.
@@ -82,10 +82,11 @@ _PAIR_INCHES = 2.2
 
 @dataclass(frozen=True, eq=False)
 class ScanPair:
-    """Two scans, and by how much the features lie elsewhere within the second.
+    """Two scans, with the displacement of features from the first to the second.
 
     Attributes:
-        moved_m: (2,) in the frame of the image: where a feature of the first is in the second, minus where it was.
+        moved_m: (2,) in the frame of the image: position of a feature in the second scan, minus its position in the
+            first.
         title: e.g. "correction off".
     """
 
@@ -96,7 +97,7 @@ class ScanPair:
 
 
 def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
-    """A row of two scans for each pair, in their own frames, with the arrow in the second."""
+    """Draw each pair as a row of two scans in their own frames, with the displacement as an arrow in the second."""
     with styled():
         made = figure(2 * _PAIR_INCHES, (_PAIR_INCHES + 0.15) * len(pairs))
         for row, pair in zip(made.subplots(len(pairs), 2, squeeze=False), pairs, strict=True):
@@ -122,10 +123,10 @@ def _arrow(ax: Axes, pair: ScanPair) -> None:
 
 
 def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | None = None) -> Figure:
-    """Draw how far the features lie from where they were in the first scan, against time.
+    """Draw the displacement of features from their place in the first scan, against time.
 
     Args:
-        record: of the pairs; `matched` says which were accepted.
+        record: of the pairs; `matched` marks the accepted ones.
         truth_m: (n, 2) true values, where known.
     """
     with styled():
@@ -172,7 +173,7 @@ _MOST_BINS = 100
 
 
 def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
-    """Of x, of y and of the distance, for the pairs that were accepted (the first scan itself left out)."""
+    """Draw histograms of x, y and distance for the accepted pairs, without the first scan itself."""
     moved = record.misplacement_m[1:][record.matched[1:]]
     with styled():
         made = figure(WIDTH_IN, 2.2)
@@ -190,8 +191,11 @@ def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
 
 
 def freedman_diaconis(values: Array) -> Array:
-    """Edges of bins as wide as 2 IQR n^(-1/3), which makes the histogram close to the density in the mean square (D.
-    Freedman, P. Diaconis, Z. Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981). One bin where all are alike."""
+    """Return edges of bins as wide as 2 IQR n^(-1/3), or of one bin if all values are equal.
+
+    This width makes the histogram close to the density in the mean square (D. Freedman, P. Diaconis, Z.
+    Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981).
+    """
     low, high = float(values.min()), float(values.max())
     quarter, three_quarters = np.percentile(values, (25, 75))
     width = 2.0 * (three_quarters - quarter) / len(values) ** (1 / 3)
@@ -215,10 +219,10 @@ _INCHES = 2.6
 
 
 def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None) -> Figure:
-    """a: both scans with the matched keypoints in orange; b: the pairs joined, inliers in colour, outliers dotted.
+    """Draw both scans twice: (a) with the matched keypoints; (b) with matches joined, outliers dotted.
 
     Raises:
-        InvalidValue: an estimator that matches no features.
+        InvalidValue: the estimator matches no features.
     """
     if matches is None:
         raise InvalidValue("this estimator uses no features", hint='e.g. estimator "brief"')
@@ -271,7 +275,9 @@ def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool
 
 
 def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | None = None) -> Figure:
-    """a: how far off the place of the first scan each was taken; b: what was known after it, minus the truth.
+    """Draw two errors against time: (a) the misplacement of each scan; (b) the estimated minus the true drift.
+
+    The misplacement is the distance on the sample from the place of the first scan.
 
     Args:
         record: of the run.

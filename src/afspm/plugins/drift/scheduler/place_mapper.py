@@ -63,7 +63,7 @@ class SavedPlace:
 
 @dataclass(frozen=True)
 class MappedBefore:
-    """The mapped form of a request with an id, which is sent again as it was."""
+    """The mapped form of a request with an id: a repeated request is sent unchanged."""
 
     kind: int
     place: SavedPlace
@@ -72,7 +72,7 @@ class MappedBefore:
 
 @dataclass(frozen=True)
 class Places:
-    """The scan and the probe in force at the microscope, in both coordinates.
+    """The scan region and probe position in force at the microscope, in both coordinates.
 
     Attributes:
         shape: (rows, columns) in force; None: not known.
@@ -108,7 +108,7 @@ class SavedPlaces:
         return cls(region, probe, places.shape, places.upwards, places.durations, places.remembered)
 
     def restored(self, codec: PlaceCodec) -> Places:
-        """Raises ValueError: a place can't be read."""
+        """Return the places. Raises ValueError for an unreadable place."""
         region = None if self.region is None else _place(codec, _SET_SCAN, self.region)
         probe = None if self.probe is None else _place(codec, _SET_PROBE, self.probe)
         return Places(
@@ -124,7 +124,7 @@ class PlaceMapper:
     """One step of mapping in progress: the places so far.
 
     Args:
-        mapping_at: by what is known of the drift now.
+        mapping_at: from the current forecast of drift.
     """
 
     region: TargetPosition[Region]
@@ -182,7 +182,7 @@ class PlaceMapper:
         return self._mapped(key, request, sample, now_s)
 
     def _mapped(self, key: str, request: Request, sample: Region | ProbePosition, now_s: float) -> MappedRequest:
-        """Map a place as a whole, whatever part of it was asked for, and remember what comes of it."""
+        # a request for a part of a place (its x, its width) becomes the whole place: rotation mixes the parts
         kind, asked = (_SET_SCAN if isinstance(sample, Region) else _SET_PROBE), request.subject
         rest = asked if isinstance(asked, ScanParameters) else ScanParameters()
         is_whole = isinstance(asked, ProbePosition) or isinstance(rest.region, Region)
@@ -226,7 +226,7 @@ class PlaceMapper:
         return MappedRequest(Request(kind, subject, place.sent), (), _said(place))
 
     def _tip_of(self, sample: Region | ProbePosition, now_s: float) -> Any:
-        """Where the tip must be: for a scan that begins now at its middle, for the probe now."""
+        # a scan that begins now is placed for its middle, the probe for now
         middle_s = now_s
         if isinstance(sample, Region):
             middle_s += self.durations.expected_s(self.shape, sample.size_m) / 2
@@ -239,7 +239,6 @@ class PlaceMapper:
     def _to_tip(
         self, sample: Region | ProbePosition, said: bytes | None, rest: ScanParameters, now_s: float
     ) -> tuple[PositionPair[Any], object]:
-        """The place in both coordinates, and what the microscope is to be sent for it."""
         tip = self._tip_of(sample, now_s)
         if isinstance(sample, Region):
             subject: object = ScanParameters(tip, rest.shape, rest.unit)
@@ -308,7 +307,6 @@ class PlaceMapper:
         return None if sample_value is None else told_as(subject.name, sample_value, told)
 
     def _in_sample(self, name: str, tip_value: float, mapping: Mapping) -> float | None:
-        """A part of the place in force, from what the microscope tells of it."""
         if name in PROBE_CHANGES:
             position = self.probe.current
             if position is None:
@@ -359,7 +357,7 @@ class PlaceMapper:
         return self._codec.relocated("ScanParameters2d", payload, known.current.said)
 
     def _lines_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
-        """They lie where the frame is that they are taken in; the finished scan will be told to lie where it was."""
+        # lines get the place of the frame in force; the finished scan will get its measured place
         region, mapping = getattr(told, "region", None), self._mapping_at(time_s)
         if region is None or mapping is None:
             return None
@@ -383,7 +381,7 @@ class PlaceMapper:
         return self._codec.relocated("ProbePosition", payload, known.current.said)
 
     def _spectrum_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
-        """It lies where the sample was at its own time, which may not be that of the move to it."""
+        # mapped for its own time: the sample may have drifted since the probe was moved
         mapping, position_m = self._mapping_at(time_s), getattr(told, "position_m", None)
         if mapping is None or position_m is None:
             return None

@@ -1,4 +1,4 @@
-"""The response to a registered scan: flags, scans to be taken again, a rate handed over to the controller."""
+"""The response to a registered scan: flags, rescans, and a rate for the controller."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 
 def respond(draft: DriftDraft, what: FollowUp) -> None:
-    """Give a response that was put off until its scan was published."""
+    """Give a response that was deferred until its scan was published."""
     match what:
         case RespondToScan():
             _to_scan(draft, what)
@@ -43,7 +43,7 @@ def respond(draft: DriftDraft, what: FollowUp) -> None:
 
 
 def is_given_up(draft: DriftDraft) -> bool:
-    """Return whether a person was called to a worker that always ends."""
+    """Return whether device-malfunction is flagged, for example because the worker ended repeatedly."""
     return _MALFUNCTION in draft.control.problems
 
 
@@ -84,7 +84,7 @@ def _to_failure(draft: DriftDraft, why: str) -> None:
 
 
 def _call_person(draft: DriftDraft) -> None:
-    """Flag a malfunction until a person has looked; a worker whose drift is never corrected delays no component."""
+    # without correction the worker's end delays no component
     if not draft.env.settings.correct:
         return
     draft.worker = replace(draft.worker, waits_for_person=True)
@@ -105,7 +105,7 @@ def _search(draft: DriftDraft, why: str) -> None:
 
 
 def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None:
-    """Have the first scan taken in the other direction before any component goes on."""
+    # flagged, so that no component scans before both directions are there
     draft.duties = replace(draft.duties, started=True)
     if upwards is None:
         why = f"the microscope does not report {names.SCAN_DIRECTION}"
@@ -117,7 +117,7 @@ def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None
 
 
 def _clear_own_flag(draft: DriftDraft) -> None:
-    """Clear the scheduler's flag; a component that solves it restores its own changes first."""
+    # a component that solves the problem restores its own changes first
     control = draft.control
     if control.problems.get(_DRIFT) == draft.env.name and control.solving != _DRIFT:
         draft.outputs.append(ProblemSeen(_DRIFT, flagged=False, name=draft.env.name))
@@ -139,10 +139,10 @@ def _want(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | N
 
 @dataclass(frozen=True)
 class RateGiven:
-    """The controller was asked to compensate `value_m_s` along an axis.
+    """A request to the controller to compensate `value_m_s` along an axis.
 
     Attributes:
-        is_new: the worker has to reckon with it from now on.
+        is_new: the worker must take it into account from now on.
     """
 
     axis: int
@@ -152,13 +152,13 @@ class RateGiven:
 
 
 def restore_compensation(draft: DriftDraft) -> None:
-    """Have the controller compensate what is reckoned with: nothing at first, whatever a night before has left."""
+    """Set the controller to the compensation in force, at first zero: an earlier night may have left another."""
     for axis, name in enumerate(_axes(draft)):
         _ask_rate(draft, RateGiven(axis, name, draft.duties.given_m_s[axis], is_new=False))
 
 
 def hand_over(draft: DriftDraft) -> None:
-    """Give the controller the newest rate, if it is significant; nothing is changed under the hands of a person."""
+    """Give the controller the newest rate, if it is significant and no person is in control."""
     predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
     if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
         return
@@ -171,7 +171,7 @@ def hand_over(draft: DriftDraft) -> None:
 
 
 def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
-    """Take the answer for one axis: the controller may take one and refuse the other."""
+    """Process the answer for one axis: the controller may accept one axis and refuse the other."""
     if not response.ok:
         # not free: a scan has begun already, and the rate is handed over after the next
         if response.code != ControlResponse.NOT_FREE:

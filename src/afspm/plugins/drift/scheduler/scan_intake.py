@@ -1,11 +1,11 @@
 """A scan from its first packet to its publication in sample coordinates.
 
-| step | when | then |
+| step | trigger | action |
 | --- | --- | --- |
-| held | its first channel comes | all that follows it waits in the gate |
-| registered | its channel for drift comes | a job for the worker |
+| held | its first channel arrives | all that follows waits in the gate |
+| registered | its channel for drift arrives | a job for the worker |
 | settled | the worker's report, an error, a time limit | its mapping is announced, and saved with the state |
-| released | at once | scan and followers come once more, and pass in their order |
+| released | at once | scan and followers are reconsidered, and pass in their order |
 | responded to | in a step of its own | flags and rescans, after the scan was published |
 """
 
@@ -102,7 +102,7 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
 
 
 def _look_at(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
-    """Find the channel to register among the packets that wait, or the end of a scan that has none."""
+    # a state other than SCANNING ends a scan that has no channel to register
     if held.asked:
         return
     if draft.worker.ends >= _MOST_ENDS:  # a person was called, or decided that the experiment goes on
@@ -141,7 +141,7 @@ def _ask_worker(draft: DriftDraft, held: HeldScan, job: ScanJob) -> None:
 
 
 def _meant(draft: DriftDraft, scan: Scan) -> Region | None:
-    """The region that the scan was meant to show, if it was taken where the scheduler had it set."""
+    # unknown if the scan was taken elsewhere than the scheduler had set it
     place = draft.places.region.current
     if place is None or not is_same(place.tip, scan.region):
         return None
@@ -149,7 +149,7 @@ def _meant(draft: DriftDraft, scan: Scan) -> Region | None:
 
 
 def _middle_s(draft: DriftDraft, scan: Scan, event: PacketIn) -> float:
-    """The middle between the scan's start and its own end: a file that comes late biases nothing."""
+    # from the scan's own end, so that a late file causes no error
     expected_s = draft.places.durations.expected_s(scan.shape, scan.region.size_m)
     return draft.timing.middle_s(_end_s(scan, event, draft.now_ns), expected_s)
 
@@ -165,7 +165,7 @@ def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | No
 
 
 def take_report(draft: DriftDraft, report: WorkerReport) -> None:
-    """Take a report of the worker."""
+    """Process a report of the worker."""
     match report:
         case Registered():
             _registered(draft, report)
@@ -221,7 +221,7 @@ def _gone(draft: DriftDraft, report: WorkerGone) -> None:
 
 
 def expire(draft: DriftDraft) -> None:
-    """Give up a scan that waits too long; a worker that hangs over it is killed."""
+    """Give up a scan that waited too long, and kill a worker that hangs."""
     held = draft.gate.held
     if held is None or draft.now_s < held.until_s:
         return
@@ -246,7 +246,7 @@ def _learn(draft: DriftDraft, forecast: Plain | None) -> None:
 
 
 def _log_if_slow(draft: DriftDraft, held: HeldScan) -> None:
-    """Warn once, before it takes too long: with more references it takes several times as long."""
+    # once, and early: with more references a registration takes several times as long
     limit_s = draft.env.settings.longest_registration
     took_s = draft.now_s - (held.until_s - limit_s)
     if draft.worker.slow_logged or took_s < limit_s / 3:
@@ -260,7 +260,7 @@ def _log_if_slow(draft: DriftDraft, held: HeldScan) -> None:
 
 
 def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
-    """Publish a scan by prediction; after too many of them the prediction is not reliable."""
+    # counted as a failure: after several of them the prediction is not reliable
     held = draft.gate.held
     if held is not None and held.key == key:
         _follow(draft, RespondToFailure(why))
@@ -268,7 +268,7 @@ def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
 
 
 def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str = "") -> None:
-    """Publish a scan that was not registered where the sample is predicted."""
+    """Publish an unregistered scan at the predicted place."""
     mapping = draft.forecast.mapping_at(draft.env.settings, held.middle_s)
     draft.gate = draft.gate.settle(held.key, None if mapping is None else mapping.matrix.tolist())
     report = _predicted(draft, held, why)
@@ -280,14 +280,12 @@ def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str
 def _announce(
     draft: DriftDraft, report: Registered, filename: str, center_m: tuple[float, float], before_ns: int | None
 ) -> None:
-    """Count a scan, and publish how its position is known."""
     draft.tally = draft.tally.add(report.outcome)
     payload = draft.env.codec.encode_mapping(report, filename, center_m, correcting=draft.corrects)
     draft.outputs.append(Announced(MAPPING, payload, before_ns))
 
 
 def _log_outcome(draft: DriftDraft, report: Registered, filename: str, level: str = "") -> None:
-    """Log the errors of an estimator, and a scan that is not registered well."""
     for failure in report.failures:
         draft.log("ERROR", failure)
     if report.outcome is not RegistrationOutcome.REGISTERED:
@@ -306,7 +304,7 @@ def _release(draft: DriftDraft) -> None:
 
 
 def _follow(draft: DriftDraft, what: FollowUp) -> None:
-    """Put a response off to a step of its own, since it may change who is in control."""
+    # in a step of its own, since a response may change which client is in control
     draft.following = (*draft.following, (draft.now_s, what))
 
 
@@ -333,7 +331,7 @@ def _predicted(draft: DriftDraft, held: HeldScan, why: str) -> Registered:
 
 
 def scan_key(scan: Scan, packet: Packet) -> str:
-    """Return a key that all channels of a scan share, and no other scan has."""
+    """Return a key common to all channels of a scan, and unique to it."""
     if scan.time_ns is None and scan.filename:
         return scan.filename
     return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"

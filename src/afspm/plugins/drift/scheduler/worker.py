@@ -1,7 +1,7 @@
-"""The process that registers scans: whatever an estimator of a user does, and however long, the scheduler goes on.
+"""The process that registers scans. Errors and long computations of an estimator don't stop the scheduler.
 
-It takes jobs one after the other, and saves its state before it reports. The end of its jobs ends it, and so does the
-death of the scheduler's process, even while it registers: the worker of the next scheduler knows more by then.
+It processes jobs one after the other, and saves its state before it reports. It ends with its jobs, and with the
+scheduler's process, even during a registration: by then the worker of the next scheduler is the newer one.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class _Worker:
         self._report(Forecasted(self._estimation.forecast))
 
     def _saved(self) -> Estimation:
-        """The estimation as it was when a scan was registered last."""
+        # from disk: the state after the last registered scan
         failures: list[PairFailure] = []
         made = tracker(self._settings.tracker, estimator(self._settings.estimator, failures.append))
         estimation = Estimation(made, self._settings.rescan, self._save, failures)

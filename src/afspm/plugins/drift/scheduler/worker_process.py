@@ -1,4 +1,4 @@
-"""The worker as the scheduler's process has it: a child that takes jobs, and whose reports come by a thread."""
+"""The worker from the scheduler's side: a child process that takes jobs, with a thread that receives its reports."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class DriftWorkerProcess:
 
     Attributes:
         wake: called from another thread when there is a report.
-        late: keeps a simulated time from running away while a scan is registered.
+        late: holds simulated time while a scan is registered.
     """
 
     def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
@@ -58,7 +58,7 @@ class DriftWorkerProcess:
         self._jobs.put(job)
 
     def reports(self) -> Iterator[WorkerReport]:
-        """Yield the reports since the last call, oldest first; those of a former worker are dropped.
+        """Yield the reports since the last call, oldest first; reports of a former worker are dropped.
 
         Simulated time passes again once the report about a scan was handled.
         """
@@ -110,7 +110,7 @@ class DriftWorkerProcess:
         process.join()
 
     def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:
-        """In a thread: from the worker's first report to its end."""
+        # in a thread: from the worker's first report to its end
         gone = None
         with contextlib.suppress(EOFError, OSError), reports:
             while True:
@@ -130,7 +130,7 @@ class DriftWorkerProcess:
 
 
 def _write_all(jobs: Connection, waiting: queue.SimpleQueue[object]) -> None:
-    """In a thread: a worker that is busy does not read, and the scheduler must not wait for it."""
+    # in a thread: a busy worker does not read, and the scheduler must not wait for it
     with contextlib.suppress(OSError), jobs:
         while (job := waiting.get()) is not None:
             jobs.send(job)
@@ -138,7 +138,7 @@ def _write_all(jobs: Connection, waiting: queue.SimpleQueue[object]) -> None:
 
 @contextlib.contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Small matrices are not worth more threads than one; libraries of the child read it as they are loaded."""
+    # small matrices gain nothing from more threads; the child's libraries read the variables as they are loaded
     added = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
     try:

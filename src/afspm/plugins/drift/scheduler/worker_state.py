@@ -1,4 +1,4 @@
-"""The worker's state on disk: one .npz file of JSON and arrays, replaced as a whole. Nothing in it is code."""
+"""The worker's state on disk: one .npz file of JSON and arrays, replaced as a whole. It contains no code."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WorkerStateFile:
         self.path = path
 
     def save(self, state: Plain) -> None:
-        """Write it aside and rename; a power cut leaves the one or the other.
+        """Write a new file and rename it; a power cut leaves the old file or the new one.
 
         Raises:
             FileError: the disk is full …
@@ -42,7 +42,7 @@ class WorkerStateFile:
         write_atomic(self.path, [file.getbuffer()], synced=True)
 
     def load(self) -> Plain | None:
-        """Return what was saved last; None if nothing was.
+        """Return the last saved state; None if there is none.
 
         Raises:
             FileError: it can't be read.

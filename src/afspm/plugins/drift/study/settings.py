@@ -20,14 +20,14 @@ class NightSettings:
 
     Attributes:
         surface: kind of the sample, see `afspm.simulation`.
-        size_m, pixels: of the square that is scanned.
-        every_s: from the beginning of one scan to that of the next.
+        size_m, pixels: of the scanned square.
+        every_s: from the beginning of one scan to the beginning of the next.
         line_s: of trace and retrace together.
-        hours: how long.
-        drift_m: how far the sample goes in the end; its direction, and a random walk besides, follow from the seed.
-        rescan: when a scan is taken again, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
-        tolerance_m: for that rule; None: a tenth of the size.
-        f_rescan: for that of the paper.
+        hours: duration.
+        drift_m: displacement of the sample at the end; its direction and an added random walk follow from the seed.
+        rescan: when a rescan is taken, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
+        tolerance_m: for the rule "tolerance"; None: a tenth of the size.
+        f_rescan: for the rule "paper".
         at_start: "up-down": the first place is scanned in both directions, as by the scheduler's default; "nothing".
         estimator, tracker: "class" and settings.
     """
@@ -61,16 +61,15 @@ class NightSettings:
 
     @property
     def scans(self) -> int:
-        """Return how many scans are planned."""
+        """Number of planned scans."""
         return int(self.hours * 3600.0 / self.every_s + 1e-9)
 
     @classmethod
     def of(cls, names: Table) -> NightSettings:
-        """Make settings from names: fields, and "paper.queue" for a setting of the tracker (estimator) "paper" where it
-        is chosen.
+        """Return the settings from names: fields, and "paper.queue" for a setting of the chosen tracker or estimator.
 
         Raises:
-            ConfigError: unknown names. InvalidValue: values that don't fit each other.
+            ConfigError: unknown names. InvalidValue: values that contradict each other.
         """
         plain: Plain = {name: value for name, value in names.items() if "." not in name}
         known = [one.name for one in fields(cls)]

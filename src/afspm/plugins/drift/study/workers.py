@@ -1,4 +1,4 @@
-"""Many independent tasks, on the cores of this computer or on a Dask cluster. A worker that dies costs only time."""
+"""Many independent tasks, on the cores of this computer or on a Dask cluster. A dead worker costs only time."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class TaskOutcome:
     """The result or the error of a task.
 
     Attributes:
-        index: which one.
-        value: what it returned, None if it failed.
-        error: how it failed, for a person.
+        index: of the task.
+        value: its return value, None if it failed.
+        error: for a person; empty if it succeeded.
     """
 
     index: int
@@ -33,7 +33,7 @@ class TaskOutcome:
 
 
 def processes(asked: int | None, pixels: int) -> int:
-    """Return the number of processes: `jobs`, or one a core where that pays."""
+    """Return the requested number of processes, or by default one per core where that pays."""
     if asked is not None:
         return asked
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
@@ -42,7 +42,7 @@ def processes(asked: int | None, pixels: int) -> int:
 def on_cores(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, jobs: int
 ) -> Iterator[TaskOutcome]:
-    """Yield the outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
+    """Yield the outcomes of `function(*task)`, in any order, from `jobs` processes (1: in this one)."""
     if jobs <= 1:
         for index, task in enumerate(tasks):
             yield _done(function, index, task)
@@ -69,7 +69,7 @@ def on_cluster(
     The task of a dead worker goes to another.
 
     Raises:
-        ConfigError: `distributed` is not installed, or nobody answers at the address.
+        ConfigError: `distributed` is not installed, or the address does not answer.
     """
     try:
         distributed: Any = importlib.import_module("distributed")

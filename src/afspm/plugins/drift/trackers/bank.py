@@ -34,14 +34,14 @@ class BankState:
     Attributes:
         filters: None before the first scan.
         similarity: rotation and scale; None: only translations are followed.
-        references: the scans that are kept, in the order of time, as in the filters' state.
-        compensation: with which tip coordinates follow the sample.
+        references: the stored scans, in the order of time, as in the filters' state.
+        compensation: velocity with which tip coordinates follow the sample.
         newest_s: the middle of the newest scan, which may have been dropped.
-        scans: how many there were.
+        scans: number of scans so far.
         unmatched: scans in a row that should have matched.
         proven: whether any two scans have matched; before, the first may be the unusable one.
-        doubted_m: (2,) where the newest scan was found, from where it was expected; None: not in doubt.
-        matched_s: the middle of the newest scan that has a place.
+        doubted_m: (2,) measured minus expected position of the newest scan; None: not in doubt.
+        matched_s: the middle of the newest scan with a measured place.
         lost: see `Update`.
     """
 
@@ -59,7 +59,7 @@ class BankState:
 
 
 class BankTracker:
-    """Filters that each expect drift to move differently, weighted by how well they foresaw it.
+    """A bank of filters with different models of drift, weighted by how well they predicted it.
 
     A scan is registered with several earlier ones: with recent ones, and with an anchor, the scan that first showed its
     part of the sample, for as long as that can be recognised. Each result measures the difference of two positions. The
@@ -67,23 +67,23 @@ class BankTracker:
     A position holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
     A result far from every prediction is believed only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place, and proves nothing; neither do scans that match only scans adrift.
-    Their places relative to each other are still followed. After several such scans in a row the tracker is lost, as it
-    is after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
+    adrift: it is stored at its predicted place and is no evidence, nor are scans that match only scans adrift. Their
+    places relative to each other are still followed. After several such scans in a row the tracker is lost. It is lost
+    after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
     compared. A lost tracker searches everywhere. The first scan with a place ends that, and corrects the scans adrift.
 
     A scan that can be compared with no other, such as a zoom too fine for the overview, starts a series of its own. A
-    zoom is searched in an overview only where it is expected, and the tracker is not lost because an overview does not
-    show it clearly: one particle looks like the next.
+    zoom is searched in an overview only at its expected place. A zoom not recognised in an overview does not make the
+    tracker lost: one particle looks like the next.
 
-    With the transform "similarity", scans are straightened before all that: see `Similarity`.
+    With the transform "similarity", scans are first straightened: see `Similarity`.
 
     Args:
         estimator: gets the prediction as prior.
         settings: fields of `BankSettings` and `Choice`.
 
     Raises:
-        ConfigError: a setting without a meaning.
+        ConfigError: a meaningless setting.
     """
 
     def __init__(self, estimator: Estimator, **settings: object) -> None:
@@ -145,7 +145,7 @@ class BankTracker:
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
-        """Take in a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
+        """Update by a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
 
         Raises:
             InvalidValue: before the first scan.
