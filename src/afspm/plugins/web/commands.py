@@ -1,4 +1,4 @@
-"""`afspm dashboard`: the page of an experiment that runs already, here or on another computer; and of `afspm run`."""
+"""`afspm dashboard`: the page of a running experiment, here or on another computer; and the page of `afspm run`."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def dashboard(
         bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
     ] = False,
 ) -> None:
-    """Show an experiment in the browser: steer one that runs, look through one that has ended.
+    """Show an experiment in the browser: steer a running one, or look through one that has ended.
 
-    It joins the run as a notebook would: the experiment does not notice when it comes and goes. When it ends, the page
-    stays, with a slider through the night, until Ctrl-C; so it is shown for a run that has ended. With an experiment
-    file of which nothing was started here it connects to where the file says that the scheduler is. A password for
-    those who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
+    The page joins a running experiment as a notebook would; the experiment does not depend on it. When the experiment
+    ends, the page stays until Ctrl-C, with a slider through the night; a run that has ended is shown in the same way.
+    If the experiment runs on another computer, name its experiment file: the page connects to the scheduler's address
+    in it. A password for viewers who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
     """
     from afspm.record.run_lock import goes_on
 
@@ -71,7 +71,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
     """Show a run that has ended until Ctrl-C.
 
     Args:
-        name: of the dashboard that it had, with its settings.
+        name: of its dashboard, with these settings.
     """
     import subprocess
     import sys
@@ -88,7 +88,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
 
 
 def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
-    """Return name and settings of a dashboard among the processes that were started here; None: there is none."""
+    """Return name and settings of a dashboard among the processes started here; None: there is none."""
     for process in experiment.resolved.processes.values():
         if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
             return process.name, process.settings
@@ -104,7 +104,7 @@ def with_page(files: list[Path]) -> Experiment:
 
 
 def resumed_with_page(found: ResumableRun) -> ResumableRun:
-    """Return the run that is to go on, with a dashboard if it has none."""
+    """Return the run to resume, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
 
@@ -115,7 +115,6 @@ def _has_dashboard(experiment: Experiment) -> bool:
 
 
 def _overlay() -> Path:
-    """Return the file that is laid over an experiment to give it a dashboard."""
     from afspm.plugins.web import dashboard
 
     return Path(dashboard.__file__).with_name("assets") / "dashboard.toml"
@@ -130,7 +129,7 @@ def _print_password() -> None:
 
 
 def _people_in(file: Path) -> dict[str, str]:
-    """Return the names and hashes in a file of `--people`, with or without a leading `people.`."""
+    # keys may begin with `people.`, as `--make-password` prints them
     import tomllib
 
     from afspm.basics.errors import ConfigError
@@ -148,7 +147,7 @@ def _people_in(file: Path) -> dict[str, str]:
 
 
 def _run_here(where: Path) -> Path | None:
-    """Return the folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    # None: an experiment file without a run here; its run was started on another computer
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
 
@@ -264,7 +263,7 @@ def _recorded(folder: Path, name: str, settings: PlainMapping) -> RecordedSettin
 
 
 def _start_part(file: Path) -> int:
-    """Run the dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
+    # the scheduler runs elsewhere, so the dashboard is started as `afspm run --only` would start it
     import sys
 
     from afspm.basics.errors import ConfigError

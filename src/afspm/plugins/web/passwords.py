@@ -1,4 +1,4 @@
-"""Names and passwords of those who may look at an experiment, or steer it, over HTTP."""
+"""Names and passwords of persons who may look at an experiment, or steer it, over HTTP."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _MOST_REMEMBERED = 1000
 
 
 def hashed(password: str) -> str:
-    """Return a password as it may be written down: "scrypt:<salt>:<hash>"."""
+    """Return a password's salted hash for a file: "scrypt:<salt>:<hash>"."""
     salt = os.urandom(16)
     return f"scrypt:{_text(salt)}:{_text(_scrypt(password, salt))}"
 
 
 def matches(password: str, kept: str) -> bool:
-    """Return whether a password is the one of `kept`, a result of `hashed`."""
+    """Return whether a password belongs to `kept`, a result of `hashed`."""
     _, salt, digest = kept.split(":")
     return hmac.compare_digest(_scrypt(password, base64.b64decode(salt)), base64.b64decode(digest))
 
 
 def is_hash(text: str) -> bool:
-    """Return whether a text is what `hashed` makes."""
+    """Return whether a text has the form of `hashed`."""
     return re.fullmatch(r"scrypt:[A-Za-z0-9+/=]{24}:[A-Za-z0-9+/=]{44,88}", text) is not None
 
 
@@ -52,25 +52,25 @@ def is_loopback(host: str) -> bool:
 
 
 def check_name(name: str) -> str:
-    """Return the name of a person as it may stand in the record; empty if it may not."""
+    """Return a person's name in the form for the record; empty if it is not allowed."""
     name = " ".join(name.split())
     return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
 
 
 class Passwords:
-    """Decides whom a server lets look, and whom it believes a name.
+    """Decides whether a viewer may look, and whether a name is believed.
 
-    On loopback without passwords everybody may look, and any name is believed. Where there is a common password, only
-    those who know it may look. Where there are persons, only they have names, each with a password of the own.
+    On loopback without passwords every viewer may look, and any name is believed. With a common password, a viewer
+    needs it to look. With persons, only they have names, each with a password.
 
     Args:
-        host: the address that is listened at.
+        host: the address to listen at.
         password_hash: of the common password, see `hashed`.
         people: the hash of each person's password.
-        now_s: the time in real seconds, for how often an address may try.
+        now_s: the time in real seconds, for the rate of tries.
 
     Raises:
-        ConfigError: a hash or a name is none.
+        ConfigError: a malformed hash or name.
     """
 
     def __init__(self, host: str, password_hash: str, people: Mapping[str, str], now_s: Callable[[], float]) -> None:
@@ -96,20 +96,20 @@ class Passwords:
 
     @property
     def lets_look(self) -> bool:
-        """True if everybody may look."""
+        """True if every viewer may look."""
         return self._local and not self._hashes[""]
 
     def wait_s(self, person: str, address: str) -> float:
-        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        """Return the real seconds until another password of this person is checked from this address; 0: now."""
         with self._lock:
             tries = self._tries.get(self._prover(person, address))
             return 0.0 if tries is None else tries.wait_s(self._now_s())
 
     def proves(self, person: str, password: str, address: str) -> bool:
-        """Return whether a password is that of a person; False also if it is not looked at yet (see `wait_s`).
+        """Return whether a password is right; False also if it is not checked yet (see `wait_s`).
 
-        It takes some hundredths of a second. A password that was right before, from the same address, is right at
-        once, however often others were wrong there.
+        It takes some hundredths of a second. A password that was right before, from the same address, is accepted at
+        once, after any number of wrong tries there.
         """
         if self.is_open or (not person and self.lets_look):
             return True
@@ -133,7 +133,7 @@ class Passwords:
         return True
 
     def proof_of(self, person: str) -> str:
-        """Return what stands for a person's password: with another one it is another."""
+        """Return a text derived from a person's password, which changes with it."""
         if self.is_open:
             return ""
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()

@@ -34,8 +34,8 @@ def listening(
     """Return a socket that listens at `host`.
 
     Args:
-        port: None: the first of `wanted` that is free, or any.
-        what: listens, for the error.
+        port: None: the first free one of `wanted`, or any.
+        what: name of the server, for the error.
 
     Raises:
         ConfigError: no such address, or the port is taken.
@@ -69,7 +69,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 def url_of(host: str, port: int, *, encrypted: bool) -> str:
-    """Return where the page is found, from other computers too if it listens at all addresses of this one."""
+    """Return the page's URL, valid on other computers, too, if the server listens at all addresses."""
     with contextlib.suppress(ValueError):  # a name
         if ipaddress.ip_address(host).is_unspecified:
             host = socket.gethostname()
@@ -79,9 +79,9 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
 class _TlsListener(socket.socket):
     """A listening socket that ends connections whose TLS handshake takes too long, or is the oldest of too many.
 
-    The server learns of a connection only when its handshake is done, and asyncio waits a minute for that: a client
-    that never begins would use up the files that the process may open. (On Windows, whose event loop accepts
-    connections by itself, asyncio's minute remains.)
+    The server learns of a connection only after its handshake, and asyncio waits a minute for that: a client that never
+    begins would use up the process's file descriptors. (On Windows, whose event loop accepts connections by itself,
+    asyncio's minute remains.)
     """
 
     def __init__(self, bound: socket.socket, within_s: float) -> None:
@@ -112,7 +112,7 @@ class _TlsListener(socket.socket):
 
 
 def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -> type[asyncio.Protocol]:
-    """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
+    # uvicorn keeps a stalled client's connection for ever; this protocol disconnects it
     import h11
 
     # the one that is written in Python: it bounds the head of a request, which its C sibling takes in without end
@@ -200,11 +200,11 @@ class WebServer:
 
     Args:
         certificate, key: PEM files, for https; None: http.
-        most_requests: at a time; those beyond are answered 503. None: any number.
+        most_requests: at a time; further ones are answered by 503. None: any number.
         stalled_s, head_s: real; see `STALLED_S` and `HEAD_S`.
 
     Raises:
-        ConfigError: the files are no certificate and its key.
+        ConfigError: the files are no certificate with its key.
     """
 
     def __init__(
@@ -248,11 +248,11 @@ class WebServer:
         self._thread = threading.Thread(target=self._run, name="web", daemon=True)
 
     def start(self) -> None:
-        """Begin to serve; requests that came before are answered then."""
+        """Begin to serve; earlier requests are then answered, too."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, within seconds; whoever is connected is cut off."""
+        """Stop, within seconds; open connections are cut off."""
         self._server.should_exit = True
         self._thread.join(_STOPPED_S)
         for one in (self._listener, self._bound):

@@ -34,7 +34,7 @@ class SlowContent:
     """The parts that take longer to make.
 
     Attributes:
-        sample_map_near: only where something was measured.
+        sample_map_near: only the area of measurements.
         time_line_unfolded: with a row for each process.
     """
 
@@ -51,7 +51,7 @@ class Content:
 
     Attributes:
         trouble: why it should not be trusted; empty: it may be.
-        unheard: for how long, in ns, a process has not been told of while others are.
+        unheard: for each process without reports while others report: for how long, ns.
     """
 
     status: str = ""
@@ -73,9 +73,9 @@ class Contents:
     """Makes the content; from the page's thread.
 
     Args:
-        limits: where scans may lie at all, in tip coordinates; None if it is not known.
+        limits: the allowed region of scans, in tip coordinates; None if it is not known.
         adjustable: parameters that a person may set in AUTOMATED, too.
-        pictures: the address under which there are small pictures of scans.
+        pictures: the address of small pictures of scans.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Contents:
         self._revision = 0
 
     def get(self) -> Content:
-        """Return how it is now, or was a moment ago."""
+        """Return the content of now, or of a moment ago."""
         with self._lock:
             now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
             if revision != self._revision:
@@ -149,7 +149,7 @@ class Contents:
         )
 
     def _strip(self, overview: Overview) -> Iterator[tuple[int, str]]:
-        """Yield a picture of each scan for the time line."""
+        # a picture of each scan for the time line
         number = 0
         for one in overview.scans:
             if one.number != number and self._pictures and not one.interrupted:
@@ -169,7 +169,7 @@ def _now_ns(watch: Watch, overview: Overview) -> int:
 
 
 def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
-    """Return for how long, in ns, each process has not been told of while others are: its computer is gone."""
+    """Return for how long, in ns, each process has sent no report while others have: its computer is gone."""
     if watch.ended:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
@@ -178,7 +178,7 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
 
 
 def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
-    """Yield the processes; in a run that is over none is alive, though the last report may say so."""
+    """Yield the processes; after the run all have ended, regardless of their last report."""
     for state in overview.processes.values():
         if not watch.is_over or state.condition in OVER:
             yield state
@@ -188,7 +188,7 @@ def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
 
 
 def trouble(watch: Watch) -> str:
-    """Return why what is shown may not be how it is; empty if it is."""
+    """Return why the page may be out of date; empty if it is up to date."""
     if watch.ended:
         return "The experiment has ended. This page shows its final state."
     if not watch.connected:
@@ -231,7 +231,7 @@ def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = T
 
 
 def _has_failed(spans: Sequence[Span]) -> bool:
-    """Return whether a process was ever anything else than started once, alive and done."""
+    # a process without failure is started once, then alive, then done
     return any(span.label not in _AS_USUAL for span in spans) or any(span.label == _STARTING for span in spans[1:])
 
 
@@ -243,7 +243,7 @@ def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
 
 
 def status_html(watch: Watch, overview: Overview) -> str:
-    """Return mode, holder, the microscope's state, problems, and what time it is in the experiment."""
+    """Return mode, holder, the microscope's state, problems, and the time of the experiment."""
     control = overview.control
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
@@ -269,7 +269,6 @@ def _chip(html: str, part: str, style: str = "") -> str:
 
 
 def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
-    """Yield its state, how far the scan is, where the probe stands, and its feedback."""
     status = overview.status
     state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
     paused = " (paused)" if status and status.paused else ""
@@ -294,7 +293,7 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
 
 
 def notes_html(overview: Overview) -> str:
-    """Return the notes, that of the latest moment first."""
+    """Return the notes, latest moment first."""
     scans = {scan.time_ns: scan for scan in reversed(overview.scans)} if overview.notes else {}
     notes = sorted(overview.notes, key=lambda note: -note.time_ns)
     rows = "".join(_note(note, scans.get(note.scan_ns or 0)) for note in notes)

@@ -22,19 +22,20 @@ TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
 
 
 class Dashboard(WebComponent):
-    """Serves one page. It only subscribes, and asks through the scheduler in the names of persons; all others have the
-    processor first.
+    """Serves the page of an experiment. Persons steer through the scheduler, each under the person's name.
+
+    Other processes have the processor first.
 
     Args:
-        host: the address to listen at. At any other than this computer's own a password is needed.
-        port: 0 for any that is free; None: 8080, or any if that is taken. A restart takes the same one.
-        people: who may steer: the hash of each person's password, as `afspm dashboard --make-password` prints it.
-        password_hash: of a common password, with which one may look. The password itself may be in the environment:
+        host: the address to listen at. Any but a loopback address needs a password.
+        port: 0 for any free port; None: 8080, or any if that is taken. A restart takes the same one.
+        people: persons who may steer: the hash of each password, as `afspm dashboard --make-password` prints it.
+        password_hash: of a common password for viewers who only look. The password itself may be in the environment:
             AFSPM_DASHBOARD_PASSWORD.
         certificate, certificate_key: PEM files, for https.
 
     Raises:
-        ConfigError: others could come in without a password, the port is taken …
+        ConfigError: other computers could come in without a password, the port is taken …
     """
 
     served = "dashboard"

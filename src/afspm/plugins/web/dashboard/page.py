@@ -1,4 +1,4 @@
-"""The one page: its sections, and what keeps them up to date for one viewer."""
+"""The page: its sections, and their updates for one viewer."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ class Services:
 
     Attributes:
         title: the name of the experiment.
-        simulated: True if the microscope is none.
-        conditions: what was set when each scan began.
+        simulated: True if the microscope is simulated.
+        conditions: parameters at the start of each scan.
     """
 
     watch: Watch
@@ -84,7 +84,8 @@ class Page:
         self._timer = ui.timer(REFRESH_S, self._refresh)
 
     def _add_more(self) -> None:
-        """Add the sections that only another kind of page has."""
+        # for sections of a subclass
+        ...
 
     def _header(self) -> None:
         services = self._services
@@ -113,7 +114,7 @@ class Page:
         )
 
     async def _refresh(self) -> None:
-        """Bring the page up to date, and wait until the browser has drawn that: nothing is queued for a slow one."""
+        # waits until the browser has drawn the update, so that nothing is queued for a slow one
         if not self._services.access.is_signed_in(self._visitor):
             self._stop()
             ui.navigate.to(SIGN_IN)
@@ -134,7 +135,6 @@ class Page:
             self._stop()
 
     def _state(self, content: Content) -> dict[str, object]:
-        """Return what the browser's scripts have to know."""
         return {
             "channels": content.channels,
             "trouble": content.trouble,
@@ -161,7 +161,7 @@ class Theme:
         ui.run_javascript(f"window.afspm?.keepTheme({json.dumps(self._name)})")
 
     def remember(self, name: object) -> None:
-        """Take what the browser has kept."""
+        """Take the choice that the browser kept."""
         if isinstance(name, str) and name != self._name and name in THEMES:
             self._set(name)
 
@@ -203,7 +203,7 @@ class Sections:
                 self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
     async def show(self, content: Content) -> None:
-        """Bring all of them up to date."""
+        """Update all sections."""
         self._content = content
         self._draw()
         self._drift.show(content.slow.drift)
@@ -239,7 +239,7 @@ def section(title: str, name: str) -> Iterator[ui.element]:
 
 
 def _image_html() -> str:
-    """Return what assets/image.js brings to life."""
+    # assets/image.js finds these elements by their names
     offered = {
         "palettes": {name: name for name in PALETTES},
         "levellings": {how.value: LEVELLINGS.get(how, how.value) for how in sorted(Levelling, key=_plane_first)},

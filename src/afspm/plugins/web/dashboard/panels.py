@@ -1,4 +1,4 @@
-"""Parts of the page that keep something of their own for one viewer: the log's filter, rows of processes, spectra."""
+"""Parts of the page with state for one viewer: the log's filter, rows of processes, spectra, a note being written."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ChartPanel:
         self._chart.set_visibility(False)
 
     def show(self, chart: Chart) -> None:
-        """Bring it up to date."""
+        """Show this chart."""
         if chart == self._shown:
             return
         self._shown = chart
@@ -51,7 +51,7 @@ class ChartPanel:
 
 
 class SpectraPanel:
-    """The newest spectrum with those before it, or the one picked in the map."""
+    """The newest spectrum with earlier ones, or the one selected in the map."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -62,7 +62,7 @@ class SpectraPanel:
         ui.on("spectrum_picked", self._pick)
 
     def show(self) -> bool:
-        """Bring it up to date; returns whether there is a spectrum."""
+        """Update the chart; returns whether there is a spectrum."""
         with self._watch.reading():
             store = self._watch.spectra
             picked = None if self._picked_ns is None else store.at(self._picked_ns)
@@ -83,7 +83,7 @@ class SpectraPanel:
 
 
 class LogPanel:
-    """The log, newest lines first, filtered as one viewer wants it."""
+    """The log, newest lines first, with a filter for one viewer."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
@@ -97,7 +97,7 @@ class LogPanel:
         self._html = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0" role="log" aria-live="off"')
 
     def show(self, lines: Sequence[LogLine], names: Iterable[str]) -> None:
-        """Bring it up to date."""
+        """Show these lines."""
         every = [_EVERYTHING, *sorted({*names, *(line.name for line in lines)})]
         if every != self._name.options:
             self._name.set_options(every, value=self._name.value)
@@ -119,8 +119,8 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 
     Args:
         names: of components; empty: all.
-        level: the least that is shown.
-        text: that a line has to contain, in lower or upper case.
+        level: the lowest level shown.
+        text: filter for lines, in any case.
     """
     least = LEVELS.index(level) if level in LEVELS else 0
     wanted = [
@@ -142,7 +142,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 
 
 def _level_html(level: str) -> str:
-    """Return the level of a line that is not as usual."""
+    # INFO is the usual level, and not shown
     return "" if level == "INFO" else f"<i>{escape(level)}</i> "
 
 
@@ -156,7 +156,7 @@ class HealthPanel:
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
 
     def show(self, processes: Sequence[ProcessState], unheard: Mapping[str, int]) -> None:
-        """Bring the rows up to date; `unheard` as in `Content`."""
+        """Update the rows; `unheard` as in `Content`."""
         self._nothing.set_visibility(not processes)
         for state in processes:
             row = self._rows.get(state.name)
@@ -183,7 +183,6 @@ class HealthRow:
         self._style = ""
 
     def show(self, state: ProcessState, unheard_ns: int | None) -> None:
-        """Bring it up to date."""
         words = process_words(state, unheard_ns)
         for cell, text in zip(self._cells, words, strict=True):
             cell.set_text(text)
@@ -198,7 +197,7 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     """Return (condition, since when or busy for how long, restarts) of a process, in words.
 
     Args:
-        unheard_ns: for how long it has not been told of, if others are told of.
+        unheard_ns: time without a report, while other processes report.
     """
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {time_of_day(state.since_ns)}"
@@ -231,7 +230,6 @@ class NotesPanel:
         self._list = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
     def show(self, notes: str) -> None:
-        """Bring the list up to date."""
         self._list.set_content(notes)
 
     async def _write(self) -> None:

@@ -1,4 +1,4 @@
-"""Sessions: signed cookies, and which of them ended before their time."""
+"""Sessions: signed cookies, and a list of sessions that were ended early."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Session:
     """The content of a cookie.
 
     Attributes:
-        person: empty for one who only looks.
-        proof: stands for the password that it was begun with.
+        person: empty for a viewer who only looks.
+        proof: derived from the password at its beginning.
         generation: of the person's sessions: signing out everywhere begins the next.
-        since_s: when it began, real time.
+        since_s: its beginning, real time.
     """
 
     person: str
@@ -51,7 +51,8 @@ class Sessions:
     """Signs cookies and checks them. From any thread.
 
     Args:
-        file: keeps key and endings over a restart, readable by its owner alone; None: they end with this process.
+        file: keeps the key and ended sessions over a restart, readable by its owner alone; None: sessions end with this
+            process.
         now_s: the time in real seconds.
     """
 

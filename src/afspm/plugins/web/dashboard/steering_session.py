@@ -18,7 +18,7 @@ _CLOSE = [{"label": "Close", "color": "white"}]
 
 
 class SteeringSession:
-    """Carries out what a viewer asks for, and shows the result, with the reason of a refusal."""
+    """Carries out a viewer's actions, and shows the result, with the reason of a refusal."""
 
     def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
         self.watch = watch
@@ -39,7 +39,7 @@ class SteeringSession:
 
     @property
     def may_measure(self) -> bool:
-        """True if the viewer can ask the microscope for something."""
+        """True if the viewer can command the microscope."""
         return self.may_steer and self.content.is_manual
 
     def results(self) -> None:
@@ -92,7 +92,7 @@ async def asked(title: str, text: str, yes: str) -> bool:
 async def ask_in_dialog(
     title: str, body: Callable[[], object], yes: str, may: Callable[[], bool] = lambda: True
 ) -> bool:
-    """Ask the viewer in a dialog with a body of its own, which can only be agreed to while `may()`."""
+    """Ask the viewer in a dialog with a body of its own; the answer yes is enabled while `may()` is true."""
 
     def agree() -> None:
         if may():

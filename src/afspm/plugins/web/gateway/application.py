@@ -1,4 +1,4 @@
-"""The web application: routes by what they are about, and the same model for every refusal."""
+"""The web application: routes by subject, and one model for every refusal."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ async def _no_route(asked: Request, error: Exception) -> Response:
 
 
 def _methods(paths: Plain, path: str) -> list[str]:
-    """Return the methods of a path, of which each has a route of its own."""
+    # each method of a path is a route of its own
     for template, of_path in paths.items():
         if re.fullmatch(re.sub(r"{\w+}", "[^/]+", template), path):
             return [method.upper() for method in of_path]

@@ -1,4 +1,4 @@
-"""`Gateway`: the component that lets whatever speaks HTTP take part in an experiment."""
+"""`Gateway`: the component that lets HTTP clients take part in an experiment."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ MOST_REQUESTS = 200
 class Gateway(WebComponent):
     """Serves a JSON API over HTTP: state, parameters, scans, control, measurements, events.
 
-    Each name acts as `<gateway>:<name>`, with the roles and limits of that. Control has a lease, which the scheduler
-    keeps: a client that vanishes loses control as a process that dies does. It asks for nothing by itself; all others
-    have the processor first.
+    A client with a name acts as `<gateway>:<name>`, with the roles and limits of that name. Control has a lease, which
+    the scheduler keeps: a client that vanishes loses control as a process that dies does. Other processes have the
+    processor first.
 
     Args:
-        host: the address to listen at. At any other than this computer's own, `people` and a certificate are needed.
-        port: 0 for any that is free; None: 8090, or any if that is taken. A restart takes the same one.
-        people: who may command: the hash of each name's token, as `afspm dashboard --make-password` prints it. Without
+        host: the address to listen at. Any but a loopback address needs `people` and a certificate.
+        port: 0 for any free port; None: 8090, or any if that is taken. A restart takes the same one.
+        people: names that may command: the hash of each token, as `afspm dashboard --make-password` prints it. Without
             any, every name may, from this computer.
         certificate, certificate_key: PEM files, for https.
-        origins: of pages elsewhere that may ask, e.g. "http://localhost:3000"; by default none may.
+        origins: of pages elsewhere that may send requests, e.g. "http://localhost:3000"; by default none may.
 
     Raises:
-        ConfigError: others could come in without a token, or listen in; the port is taken …
+        ConfigError: other computers could come in without a token, or listen in; the port is taken …
     """
 
     served = "gateway"

@@ -1,4 +1,4 @@
-"""The guard before everything: where a request comes from, who asks, and how much is sent."""
+"""The guard before everything: origin, name and size of a request."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ MOST_BODY_BYTES = 64 << 10
 
 
 class GatewayGuard:
-    """ASGI middleware: checks each request, and sets scope["state"][PERSON] to the name, empty for who only looks.
+    """ASGI middleware: checks each request, and sets scope["state"][PERSON] to the name; empty: may only look.
 
     Args:
-        origins: of pages elsewhere that may ask.
+        origins: of pages elsewhere that may send requests.
     """
 
     def __init__(self, app: AsgiApp, passwords: Passwords, host: str, origins: Collection[str]) -> None:
@@ -81,7 +81,7 @@ def answer(refused: RefusedRequest) -> JSONResponse:
 
 
 class _Body:
-    """Counts what is sent, also where its length is not told before."""
+    """Limits the size of a request's body, also without a declared length."""
 
     def __init__(self, receive: Receive) -> None:
         self._receive = receive
@@ -103,7 +103,7 @@ class _Body:
 
 
 def _name_and_token(shown: str) -> tuple[str, str]:
-    """Return the parts of an Authorization header: Basic, or Bearer with the two and a colon in between."""
+    # Basic, or Bearer with name and token joined by a colon
     scheme, _, said = shown.partition(" ")
     if scheme.lower() == "basic":
         try:

@@ -1,4 +1,4 @@
-"""Routes for everybody who may look: state, parameters, scans, spectra, events."""
+"""Routes for every client that may look: state, parameters, scans, spectra, events."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _EVENTS: dict[int | str, dict[str, object]] = {
 
 
 class ParameterCache:
-    """Asks for parameters, one client for all that want the same."""
+    """Values of parameters, read from the microscope at most once a second for all clients together."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
@@ -95,7 +95,7 @@ class ParameterCache:
 
 
 class ReadingRoutes:
-    """Answers from what was published; only parameters are asked for."""
+    """Answers from published messages; only parameters and actions are read from the microscope."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
@@ -123,7 +123,7 @@ class ReadingRoutes:
         return router
 
     async def state(self, asked: Request) -> StateModel:
-        """Return what the experiment and the microscope do."""
+        """Return the state of the experiment and the microscope."""
         services, watch = self._services, self._watch
         person = services.person_of(asked)
         who = services.persons.name_of(person) if person else None
@@ -146,15 +146,15 @@ class ReadingRoutes:
             )
 
     async def parameters(self) -> list[ParameterModel]:
-        """Return the parameters that the microscope has, as they are in force."""
+        """Return the parameters of the microscope with the values in force."""
         return await self._parameters.all()
 
     async def parameter(self, name: Parameter) -> ParameterModel:
-        """Return a parameter as it is in force."""
+        """Return a parameter with its value in force."""
         return await self._parameters.one(name)
 
     async def actions(self) -> list[ActionModel]:
-        """Return the actions of the known ones that the microscope has."""
+        """Return the known actions that the microscope has."""
 
         def supported(commands: PersonCommands) -> list[str]:
             return [name for name in _ACTIONS if commands.supports(name).ok]
@@ -195,7 +195,7 @@ class ReadingRoutes:
         format: ValueFormat = ValueFormat.NPY,
         levelling: Levelling = Levelling.PLANE,
     ) -> Response:
-        """Return the values of a channel, by default the first; a picture is levelled, the others are not."""
+        """Return the values of a channel, by default the first; a picture is levelled, other formats are not."""
         channels = self._scan(which)
         wanted = next((one for one in channels if channel in ("", one.channel)), None)
         if wanted is None:
@@ -220,7 +220,7 @@ class ReadingRoutes:
             str | None, Header(pattern=r"^[0-9]{1,19}$", description="sent by EventSource")
         ] = None,
     ) -> Response:
-        """Stream what is published: from now on, or after an event."""
+        """Stream the published events: from now on, or after an event."""
         services = self._services
         if services.streams.is_full:
             raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_STREAMS} streams of events are open")

@@ -31,7 +31,7 @@ READER = ".reader"
 
 @dataclass
 class GatewayServices:
-    """The parts that the routes share, and the ways in which they ask."""
+    """The shared parts of the routes, and their ways to send requests."""
 
     watch: Watch
     bell: Bell
@@ -46,27 +46,27 @@ class GatewayServices:
     waiting: Counter[str] = field(default_factory=Counter)
 
     def person_of(self, asked: Request) -> str:
-        """Return the name that a request was sent with; empty: it only looks."""
+        """Return the name in a request; empty: it only looks."""
         person: str = getattr(asked.state, PERSON, "")
         return person
 
     def who(self, asked: Request) -> str:
-        """Return the name by which the scheduler knows who asks. Raises RefusedRequest for who has none."""
+        """Return the scheduler's name for a request's client. Raises RefusedRequest for a request without a name."""
         if not (person := self.person_of(asked)):
             raise RefusedRequest(RefusalCode.NAME_NEEDED, "what is done is in the record with a name")
         return self.persons.name_of(person)
 
     async def do(self, asked: Request, action: Callable[[PersonCommands], T]) -> T:
-        """Have an action carried out in the name of who asks. Raises RefusedRequest."""
+        """Carry out an action under the client's name. Raises RefusedRequest."""
         self.who(asked)
         return await self._carry_out(self.person_of(asked), action)
 
     async def command(self, asked: Request, action: Callable[[PersonCommands], Response]) -> Response:
-        """Carry out a request to the scheduler. Raises RefusedRequest where it is no success."""
+        """Carry out a request to the scheduler. Raises RefusedRequest if it is unsuccessful."""
         return _success(await self.do(asked, action))
 
     async def read(self, action: Callable[[PersonCommands], T]) -> T:
-        """Have the microscope asked for what anybody may know."""
+        """Carry out an action that only reads, under the gateway's own name for readers."""
         return await self._carry_out(READER, action)
 
     async def _carry_out(self, person: str, action: Callable[[PersonCommands], T]) -> T:
