@@ -5,8 +5,8 @@
         scope = Microscope("runs", parameters=["tip-bias-voltage"])
     RE(bp.scan([scope.scan], scope.scan.center_x, -1e-6, 1e-6, 5))
 
-The scheduler decides as it does for a notebook: a plan waits for control, limits hold, a repair of the tip comes first.
-While a plan has staged the microscope, it keeps control. A plan that is aborted stops what is being measured.
+The scheduler treats a plan like a notebook: the plan waits for control, limits hold, a repair of the tip comes first. A
+plan keeps control while it has staged the microscope. An aborted plan stops its measurement.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _PlanSession:
         self._running: Future[Any] | None = None
 
     async def call(self, ask: Callable[[Scope], T]) -> T:
-        """Return what the scope answers. A task that is cancelled meanwhile interrupts the call."""
+        """Call the scope in its thread and return the result. Cancelling the task interrupts the call."""
         self._running = asked = self._thread.submit(self._ask, ask)
         try:
             return await asyncio.wrap_future(asked)
@@ -65,7 +65,7 @@ class _PlanSession:
             raise
 
     def interrupt(self) -> None:
-        """End the call that is under way: a measurement is stopped."""
+        """End the current call, which stops a measurement."""
         if self._scope is not None and self._running is not None and not self._running.done():
             self._scope.interrupt()
 
@@ -125,7 +125,7 @@ class _ParameterBackend(SignalBackend[float]):
 
 
 class _Measurement(StandardReadable, Triggerable):
-    """Something that is measured where its signals say, with an array for each channel or variable."""
+    """A measurement at the place of its signals, with an array for each channel or variable."""
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
         self._session = session
@@ -142,7 +142,7 @@ class _Measurement(StandardReadable, Triggerable):
         return told | {f"{self.name}-{field}": reading for field, reading in self._readings.items()}
 
     async def _measured(self, ask: Callable[[Scope], T]) -> T | None:
-        """Return what was measured; None: the plan was aborted, and the measurement stopped."""
+        # None: the plan was aborted, and the measurement stopped
         self._keys, self._readings = {}, {}
         try:
             return await self._session.call(ask)
@@ -167,7 +167,8 @@ class _Measurement(StandardReadable, Triggerable):
 class ScanDevice(_Measurement):
     """A scan: `trigger` takes it, and reading it gives all channels, [y, x] with both ascending.
 
-    Signals `center_x`, `center_y`, `size_x`, `size_y` (m) and `angle` (rad) say where, `rows` and `columns` how fine.
+    Signals `center_x`, `center_y`, `size_x`, `size_y` (m) and `angle` (rad) set the region, `rows` and `columns` its
+    pixels.
     """
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
@@ -221,9 +222,9 @@ class Microscope(StandardReadable):
 
     Args:
         where: the folder of the run, of all runs, or the experiment file, as for `afspm.connect`.
-        parameters: generic names of those that are to be signals: "tip-bias-voltage" becomes `tip_bias_voltage`. All
-            are in SI units.
-        client: what others see as the holder of control.
+        parameters: generic names of the parameters that become signals: "tip-bias-voltage" becomes `tip_bias_voltage`.
+            All are in SI units.
+        client: the name of the holder of control, as the experiment shows it.
 
     Attributes:
         scan: a `ScanDevice`; spectrum: a `SpectrumDevice`.
@@ -248,7 +249,7 @@ class Microscope(StandardReadable):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """Stop what is being measured, and give control back."""
+        """Stop the current measurement, and release control."""
         self._session.interrupt()
         await self._session.call(lambda _: self._held.close())
 

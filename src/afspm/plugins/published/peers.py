@@ -1,4 +1,4 @@
-"""Components of the published implementation in an experiment of ours, and our microscope for their scheduler."""
+"""Components of the published implementation in an afspm experiment, and afspm's microscope for their scheduler."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ _NAMELESS = b"a client without a name: set the socket's identity to the componen
 
 
 class PublishedPeers:
-    """Lets components of the published implementation take part: they find here the scheduler that they know.
+    """Lets components of the published implementation join, by playing the scheduler that they expect.
 
-    Each is to our scheduler a client of its own, by its own name.
+    The afspm scheduler sees each of them as a client with its own name.
 
     Args:
         serve: the address that their control clients connect to.
         publish: the address that their subscribers connect to.
-        as_translator: stand for the translator instead: for their scheduler, or their suite of tests. Packets then have
-            a translator's envelopes, and this process takes control before each command.
+        as_translator: play the translator instead, for their scheduler or their test suite. Packets then have a
+            translator's envelopes, and this process takes control before each command.
     """
 
     opens_plain: ClassVar[bool] = True
@@ -65,7 +65,7 @@ class PublishedPeers:
         self._as_translator = as_translator
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or the parent lets go."""
+        """Run until the experiment ends or the parent is gone."""
         port = _PeersPort(context, self._serve, self._publish, as_translator=self._as_translator)
         context.when_stopping(lambda: port.wake_up(ParentGone()))
         try:
@@ -82,11 +82,11 @@ class PublishedPeers:
 
 
 class _PeerClient:
-    """One client of our scheduler, for one peer; or, in place of a translator, for all peers.
+    """One client of the afspm scheduler for one peer; or, in place of a translator, for all peers.
 
     Attributes:
-        asked: requests without an answer, by id: the peer's identity, the number, and what was sent.
-        admitted: the scheduler has answered in this name; else a failure is about the name itself.
+        asked: requests without an answer, by id: the peer's identity, the number, and the frames sent.
+        admitted: the scheduler has answered under this name before; until then a failure concerns the name itself.
         leaves: the peer is gone, and its last request is not answered yet.
     """
 
@@ -156,20 +156,20 @@ class _PeersPort(BasePort[Incoming]):
         self._listen(version_1.TOPICS)
 
     def next_id(self, name: str) -> str:
-        """Return an id for a request in a name, not used before."""
+        """Return an unused id for a request under a name."""
         return f"{name}/{self._session}/{next(self._numbers)}"
 
     def due_in_s(self) -> float | None:
-        """Return how long to wait for messages at most."""
+        """Return the longest time to wait for messages; None: no limit."""
         due_s = min(self._outlet.due_s, self._ends_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment has ended, and answers have had time to go out."""
+        """Return whether the experiment has ended, and the time for last answers, too."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def publish_due(self) -> None:
-        """Replay to late joiners, then publish what is due."""
+        """Replay to late joiners, then publish due packets."""
         self._outlet.publish_due()
 
     def answer(self, client: _PeerClient, identity: bytes, asked: int, response: Response) -> None:
@@ -233,7 +233,7 @@ class _PeersPort(BasePort[Incoming]):
         return client
 
     def _name_inside(self, identity: bytes) -> str:
-        """The name by which the scheduler knows a peer; with keys, this process acts for it."""
+        # with keys, this process acts for the peer as for a person
         if self._as_translator:
             return self.launch.name
         name = identity.decode("utf-8", "replace")
@@ -247,7 +247,7 @@ class _PeersPort(BasePort[Incoming]):
         return []
 
     def _changes(self) -> set[int]:
-        """Take in which connections went, and return their descriptors."""
+        # returns the descriptors of connections that were lost
         gone: set[int] = set()
         for kind, descriptor in self._monitor.drain():
             self._disconnected(descriptor)
@@ -292,7 +292,7 @@ class _PeersPort(BasePort[Incoming]):
             self._poller.register(subscriber.monitor.socket, subscriber.follow)
 
     def take(self, incoming: Incoming) -> None:
-        """Process what our scheduler publishes."""
+        """Process a packet or the end from the afspm scheduler."""
         match incoming:
             case PacketReceived(packet, _):
                 self._take_packet(packet)
@@ -317,7 +317,7 @@ class _PeersPort(BasePort[Incoming]):
         self._outlet.pacing.put(Packet(envelope, packet.payload, packet.time_ns), message, state)
 
     def _with_names_outside(self, packet: Packet) -> Packet:
-        """A peer in control finds the name that it knows itself by."""
+        # a peer compares the holder of control with its own name
         prefix = f"{self.launch.name}{PERSON}"
         told = wire.decode(CONTROL_STATE.name, packet.payload)
         if told.holder is None or not told.holder.startswith(prefix):
@@ -327,10 +327,10 @@ class _PeersPort(BasePort[Incoming]):
 
 
 class _Outlet:
-    """Publishes to SUB sockets: paced, and first what was published before.
+    """Publishes to SUB sockets: first a replay to late joiners, then paced packets.
 
     Attributes:
-        pacing: takes what is to be published.
+        pacing: the queue of packets to publish.
     """
 
     def __init__(
@@ -347,11 +347,11 @@ class _Outlet:
 
     @property
     def due_s(self) -> float:
-        """When something goes out; infinity: nothing waits."""
+        """Time of the next publication; infinity: nothing waits."""
         return min(self.pacing.due_s, self._replay_s)
 
     def subscriptions(self) -> list[str]:
-        """Take in who subscribed; return the prefixes that are meant."""
+        """Process new subscriptions; return the prefixes that they mean."""
         meant: list[str] = []
         while frames := receive_frames(self.socket):
             kind, subscription = frames[0].bytes[:1], frames[0].bytes[1:]
@@ -373,7 +373,7 @@ class _Outlet:
         return meant
 
     def publish_due(self) -> None:
-        """Replay to late joiners, then publish what is due."""
+        """Replay to late joiners, then publish due packets."""
         now_s = self._clock.monotonic_s()
         if now_s >= self._replay_s:
             prefixes, self._joined, self._replay_s = tuple(self._joined), set(), math.inf
@@ -383,7 +383,7 @@ class _Outlet:
             self._publish(packet)
 
     def end(self) -> None:
-        """Publish all that waits, and that the experiment has ended."""
+        """Publish all waiting packets, and the end of the experiment."""
         for packet in self.pacing.take_all():
             self._publish(packet)
         self.socket.send(wire.KILL)
@@ -396,7 +396,7 @@ class _Outlet:
 
 
 class _Receiver:
-    """Hands what one subscriber receives to the bridge."""
+    """Hands messages of one subscriber to the bridge."""
 
     def __init__(self, bridge: _PeersPort, subscriber: Subscriber) -> None:
         self._bridge, self._subscriber = bridge, subscriber

@@ -1,4 +1,4 @@
-"""Our components under a scheduler of the published implementation."""
+"""Components of afspm under a scheduler of the published implementation."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MOST_ANSWERS: Final = 256
 
 
 class PublishedScheduler:
-    """Stands for a scheduler of the published implementation, which decides who is in control.
+    """Stands for a scheduler of the published implementation, which arbitrates control.
 
     Args:
         serve: the address of its router.
@@ -62,7 +62,7 @@ class PublishedScheduler:
         self._serve, self._publish = serve, publish
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or the parent lets go."""
+        """Run until the experiment ends or the parent is gone."""
         stopping = threading.Event()
         port = _SchedulerPort(context, self._serve, self._publish)
 
@@ -84,8 +84,8 @@ class _ClientOutside:
     """The connection of one client to their scheduler.
 
     Attributes:
-        connection: the newest by which the client has asked.
-        asked: requests sent and not answered, oldest first: a REQ socket has one at a time.
+        connection: the newest connection of the client.
+        asked: requests without an answer, oldest first: a REQ socket has one at a time.
         answers: to the latest requests, by id.
     """
 
@@ -103,7 +103,7 @@ class _ClientOutside:
         self._is_sent = False
 
     def ask(self, request: Request) -> None:
-        """Send a request once those before it are answered; one that is repeated gets the answer that it had."""
+        """Send a request once earlier ones are answered; repeat the known answer to a repeated one."""
         if request.id and request.id in self.answers:
             self._bridge.reply(self, self.answers[request.id])
         elif not request.id or all(request.id != one.id for one in self.asked):
@@ -160,7 +160,7 @@ class _ClientOutside:
 
 
 class _SchedulerPort(BasePort[Incoming]):
-    """All sockets of the process: outside those of a client for each of ours, inside those of a scheduler."""
+    """All sockets of the process: outside one for each client of afspm, inside the sockets of a scheduler."""
 
     def __init__(self, context: ProcessContext, serve: str, publish: str) -> None:
         launch = context.launch
@@ -186,16 +186,16 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.register(self._monitor.socket, self._connected)
 
     def due_in_s(self) -> float | None:
-        """Return how long to wait for messages at most."""
+        """Return the longest time to wait for messages; None: no limit."""
         due_s = min(self._ends_s, self._opens_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment has ended, and answers have had time to go out."""
+        """Return whether the experiment has ended, and the time for last answers, too."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def open_when_cached(self) -> None:
-        """Let our components in, once their scheduler has had time to send its cache."""
+        """Let afspm's components in, once their scheduler has had time to send its cache."""
         if self._clock.monotonic_s() >= self._opens_s and self.launch.sockets.serve is not None:
             self._opens_s = math.inf
             self._router = Router(self._network, self.launch.sockets.serve, self._warnings, self._clock)
@@ -203,7 +203,7 @@ class _SchedulerPort(BasePort[Incoming]):
             self._poller.register(self._router.monitor.socket, self._requests)
 
     def known_answer(self, request: Request) -> Response | None:
-        """Return the answer to a request that would end their scheduler; None: it is asked."""
+        """Return the answer to a request that would end their scheduler; None: it may be sent."""
         if not version_1.has_request(request.kind):
             return version_1.unknown_request(request.kind, "scheduler", request.id)
         if request.kind == ControlRequest.RMV_EXP_PRBLM and request.subject not in self._flagged | self._unpublished:
@@ -211,7 +211,7 @@ class _SchedulerPort(BasePort[Incoming]):
         return None
 
     def note(self, request: Request, response: Response) -> None:
-        """Remember which problems are flagged."""
+        """Remember flagged problems."""
         if response.ok and request.kind == ControlRequest.ADD_EXP_PRBLM:
             self._unpublished.add(int(request.subject))
         elif response.ok and request.kind == ControlRequest.RMV_EXP_PRBLM:

@@ -1,4 +1,7 @@
-"""Version 1 of the protocol: what its programs can read. All else ends them."""
+"""Version 1 of the protocol: the messages that its programs can read, and the pace at which they can follow.
+
+Any other envelope or request number ends them.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,7 @@ def has_request(number: int) -> bool:
 
 
 def request_frames(request: Request) -> list[bytes]:
-    """Return a request in the frames of version 1: number, and the object of a request that has one, be it empty."""
+    """Return a request in the frames of version 1: its number, and its object (possibly empty) if it takes one."""
     number = bytes([request.kind])
     return [number] if request.kind in _WITHOUT_OBJECT else [number, request.payload or encode_subject(request.subject)]
 
@@ -63,8 +66,8 @@ def answer_frames(asked: int, response: Response, *, reason: bool = False) -> li
     """Return a response in the frames of version 1: number and object.
 
     Args:
-        asked: the number of the request; the answer to REQ_PARAM always has an object, be it empty.
-        reason: add the reason as a third frame, for a person who looks at what came.
+        asked: the number of the request; the answer to REQ_PARAM always has an object, possibly empty.
+        reason: add the reason as a third frame, for debugging.
     """
     if reason:
         return encode_response(response)[:3]
@@ -73,13 +76,13 @@ def answer_frames(asked: int, response: Response, *, reason: bool = False) -> li
 
 
 def unknown_request(number: int, whose: str, request_id: str) -> Response:
-    """Return the answer to a request that is not sent outside, where its number would end the peer."""
+    """Return the answer to a request whose number would end the peer, so that it is not sent outside."""
     reason = f"the {whose} is of version 1 of the protocol, which has no request {number}"
     return Response(int(ControlResponse.CMD_NOT_SUPPORTED), b"", reason, request_id)
 
 
 def topics_meant(prefix: str) -> list[str]:
-    """Return the prefixes that a subscription of version 1 means: a common beginning stands for messages it knows.
+    """Return the prefixes that a subscription of version 1 means: a common beginning stands for the messages it knows.
 
     >>> topics_meant("Scan")
     ['Scan2d', 'ScanParameters2d']
@@ -90,10 +93,10 @@ def topics_meant(prefix: str) -> list[str]:
 
 
 class Pacing:
-    """Keeps packets in order, and each back until its predecessor has been seen.
+    """Delays packets for peers that process one message per poll and see only the last state; keeps their order.
 
     Scans go out `PAUSE_S` apart. The state after SS_MOVING or SS_INTERRUPTED goes out `PAUSE_S` after it, and after the
-    last settings that came in between. Above `MOST_WAITING` packets the oldest go out at once.
+    last settings in between. Above `MOST_WAITING` packets the oldest go out at once.
     """
 
     def __init__(self) -> None:
@@ -103,11 +106,16 @@ class Pacing:
         self._passes = False
 
     def put(self, packet: Packet, message: str, state: ScopeState | None) -> None:
-        """Add a packet; `state` is the one that it publishes."""
+        """Add a packet.
+
+        Args:
+            message: its kind.
+            state: the state in a ScopeStateMsg; None for others.
+        """
         self._waiting.append((packet, message, state))
 
     def hold(self, until_s: float) -> None:
-        """Keep everything back until then: a late joiner is still to get what went out before."""
+        """Hold all packets until then: a late joiner still has to get earlier ones."""
         self._held_until_s = max(self._held_until_s, until_s)
 
     def take(self, now_s: float) -> list[Packet]:
@@ -127,7 +135,7 @@ class Pacing:
 
     @property
     def due_s(self) -> float:
-        """When the next packet goes out; infinity: none waits."""
+        """Time of the next packet; infinity: none waits."""
         if not self._waiting:
             return math.inf
         _, message, state = self._waiting[0]
