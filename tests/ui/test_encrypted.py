@@ -1,4 +1,4 @@
-"""With a certificate and a password, as from another computer: what is seen and what is done goes over https."""
+"""Viewing and steering over https with a certificate and a password, as from another computer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""However much is published, the page shows the newest, and takes no more memory for it."""
+"""At any rate of messages the page shows the newest, and its memory does not grow."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def page(browser: Any, stage: Stage) -> Iterator[Any]:
 
 
 def heap_bytes(page: Any) -> float:
-    """Of the page's JavaScript, without what is garbage."""
+    """Return the size of the page's JavaScript heap, without garbage."""
     session = page.context.new_cdp_session(page)
     session.send("HeapProfiler.collectGarbage")
     return float(session.send("Runtime.getHeapUsage")["usedSize"])
@@ -60,7 +60,7 @@ def test_at_full_speed_the_newest_is_shown_and_the_rest_left_out(stage: Stage, p
 
 
 def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -> None:
-    """As many messages as 8 hours bring at one line, state and word every 4 s, in seconds; twice, to compare."""
+    """As many messages as in 8 hours with one line, state and log line every 4 s, within seconds; twice, to compare."""
     sizes = []
     for half in range(2):
         for i in range(3600):

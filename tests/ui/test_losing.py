@@ -1,4 +1,4 @@
-"""The dashboard may be killed, the scheduler too, and the experiment ends: the page says so each time."""
+"""The page shows a killed dashboard, a killed scheduler, and the end of the experiment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page outlives the experiment: the night can be looked through, and notes can be written, when it is over."""
+"""After the experiment the page stays: the night can be looked through, and notes can be written."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLACES = "new Set([...document.querySelectorAll('.map [data-time]')].map((shape)
 
 @pytest.fixture(scope="module")
 def ended(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    """A night of a few scans that a person has looked at, and that has ended; the page stays."""
+    """A night of a few scans that a person has viewed, and that has ended; the page stays."""
     night = Night(tmp_path_factory.mktemp("ended"), speed=600.0, more=MORE, options=("--stay",))
     try:
         context = browser.new_context()
@@ -77,7 +77,7 @@ def record(night: Night) -> Run:
 
 
 def look_at(page: Any, night: Night, number: int) -> int:
-    """Go to the moment when a scan was finished; its time."""
+    """Go to the moment at which a scan was finished; return its time."""
     with record(night) as run:
         time_ns = run.numbered(number).time_ns
     page.wait_for_function("window.afspm?.scrubber")

@@ -1,4 +1,4 @@
-"""Each button does what it says, in the name of the person, as the scheduler's own messages tell."""
+"""Each button has its effect, in the name of the person, as the scheduler's own messages show."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ADA = "dashboard:Ada"
 
 @pytest.fixture
 def page(night: Night, opened: Opened) -> Iterator[Any]:
-    """The page of somebody who has signed in, in AUTOMATED mode."""
+    """The page of a person who has signed in, in AUTOMATED mode."""
     page = opened(night.url, person="Ada")
     page.wait_for_selector("button:has-text('Take over')")
     yield page
@@ -36,13 +36,13 @@ def take_over(page: Any, night: Night) -> None:
 
 
 def seen(night: Night) -> int:
-    """How many journal entries there are, to look only for those after."""
+    """Return the number of journal entries, to look only for later ones."""
     night.follower.pump(0.0)
     return len(night.follower.overview.entries)
 
 
 def said(page: Any, text: str) -> None:
-    """Wait until the page says so."""
+    """Wait until the page contains a text."""
     page.wait_for_selector(f".outcomes >> text={text}")
 
 

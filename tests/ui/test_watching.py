@@ -1,4 +1,4 @@
-"""What is shown is what was published."""
+"""The page shows the published data."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
 
 @pytest.fixture(scope="module")
 def scan(night: Night) -> Iterator[Scan]:
-    """A scan of many pixels, turned, longer than wide: nothing in it is the same when mirrored."""
+    """A rotated scan of many pixels, longer than wide: every mirror image of it differs."""
     with afspm.connect(night.folder, "tester") as scope:
         yield scope.scan(TURNED, shape=(48, 72), timeout_s=60.0).first
 
 
 def shown(page: Any, scan: Scan) -> Any:
-    """The canvas, once it shows the scan."""
+    """Return the canvas, once it shows the scan."""
     page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{scan.time_ns}'")
     return page.locator(".picture")
 
 
 def drawn(page: Any) -> str:
-    """Wait for a picture; its time."""
+    """Wait for a picture; return its time."""
     page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
     return str(page.get_attribute(".picture", "data-time"))
 

@@ -1,4 +1,4 @@
-"""The probability that a match is wrong: what raises it, what is said of it, and how it is fitted."""
+"""The probability that a match is wrong: its dependence on the evidence, its text, and its fit."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_refusal_names_what_speaks_most_against_the_match_and_how_likely_it_is
 
 
 def test_the_fit_tells_probabilities_that_are_right() -> None:
-    """Of matches of which only the agreement of their parts says whether they are wrong."""
+    """Matches that are right or wrong depending only on the agreement of their parts."""
     random = np.random.default_rng(2)
     outcomes, told = [], []
     for seed in range(3000):

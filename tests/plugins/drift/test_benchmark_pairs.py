@@ -1,4 +1,4 @@
-"""The benchmark's pairs are what they say, and its bounds are those of the noise that is in them."""
+"""The benchmark's pairs match their truth, and its bounds match their noise."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ QUIET: dict[str, Any] = {
 
 
 def found_at(scan: DriftScan, xy_m: Array) -> Array:
-    """Heights at positions (2, …) in tip coordinates, by the scan's own pixels."""
+    """Return heights at positions (2, …) in tip coordinates, interpolated from the scan's pixels."""
     ny, nx = scan.values.shape
     x_m, y_m = scan.region.pixels_m((ny, nx))
     column = (xy_m[0] - x_m[0, 0]) / scan.pixel_m[0]
@@ -100,7 +100,7 @@ def test_a_prior_is_wrong_by_its_standard_deviation() -> None:
 
 
 def test_no_view_of_a_lattice_is_without_a_defect() -> None:
-    """Without one, its sites are all alike, and a displacement between them has no truth that could be found."""
+    """Without a defect all sites are alike, and the displacement between two views has no determinable truth."""
     grid = Grid(64.0)
     every_atom_px = 10  # a square of that side has at least one in it
     for seed in range(12):
@@ -126,7 +126,7 @@ def test_noise_has_the_size_it_is_said_to_have() -> None:
 
 @pytest.mark.parametrize("surface", SURFACES)
 def test_maximum_likelihood_reaches_the_bound_of_white_noise(surface: str) -> None:
-    """One noisy image against the exact surface: half of C, had both images the whole overlap."""
+    """One noisy image against the exact surface: half of C, if both images had the whole overlap."""
     made = pair(surface, "white10", seed=5, size=80)
     frame, random = made.frames[1], np.random.default_rng(7)
     sample = frame.sample_px(frame.offsets_px())
@@ -145,7 +145,7 @@ def test_maximum_likelihood_reaches_the_bound_of_white_noise(surface: str) -> No
 
 
 def test_row_noise_is_as_the_bound_takes_it() -> None:
-    """The errors of the best linear estimate scatter as its information says."""
+    """The errors of the best linear estimate scatter as predicted by its information."""
     how = replace(CONDITIONS["real"], scars=0.0)
     made = pair("particles", "real", seed=5)
     frame, random = made.frames[0], np.random.default_rng(3)
@@ -186,7 +186,7 @@ def test_the_best_estimate_of_an_unknown_ground_is_as_much_worse_as_the_bound_sa
 
 
 def test_the_published_estimator_is_as_inexact_and_as_trusting_as_it_was_measured() -> None:
-    """0.13 px on rough ground; and scans that have nothing in common are accepted."""
+    """0.13 px on rough ground; and unrelated scans are accepted."""
     pytest.importorskip("skimage")
     trials = [Trial("", "rough", "real", seed, (PUBLISHED,)) for seed in range(8)]
     found = Cell.of(outcome for trial in trials for outcome in trial.run())

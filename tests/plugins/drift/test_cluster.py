@@ -1,4 +1,4 @@
-"""Tasks and studies on a Dask cluster, which is started once for all of these."""
+"""Tasks and studies on a Dask cluster, started once for all of these tests."""
 
 from __future__ import annotations
 

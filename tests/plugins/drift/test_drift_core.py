@@ -1,4 +1,4 @@
-"""Scans wait until they are registered, whatever the worker does; and what is done about what they tell."""
+"""Scans wait for their registration, also if the worker fails or hangs; and the responses to its reports."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_all_channels_of_a_scan_wait_for_it_and_get_the_same_mapping(lab: Lab) -
 
 @pytest.mark.parametrize("channels", [("ADC", "Topo", "Topo Retrace"), ("Topo", "Topo Retrace", "ADC", "ADC Retrace")])
 def test_channels_that_come_in_files_of_their_own_are_of_one_scan(lab: Lab, channels: tuple[str, ...]) -> None:
-    """As GXSM writes them."""
+    """GXSM writes each channel into its own file."""
     lab.take_control()
     lab.scope_is(ScopeState.SCANNING)
     lab.now_s += 256.0
@@ -91,7 +91,7 @@ def test_heights_without_values_are_not_registered(lab: Lab) -> None:
 
 
 def test_the_middle_of_a_scan_is_between_its_beginning_and_its_own_end(lab: Lab) -> None:
-    """However late its file comes."""
+    """A late file does not move the middle."""
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s
     end_s = began_s + 200.0
@@ -281,7 +281,7 @@ def test_the_direction_of_a_scan_is_that_in_force_when_it_began(lab: Lab, direct
 
 
 def test_that_it_scans_is_told_again_and_the_scan_began_when_it_did(lab: Lab) -> None:
-    """To a scheduler that was started anew, say."""
+    """For example to a restarted scheduler."""
     set_direction(lab, "up")
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s
@@ -426,7 +426,7 @@ def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
 
 
 def test_a_person_is_called_though_correction_has_not_begun_yet() -> None:
-    """When it begins, nobody would correct anything."""
+    """When correction begins, no worker would do it."""
     lab = Lab(DriftCompensationSettings(correct_after=1000.0))
     lab.in_force()
     for _ in range(MOST_ENDS):
@@ -547,7 +547,7 @@ def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None
 
 
 def test_what_the_controller_compensates_is_what_is_reckoned_with_from_the_start_on() -> None:
-    """Not what was left of the night before; and after its restart what it was told before."""
+    """At first nothing, whichever rate an earlier night has left; after a restart the rate before it."""
     drift = DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y"))
     lab = Lab(drift, answer_start=False)
     told = []
@@ -610,7 +610,7 @@ def test_a_packet_that_is_no_scan_is_passed_on_as_it_is(lab: Lab) -> None:
 
 
 def test_the_plain_scheduler_s_answers_are_the_same(lab: Lab) -> None:
-    """A drop-in: what is not about places is decided by the same core."""
+    """A drop-in: requests without places are decided by the same core."""
     lab.step(RequestIn(99, "stranger", Request(int(ControlRequest.ACTION), names.START_SCAN, b"", "stranger/1/1")))
     assert lab.replies()[-1].code == ControlResponse.NOT_IN_CONTROL
 
@@ -633,13 +633,13 @@ SEEN, BADLY = RegistrationOutcome.REGISTERED, RegistrationOutcome.REFUSED
 
 
 def taken(lab: Lab, outcome: RegistrationOutcome, *failures: str) -> None:
-    """A scan, registered with this outcome."""
+    """Publish a scan, registered with this outcome."""
     lab.scan()
     lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), outcome=outcome, failures=failures))
 
 
 def test_a_scan_that_could_not_be_registered_has_a_mapping_too(lab: Lab) -> None:
-    """Else no table, and no count, would show it."""
+    """Without it neither the table nor the counts would show the scan."""
     lab.knows(forecast(DRIFT, rate_sd_m_s=1e-12))
     lab.scan()
     (job,) = lab.worker.jobs

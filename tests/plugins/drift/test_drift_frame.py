@@ -1,4 +1,4 @@
-"""Components speak of the sample: each request and packet is mapped, whole, both ways."""
+"""Components use sample coordinates: each request and packet is mapped, as a whole place, both ways."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ THERE = Region((1e-6, 2e-6), (1e-6, 0.5e-6), math.radians(30.0))
 
 @pytest.fixture
 def lab() -> Lab:
-    """The sample has moved by DRIFT, and somebody is in control."""
+    """The sample has moved by DRIFT, and a component is in control."""
     made = Lab()
     made.in_force()
     made.take_control()
@@ -43,7 +43,7 @@ def lab() -> Lab:
 
 
 def set_region(lab: Lab, region: Region | RegionChange | None, shape: tuple[int, int] | None = None) -> ScanParameters:
-    """What the microscope is asked for, and does."""
+    """Request a region and let the microscope set it; return the request that reached the microscope."""
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape))
     forward = lab.sent()
     assert forward.request.kind == ControlRequest.SET_SCAN_PARAMS
@@ -107,7 +107,7 @@ def test_pixels_alone_move_nothing(lab: Lab) -> None:
 
 
 def test_what_was_asked_for_is_given_back_to_the_last_bit(lab: Lab) -> None:
-    """In the unit in which it was asked for, too, though the controller rounds."""
+    """Also in the unit of the request, though the controller rounds."""
     from afspm.wire.generated.scan_pb2 import ScanParameters2d
 
     message = ScanParameters2d()
@@ -469,7 +469,7 @@ def test_correction_that_begins_later_goes_back_to_where_the_sample_was() -> Non
 
 
 def test_an_action_that_was_sent_before_a_kill_is_asked_for_again_without_a_move(lab: Lab) -> None:
-    """It may have been done: the microscope is busy with it then, and would refuse to be moved."""
+    """The action may have begun: the busy microscope would refuse a move."""
     set_region(lab, HERE)
     lab.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
     assert lab.sent().request.id == "series/life/go"

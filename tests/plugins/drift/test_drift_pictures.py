@@ -1,4 +1,4 @@
-"""The figures of a drifting night, from what was told and what was saved."""
+"""The figures of a drifting night, from the published mappings and the saved files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a figure looks like is not asked here."""
+    """Draw coarsely: the look of a figure is not tested here."""
     monkeypatch.setattr("afspm.plugins.drift.figures.style.DPI", 30)
     monkeypatch.setattr("afspm.plugins.drift.figures.style.LAYOUT", None)
 
@@ -45,7 +45,7 @@ def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -
 
 @cache
 def scanned() -> list[tuple[bytes, Region, float]]:
-    """Nine scans, from the fourth on in a frame that follows the sample: as saved, where, and when."""
+    """Return nine scans, from the fourth on in a frame that follows the sample: as saved, where, and when."""
     world = World.from_settings(SETTINGS, seed=1, start_s=0.0)
     found = []
     for k in range(9):
@@ -59,7 +59,7 @@ def scanned() -> list[tuple[bytes, Region, float]]:
 
 
 def saved(folder: Path) -> list[tuple[Path, Region, float]]:
-    """The files of the scans, and what is true of them."""
+    """The files of the scans, and their truth."""
     (folder / "scans").mkdir()
     found = []
     for k, (content, region, middle_s) in enumerate(scanned()):
@@ -72,7 +72,7 @@ def saved(folder: Path) -> list[tuple[Path, Region, float]]:
 
 
 def mapping(path: Path, region: Region, middle_s: float, *, correcting: bool) -> object:
-    """What the scheduler would tell that follows it without an error."""
+    """Return the mapping of a scheduler that follows the sample without error."""
     velocity = np.array(SETTINGS["drift"]["velocity_m_per_s"][:2])
     drift = velocity * (middle_s - PIXELS / 2)
     message = wire.message_type("DriftMapping")(
@@ -199,7 +199,7 @@ def test_a_channel_that_is_not_there_is_told_at_once(tmp_path: Path, caplog: pyt
 
 
 def true_m(folder: Path, *at: tuple[float, tuple[float, float]]) -> object:
-    """What was true of scans at times and places."""
+    """Return the true drift at times and places."""
     places = [(mid_s, Region(center_m, (1e-6, 1e-6))) for mid_s, center_m in at]
     return true_drift(folder, [DriftScan(np.zeros((4, 4)), region, mid_s, mid_s) for mid_s, region in places])
 

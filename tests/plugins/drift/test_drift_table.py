@@ -1,4 +1,4 @@
-"""The table of drift: what a row says, and that none is there twice."""
+"""The table of drift: the content of a row, and no duplicate rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The worker: what it knows survives a kill, and what a user's own estimator does stays in there."""
+"""The worker: its state survives a kill, and a user's own estimator can't harm the scheduler."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def job(number: int, x: int, y: int, asked: Region | None = None) -> ScanJob:
 
 
 def drift_scan(number: int, x: int, y: int) -> tuple[str, DriftScan]:
-    """The key and the scan, for `Estimation.register`."""
+    """Return the key and the scan, for `Estimation.register`."""
     end_s = number * 100.0 + 50.0
     return f"{number}.nc 0", DriftScan(picture(x, y), HERE, number * 100.0, end_s, None, f"{number}.nc")
 
@@ -140,7 +140,7 @@ def test_what_is_stored_is_no_code(tmp_path: Path) -> None:
 
 
 class Heard:
-    """What a worker's process has said, waited for."""
+    """Waits for reports of a worker's process."""
 
     def __init__(self, registrar: DriftWorkerProcess) -> None:
         self.registrar = registrar
@@ -277,7 +277,7 @@ def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatc
 
 
 def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: Path) -> None:
-    """Else it would write the state that the worker of the next scheduler reads."""
+    """Otherwise it would write the state that the worker of the next scheduler reads."""
     program = """
         import logging, sys, time
         from afspm.plugins.drift.scheduler.messages import StartWorker

@@ -1,4 +1,4 @@
-"""Estimators by name, users' own, and that none of them can do harm."""
+"""Estimators by name, a user's own, and protection from their errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FOUND = Registration(
 
 
 class Told:
-    """An estimator that says what it was told to."""
+    """An estimator with a given result."""
 
     def __init__(self, answer: Any = FOUND, gain: float = 1.0) -> None:
         if gain < 0.0:

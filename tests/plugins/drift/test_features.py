@@ -1,4 +1,4 @@
-"""Estimators by features and by correlation: right where there is something to find, refused where there is not."""
+"""Estimators by features and by correlation: right for common features, refused without them."""
 
 from __future__ import annotations
 
@@ -226,7 +226,7 @@ def test_only_pairs_that_are_allowed_are_matched() -> None:
 
 
 def disturbed() -> list[Any]:
-    """Two scans that share little more than half, the second with much noise: few matches are right."""
+    """Return two scans that share little more than half, the second with much noise: few matches are right."""
     surface, drift_m = Waves(5), (50.4 * PIXEL_M, -12.5 * PIXEL_M)
     first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, drift_m, seed=1)
     noise = np.random.default_rng(3).normal(scale=0.15 * second.values.std(), size=SHAPE)
@@ -238,7 +238,7 @@ def inliers(pair: list[Any], **settings: Any) -> float:
 
 
 def test_the_inlier_limit_is_that_of_the_paper_and_matters() -> None:
-    """Matches that are off by up to so much of the scan's resolution agree; the paper does not tighten that."""
+    """Matches agree up to this share of the scan's resolution; the paper does not tighten that."""
     pair = disturbed()
     of = [inliers(pair, residual_threshold=limit, tighten=False) for limit in (0.01, 0.05, 0.6)]
     assert of[0] < of[1] < of[2]

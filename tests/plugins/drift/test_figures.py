@@ -1,4 +1,4 @@
-"""The figures of drift show what they were given, with units."""
+"""The figures of drift show their data, with units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A grid is every combination that differs, by names from a command line or a file."""
+"""A grid contains every different combination, by names from a command line or a file."""
 
 from __future__ import annotations
 

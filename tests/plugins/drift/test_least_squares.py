@@ -1,4 +1,4 @@
-"""The default estimator: where features went, in metres, and what it refuses."""
+"""The default estimator: displacement in metres, and refusals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def scanned(
     noise: float = 0.02,
     start_s: float = 0.0,
 ) -> DriftScan:
-    """A scan of a surface that has moved by `drift_m` under the tip, with noise as a share of the relief."""
+    """Return a scan of a surface that has moved by `drift_m` under the tip, with noise as a share of the relief."""
     x, y = region.pixels_m(shape)
     values = surface(x - drift_m[0], y - drift_m[1], seed)
     values += noise * values.std() * np.random.default_rng([seed, 7, int(start_s)]).standard_normal(shape)
@@ -171,7 +171,7 @@ def test_scans_of_different_places_are_refused(seed: int) -> None:
 
 
 def test_of_two_like_features_the_right_one_is_found_by_what_lies_beside_it() -> None:
-    """The reference shows both, 600 nm apart, and the scan one of them: which of them, the empty places tell."""
+    """The reference shows both, 600 nm apart, and the scan one of them; the empty surroundings identify it."""
     drift_m = np.array([250 * NM, 20 * NM])
 
     def bumps(moved_m: NDArray[np.float64], start_s: float) -> DriftScan:
@@ -198,7 +198,7 @@ def test_a_scan_lies_on_itself_exactly() -> None:
 
 
 def test_a_site_of_a_lattice_is_refused_if_it_is_like_the_others_though_it_was_expected() -> None:
-    """A site away nearly all fits; that the defects don't is seen by what other sites are like."""
+    """One site off nearly everything fits; the comparison with other sites shows that the defects don't."""
     period_m, cos, sin = 140 * NM, math.cos(0.5), math.sin(0.5)
     x, y = REGION.pixels_m((96, 96))
     defects = np.random.default_rng(5).uniform(-SIZE_M / 2, SIZE_M / 2, (12, 2))

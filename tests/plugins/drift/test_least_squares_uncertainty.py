@@ -1,4 +1,4 @@
-"""The default estimator knows its own error, and uses what is known of the drift velocity."""
+"""The default estimator knows its own error, and uses a known drift velocity."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_more_noise_is_more_uncertainty() -> None:
 
 
 def edge(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The end of one bump: shift and shear of it are nearly the same."""
+    """Return the end of one bump: its shift and its shear are nearly the same."""
     along, across = x_m + 100 * NM, y_m - 120 * NM
     inside = 150 * NM - np.hypot(np.maximum(along, 0.0), across)
     return 1.0 / (1.0 + np.exp(-inside / (10 * NM)))
@@ -122,7 +122,10 @@ def test_a_difference_of_velocities_says_nothing_of_scans_taken_differently(
 
 
 def told(shift: float, shear: float) -> tuple[NDArray[np.float64], ...]:
-    """Of images that tell the sum of a shift along x and ten times a shear to 0.1 px, and all else very well."""
+    """Return information from images that determine a shift along x plus ten times a shear to 0.1 px.
+
+    Everything else is determined well.
+    """
     information = 1e8 * np.eye(COUNT)
     information[np.ix_([0, 3], [0, 3])] = np.outer((10.0, 100.0), (10.0, 100.0))
     theta = np.zeros(COUNT)

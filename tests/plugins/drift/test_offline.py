@@ -1,4 +1,4 @@
-"""What a pair of scans says of the time in between, and what is drawn of a run."""
+"""The displacement of a pair of scans over the time in between, and the figures of a run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def found(displacement_m: tuple[float, float], *, center_m: tuple[float, float] 
 
 
 def test_a_pair_speaks_of_the_rows_that_both_show_and_is_brought_to_the_middle_of_both() -> None:
-    """Sample and rows move up: what lies d above the middle was taken late, and meanwhile the sample went on."""
+    """Sample and rows move up: rows d above the middle are taken late, and meanwhile the sample goes on."""
     scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k + 200.0, upwards=True) for k in range(2)]
     rates = np.array([(1e-10, 0.0), (0.0, 2e-10)])
     run = replace(record()[:2], rate_m_s=rates)

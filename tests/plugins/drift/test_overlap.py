@@ -1,4 +1,4 @@
-"""What two turned rectangles share, and how alike their resolutions are."""
+"""The shared area of two rotated rectangles, and the ratio of their resolutions."""
 
 from __future__ import annotations
 

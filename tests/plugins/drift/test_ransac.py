@@ -99,7 +99,7 @@ def test_more_that_agree_are_less_likely_chance(pairs: int, inliers: int) -> Non
 
 
 def test_false_alarms_are_as_rare_as_they_are_said_to_be() -> None:
-    """Pairs with nothing in common, in a unit square: their displacements' density is at most 1."""
+    """Unrelated pairs, in a unit square: the density of their displacements is at most 1."""
     random, radius, said = np.random.default_rng(7), 0.05, 0
     search = Search(FORMS["translation"], 100, 0.1, random)
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Pairs of scans of a real microscope, the drift between which is known from other channels and exhaustive search."""
+"""Pairs of scans of a real microscope, with the drift known from other channels and exhaustive search."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_two_steps_are_as_far_as_one(registered: Registered) -> None:
 
 
 def test_the_way_back_is_the_way_there(registered: Registered) -> None:
-    """Both scans are treated alike; only where the displacement holds differs."""
+    """Both scans are treated alike; only the place of the displacement differs."""
     there, back = registered(*PMN)[0], registered(*PMN[::-1])[0]
     at_m = there.center_m + there.displacement_m
     back_m = back.displacement_m + back.linear @ (at_m - back.center_m)

@@ -1,4 +1,4 @@
-"""The table of a run comes back from its file as it was."""
+"""The table of a run is read back from its file unchanged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from afspm.plugins.drift.record import DriftRecord
 
 
 def record(n: int = 20, seed: int = 1) -> DriftRecord:
-    """Of a scan every 15 minutes, followed to a few nm."""
+    """Return the record of a scan every 15 minutes, followed to a few nm."""
     random = np.random.default_rng(seed)
     drift = np.cumsum(random.normal(10e-9, 5e-9, (n, 2)), axis=0)
     spread = np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-18

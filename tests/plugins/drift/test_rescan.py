@@ -1,4 +1,4 @@
-"""When a scan is to be taken again."""
+"""The rules for rescans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`afspm drift FILE…`: which scans of files are followed, what is told and what is written."""
+"""`afspm drift FILE…`: the choice of scans, the output, and the files."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
 
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
-    """Six scans of a sample that drifts, as the simulated microscope saves them, and a file that is broken."""
+    """Six scans of a drifting sample, as the simulated microscope saves them, and a broken file."""
     settings = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (*VELOCITY_M_S, 0.0)}}
     world = World.from_settings(settings, seed=1, start_s=0.0)
     folder = tmp_path / "run"

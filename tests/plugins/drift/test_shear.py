@@ -1,4 +1,4 @@
-"""An up frame followed by a down frame tells the absolute velocity of the drift."""
+"""The absolute velocity of drift from an up frame and a down frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VELOCITY = np.array([0.11, -0.07]) * NM
 
 
 class Lattice:
-    """Sees the exact shear, and a displacement that is off by sites unless it knows better."""
+    """Measures the exact shear, and a displacement that is off by lattice sites without a close prior."""
 
     def __init__(self, velocity_m_s: Array, *, spacing_m: float = np.inf, sd_m: float = 0.1 * NM) -> None:
         self.velocity_m_s = velocity_m_s
@@ -35,7 +35,7 @@ class Lattice:
         self.priors: list[Prior | None] = []
 
     def matrix(self, scan: DriftScan, freed_m_s: Array) -> Array:
-        """From where features are at the middle to where they are found, about the centre."""
+        """Return the map from a feature's place at the middle to its measured place, about the centre."""
         a = delay_per_length_s_m(scan)
         assert a is not None
         return np.asarray(np.linalg.inv(np.eye(2) - a * np.outer(self.velocity_m_s - freed_m_s, slow_axis(scan))))
@@ -121,7 +121,7 @@ def test_uncertainty_of_the_shear_covers_a_duration_that_counts_the_last_row() -
 
 
 def test_the_shear_resolves_a_lattice() -> None:
-    """A drift of more than half a lattice constant between the frames, so the nearest site is a wrong one."""
+    """The drift between the frames is more than half a lattice constant, so the nearest site is a wrong one."""
     lattice = Lattice(VELOCITY, spacing_m=30 * NM, sd_m=0.02 * NM)
     found = velocity_from_up_down(*frames(), lattice)
     assert lattice.priors[0] is None
@@ -152,7 +152,7 @@ def test_what_can_not_be_registered_gives_its_reason() -> None:
 
 
 def test_a_tracker_notices_an_up_frame_followed_by_a_down_frame() -> None:
-    """On a lattice, the displacement alone would be that to the nearest site."""
+    """On a lattice, the displacement alone would lead to the nearest site."""
     following = BankTracker(Lattice(VELOCITY, spacing_m=30 * NM, sd_m=0.02 * NM))
     for scan in frames():
         update = following.add(scan)

@@ -1,4 +1,4 @@
-"""Pixels that one scan alone has, and rows that are missing, do not move what the default estimator finds."""
+"""Spikes in only one scan, and missing rows, don't move the result of the default estimator."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def off_px(made: Pair, found: Registration) -> float:
 
 
 def rms_px(worse: dict[str, float], seed: int = 0) -> float:
-    """Of errors in some pairs, with so much spoiled: shares of the pixels and of the rows."""
+    """Return the rms error over some pairs with these shares of spoiled pixels and rows."""
     random = np.random.default_rng(seed)
 
     def spoiled(scan: DriftScan) -> DriftScan:

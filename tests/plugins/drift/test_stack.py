@@ -1,4 +1,4 @@
-"""Scans taken while the sample moves lie on top of each other in the stack."""
+"""Scans taken while the sample moves are aligned in the stack."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def scan(
     angle_rad: float = 0.0,
     upwards: bool | None = True,
 ) -> DriftScan:
-    """Of the landscape, with the sample displaced by `drift_m` in the middle of 100 s."""
+    """Return a scan of the landscape, with the sample displaced by `drift_m` in the middle of 100 s."""
     region = Region(center_m, (1e-6, 0.8e-6), angle_rad)
     shape = (51, 64)
     x, y = region.pixels_m(shape)

@@ -1,4 +1,4 @@
-"""A simulated night: what is measured of it is what happened."""
+"""A simulated night: its metrics match its events."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SMALL: dict[str, Any] = {"pixels": 32, "hours": 2.0, "surface": "particles", "si
 
 
 class Still:
-    """An estimator that says that nothing has moved."""
+    """An estimator whose displacement is always zero."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         followed = np.subtract(scan.region.center_m, reference.region.center_m)
@@ -30,7 +30,7 @@ class Still:
 
 
 class Blind:
-    """An estimator that never sees anything."""
+    """An estimator that refuses every pair."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         return Registration.refused("nothing to be seen")

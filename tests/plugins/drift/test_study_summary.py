@@ -1,4 +1,4 @@
-"""Settings are judged by where scans are taken, and the defaults by the spread of the best."""
+"""Settings are ranked by the misplacement of scans, and the defaults are judged by the spread of the best."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The default tracker: near the best there is, not thrown off, lost and found, in any place and at any size."""
+"""The default tracker: near the optimum, robust to wrong pairs, lost and found, at any place and size."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STEADY = steady((0.05 * NM, -0.03 * NM))
 
 
 def night(seed: int, walk_m: float = NM) -> Drift:
-    """Relaxations of hours and of half an hour, a day's wave, and a random walk of so much in 15 minutes."""
+    """Relaxations of hours and of half an hour, a day's wave, and a random walk of this step in 15 minutes."""
     random = np.random.default_rng(seed)
     slow, fast, daily = (v / np.linalg.norm(v) for v in random.standard_normal((3, 2)))
     times_s = np.arange(0.0, 120 * INTERVAL_S, 60.0)
@@ -38,7 +38,7 @@ def night(seed: int, walk_m: float = NM) -> Drift:
 
 
 def error_m(world: World, prediction: Prediction, start_s: float = FRAME_S) -> Array:
-    """What it says less the truth; positions are counted from the first scan."""
+    """Return the estimate minus the truth; positions are counted from the first scan."""
     drift = world.drift_m(prediction.time_s) - world.drift_m(start_s)
     return np.asarray(-prediction.mapping.translation_m - drift)
 
@@ -55,7 +55,7 @@ def nights() -> list[tuple[World, list[Update]]]:
 
 
 def test_it_predicts_better_than_the_last_step_does(nights: list[tuple[World, list[Update]]]) -> None:
-    """Late misplacement of the same nights: at most 0.85 of the paper's scheme with the same estimator."""
+    """Late misplacement in the same nights: at most 0.85 of the paper's scheme with the same estimator."""
     late: dict[type, list[Array]] = {BankTracker: [], PaperTracker: []}
     for seed, (world, updates) in enumerate(nights[:3]):
         late[BankTracker] += [error_m(world, update.before) for update in updates[8:]]
@@ -66,7 +66,7 @@ def test_it_predicts_better_than_the_last_step_does(nights: list[tuple[World, li
 
 
 def test_it_knows_how_well_it_knows(nights: list[tuple[World, list[Update]]]) -> None:
-    """Neither over-confident nor careless, before a scan and after it."""
+    """Neither over-confident nor over-cautious, before a scan and after it."""
     before, after = [], []
     for world, updates in nights:
         for update in updates[8:]:
@@ -78,20 +78,20 @@ def test_it_knows_how_well_it_knows(nights: list[tuple[World, list[Update]]]) ->
 
 
 class WorldByRows(World):
-    """A scan shows the sample where it was in the mean of its rows."""
+    """A scan shows the sample at the mean of its displacement over the rows."""
 
     def _seen(self, scan: DriftScan, position_m: Array) -> Array:
         return super()._seen(scan, position_m) + self.shown_m(scan) - self.drift_m(scan.mid_s)
 
     def shown_m(self, scan: DriftScan) -> Array:
-        """(2,) the mean of the displacement over the rows."""
+        """Return the mean (2,) of the displacement over the rows."""
         times_s = np.linspace(scan.start_s, scan.end_s, 65)
         return np.asarray(np.mean([self.drift_m(float(t)) for t in times_s], axis=0))
 
 
 @pytest.mark.parametrize("walk_m", [1 * NM, 4 * NM])
 def test_it_knows_what_the_sample_wanders_during_a_scan(walk_m: float) -> None:
-    """Told after a scan is where the sample was in the middle of it, but the scan shows the mean of its rows."""
+    """The estimate is for the middle of a scan, but the scan shows the mean over its rows."""
     chi2 = []
     for seed in range(6):
         world = WorldByRows(night(seed, walk_m), noise_m=0.05 * NM, seed=seed)
@@ -119,7 +119,7 @@ def test_the_first_scan_is_where_positions_are_counted_from() -> None:
 
 @pytest.mark.parametrize("upwards", [True, False])
 def test_an_overlap_off_the_middle_biases_nothing(*, upwards: bool) -> None:
-    """At a fifth of the frame from its middle, what drifts by 26 nm a frame is 5 nm further."""
+    """A fifth of the frame from its middle, a sample that drifts by 26 nm a frame is 5 nm further."""
     world = World(steady((0.0, 0.1 * NM)), noise_m=0.0)
     following = BankTracker(world)
     for k, offset in enumerate((0.0, 0.4, -0.4, 0.3, -0.3)):
@@ -234,7 +234,7 @@ def test_a_jump_of_half_a_scan_is_found_at_once_and_believed_the_second_time() -
 
 
 def far_jump(distance_m: float) -> World:
-    """The sample jumps so far between scans 10 and 11 that the next ones share nothing with those before."""
+    """Return a sample that jumps so far between scans 10 and 11 that later scans share nothing with earlier ones."""
     jump = np.array([distance_m, 0.0])
     return World(lambda t: STEADY(t) + (t > 10.5 * INTERVAL_S) * jump)
 
@@ -270,7 +270,7 @@ def test_after_a_far_jump_one_scan_that_shows_an_old_place_puts_all_right() -> N
 
 
 def test_a_place_first_seen_adrift_is_known_once_an_older_one_says_so() -> None:
-    """The first scan of a place next to the known one was not usable with any older; the next ones are."""
+    """The first scan of a place next to the known one matched no older scan; the next ones do."""
     world = World(STEADY)
     following = BankTracker(world)
     follow(following, 8)
@@ -329,7 +329,7 @@ def test_an_unusable_picture_is_passed_over() -> None:
 
 
 def test_an_anchor_that_can_not_be_recognised_any_more_is_given_up() -> None:
-    """The tip has changed: new scans match each other, old ones do not match them."""
+    """The tip has changed: new scans match each other, and no older ones."""
     world = World(night(6))
     following = BankTracker(world)
     follow(following, 10)
@@ -348,7 +348,7 @@ def test_the_first_scan_stays_the_anchor_while_it_is_recognised() -> None:
 
 
 def test_other_places_get_anchors_of_their_own() -> None:
-    """Two places, scanned in turn: what is known of one holds for the other, and for what is certain."""
+    """Two places, scanned in turn: the drift measured at one place holds for the other, with its uncertainty."""
     world = World(night(8), noise_m=0.3 * NM)
     following = BankTracker(world)
     places = [(0.0, 0.0), (3.5 * SIZE_M, 1.0 * SIZE_M)]
@@ -380,7 +380,7 @@ def test_a_wide_scan_and_narrow_ones_in_it() -> None:
 
 
 def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_own() -> None:
-    """It is as far from the overview as it is, and to scan it again would not change that."""
+    """Its distance from the overview stays unknown, and a rescan would not change that."""
     world = World(night(4))
     following = BankTracker(world, sr_norm_min=0.25)
     following.add(scan_at(FRAME_S, pixels=16, key="overview"))
@@ -403,7 +403,7 @@ def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_o
 
 
 def refusing(world: World) -> list[Prior | None]:
-    """Have every registration refused; returns where each is expected, as they are asked for."""
+    """Refuse every registration; return the list to which each registration adds its prior."""
     asked: list[Prior | None] = []
 
     def refuse(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
@@ -527,7 +527,7 @@ def test_a_velocity_before_the_first_scan_is_refused() -> None:
 
 
 def compensating(drift: Drift, since_s: float, velocity: Array) -> Drift:
-    """What is left in tip coordinates when a controller follows."""
+    """Return the remaining drift in tip coordinates when a controller compensates."""
     return lambda t: drift(t) - velocity * max(t - since_s, 0.0)
 
 
@@ -551,7 +551,7 @@ def test_a_rate_that_the_controller_takes_over_is_taken_off() -> None:
 
 
 def test_compensation_may_be_told_while_a_scan_is_taken_and_survives_a_kill() -> None:
-    """The file of a scan that was half done at that time comes after the news."""
+    """The file of a scan that was half done at that time comes after the change."""
     velocity = np.array([0.05, -0.03]) * NM
     changed_s = FRAME_S + 9 * INTERVAL_S + 30.0
     world = World(compensating(STEADY, changed_s, velocity), noise_m=0.01 * NM)

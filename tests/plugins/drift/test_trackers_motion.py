@@ -1,4 +1,4 @@
-"""How the filters of the bank let drift move."""
+"""The models of motion in the filters of the bank."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 3
 
 @pytest.mark.parametrize(("first_s", "second_s"), [(900.0, 900.0), (20.0, 1.0), (0.001, 26.999), (3600.0, 0.1)])
 def test_two_steps_are_one_long_one(first_s: float, second_s: float) -> None:
-    """Also across the times where a series takes the place of the exponentials."""
+    """Also across the step length at which a series replaces the exponentials."""
     (f1, q1), (f2, q2), (f, q) = MODELS.over(first_s), MODELS.over(second_s), MODELS.over(first_s + second_s)
     assert np.allclose(f2 @ f1, f, rtol=1e-12)
     together = f2 @ q1 @ f2.transpose(0, 2, 1) + q2

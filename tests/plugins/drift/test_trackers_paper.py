@@ -1,4 +1,4 @@
-"""The tracker of the paper does what the paper says."""
+"""The tracker of the paper follows the paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NM = 1e-9
 
 
 def test_the_worked_example_of_the_paper() -> None:
-    """Supporting information, "Drift Correction Example", in nm: x_tot is what M_tot adds to tip coordinates."""
+    """Supporting information, "Drift Correction Example", in nm: M_tot adds x_tot to tip coordinates."""
     total = {0: 0.0, 1: 1.0, 2: 2.0, **{k: float(k) for k in range(3, 13)}, 13: 12.5, 14: 13.0}
     world = World(lambda t: np.array([-np.interp(t, [*total], [*total.values()]) * NM, 0.0]), noise_m=0.0)
     following = PaperTracker(world, queue=20)
@@ -122,7 +122,7 @@ def test_it_is_lost_after_some_scans_without_a_match() -> None:
 
 
 class Turning:
-    """An estimator for a sample that turns about the origin and grows, at constant rates."""
+    """An estimator for a sample that rotates about the origin and grows, at constant rates."""
 
     rad_per_s, growth_per_s = 1e-4, 2e-5
 
@@ -185,7 +185,7 @@ def test_a_translation_leaves_rotation_out() -> None:
 
 
 def test_a_rotated_scan_is_taken_by_what_the_matrices_say() -> None:
-    """M_k x_k = M_j x_j for every feature, whatever the prediction was."""
+    """M_k x_k = M_j x_j for every feature, with any prediction."""
     following = PaperTracker(Turning(), transform="affine")
     for time_s in (0.0, 100.0, 250.0):
         update = following.add(scan_at(time_s, (0.2e-6, -0.1e-6)))

@@ -1,4 +1,4 @@
-"""The default tracker with rotation and scale: corners stay in place, nothing is made up, and nothing is lost."""
+"""The default tracker with rotation and scale: corners stay in place, no rotation is invented, and no scan is lost."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ TURN = 1.5e-3j  # in an interval
 
 @dataclass(frozen=True)
 class Sample:
-    """It drifts, and turns and expands about a place that is not the frame's.
+    """Drifts, rotates and expands about a pivot outside the frame.
 
     Attributes:
         rate_per_s: logarithm of the scale, plus i times the angle in rad, in a second.
-        pivot_m: about which it does.
+        pivot_m: the centre of rotation and expansion.
     """
 
     rate_per_s: complex
@@ -54,7 +54,7 @@ class Sample:
         return Mapping.of(linear, pivot - linear @ pivot + VELOCITY_M_S * time_s)
 
     def scanned(self, region: Region, time_s: float, seed: int) -> DriftScan:
-        """Scanned so fast that nothing moves meanwhile."""
+        """Return a scan so fast that nothing moves meanwhile."""
         x, y = region.pixels_m((PIXELS, PIXELS))
         at = self.to_tip(time_s).inverse.apply(np.stack([x, y], axis=-1))
         values = SURFACE.at_points(at)
@@ -64,11 +64,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class Night:
-    """Scans of one place of the sample, each where the tracker says that it is.
+    """Scans of one place of the sample, each at the tracker's prediction.
 
     Attributes:
-        corners_m: (n,) how far the corner of each scan that is furthest off is from where it was meant to be.
-        truth: (n,) logarithm of the scale, plus i times the angle, that there really was.
+        corners_m: (n,) distance of each scan's furthest corner from its intended place.
+        truth: (n,) true logarithm of the scale, plus i times the angle.
     """
 
     updates: list[Update]
@@ -96,14 +96,14 @@ def night(rate_per_scan: complex, transform: str, count: int, compared: int = 1)
 
 
 def estimate(update: Update) -> complex:
-    """Logarithm of the scale of the sample, plus i times its angle."""
+    """Return the estimated logarithm of the scale of the sample, plus i times its angle."""
     inverse = update.after.mapping.inverse
     return complex(np.log(inverse.scale), inverse.angle_rad)
 
 
 @pytest.mark.parametrize("rate", [TURN, -1.1e-3 + 1.1e-3j], ids=["turns", "turns and shrinks"])
 def test_corners_stay_in_place_on_a_sample_that_turns_or_expands(rate: complex) -> None:
-    """So does what lies beside the frame, three frames away."""
+    """So do places beside the frame, three frames away."""
     plain, corrected = night(rate, "translation", 24), night(rate, "similarity", 24)
     assert all(update.matched for update in corrected.updates)
     assert plain.corners_m[-6:].mean() > 12 * NM
@@ -126,7 +126,7 @@ def test_without_a_turn_none_is_made_up_and_corners_lose_less_than_a_twentieth_o
 
 
 def test_translations_are_the_default_and_are_not_touched() -> None:
-    """With the option off neither the mapping nor what is saved and told knows of it."""
+    """With the option off, neither the mapping nor the saved and published state contains it."""
     tracker = BankTracker(LeastSquares(), compared=2)
     update = followed(Sample(TURN / INTERVAL_S), tracker, 3).updates[-1]
     assert np.array_equal(update.after.mapping.linear, np.eye(2))

@@ -1,4 +1,4 @@
-"""Tasks are done whatever becomes of the workers."""
+"""Tasks are done in spite of dead workers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def doubled(number: int) -> int:
 
 
 def doubled_by_the_next(number: int, marks: Path) -> int:
-    """The first worker that is given 3 dies of it."""
+    """The first worker that is given 3 dies."""
     mark = marks / "died"
     if number == 3 and not mark.exists():
         mark.touch()

@@ -1,4 +1,4 @@
-"""Packets for peers that look at one message a poll."""
+"""Packets for peers that process one message per poll."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def access(
 
 
 def who(guard: Access, cookie: str | None) -> str | None:
-    """The name of who shows a cookie; None: nobody who may come in."""
+    """Return the name of a cookie's viewer; None: access is refused."""
     visitor = guard.visitor(cookie)
     return None if visitor is None else visitor.person
 

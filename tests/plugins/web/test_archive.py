@@ -96,7 +96,7 @@ def test_a_watch_rings_when_something_has_changed_and_tells_how_long_it_is_silen
 
 
 class _Later(ExperimentClock):
-    """A minute later each time that it is asked."""
+    """A clock that advances a minute with each reading."""
 
     looks = 0
 

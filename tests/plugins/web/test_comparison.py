@@ -1,4 +1,4 @@
-"""Two scans laid over each other."""
+"""The difference of two aligned scans."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Map, time line, curves, words: what is in the HTML."""
+"""Map, time line, curves and texts in the HTML."""
 
 from __future__ import annotations
 
@@ -290,7 +290,7 @@ ELSEWHERE = 600
 
 
 def gone() -> Overview:
-    """Two computers, one of which is not heard of from 30 s on."""
+    """Two computers; one of them sends no reports from 30 s on."""
     overview = Overview()
     for time_s in range(1, ELSEWHERE, 2):
         for name, computer in (("scheduler", "here"), ("series", "there")):
@@ -325,7 +325,7 @@ def test_a_simulated_night_passes_faster_and_nobody_is_gone_for_that() -> None:
 
 
 def lines(options: Any) -> list[list[list[float | None]]]:
-    """The points of each line of a chart, as the browser gets them."""
+    """Return the points of each line of a chart, as the browser gets them."""
     return [one["data"] for one in json.loads(json.dumps(options, allow_nan=False))["series"] if one["type"] == "line"]
 
 

@@ -1,4 +1,4 @@
-"""Events are kept in their order, bounded, and told to be missed where they are not."""
+"""Events are kept in order, bounded, and reported as missed where they are not."""
 
 from __future__ import annotations
 

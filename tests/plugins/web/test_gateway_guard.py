@@ -1,4 +1,4 @@
-"""Who may ask a gateway, from where, and how much may be sent."""
+"""The guard of the gateway: names, origins, and sizes of requests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Clock:
 
 
 async def echo(scope: Any, receive: Any, send: Any) -> None:
-    """Answers with the name, and how much came."""
+    """Answers with the name and the length of the body."""
     size, more = 0, True
     while more:
         message = await receive()

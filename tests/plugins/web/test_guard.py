@@ -19,13 +19,13 @@ PEOPLE = {"Ada": hashed("analytical")}
 
 
 def completed(doing: Coroutine[Any, Any, Any]) -> Any:
-    """What comes of it; in a thread of its own, as a browser that is tested has its loop running in this one."""
+    """Run a coroutine in a thread of its own: the browser under test has its loop running in this one."""
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(asyncio.run, doing).result()
 
 
 class Browser:
-    """Asks an application without a network in between, and keeps its cookies."""
+    """Sends requests to an application without a network, and keeps its cookies."""
 
     def __init__(self, app: Guard, at: str) -> None:
         self._app = app
@@ -46,7 +46,7 @@ class Browser:
         return answer
 
     def talk(self, origin: str) -> list[str]:
-        """What a websocket is told, one word a message."""
+        """Connect a websocket; return the messages it receives, one word each."""
         cookies = "; ".join(f"{cookie.name}={cookie.value}" for cookie in self._cookies.jar)
         headers = {"host": self._at.netloc.decode(), "origin": origin, "cookie": cookies}
         scope = {
@@ -145,7 +145,7 @@ def test_guessing_is_slowed_down_and_said_to_be(served: Served) -> None:
 
 
 def test_link_with_a_token_signs_nobody_in(served: Served) -> None:
-    """A page of another site may hold one: its reader would steer under the name of its author."""
+    """Another site's page may contain such a link: its reader would steer under the name of its author."""
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     answer = browser.get("/?token=analytical&name=Ada", headers={"accept": "text/html"})
     assert (answer.status_code, answer.headers["location"]) == (303, "/login")

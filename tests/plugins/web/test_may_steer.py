@@ -1,4 +1,4 @@
-"""Steering asks for nothing in nobody's name, whatever the page lets a viewer press."""
+"""Steering sends no request without a name, even if the page shows a button."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def steering(access: Access, monkeypatch: pytest.MonkeyPatch) -> Steering:
 
 
 def done(steering: Steering, visitor: Visitor) -> list[Any]:
-    """In whose names an act was carried out."""
+    """Return the names under which an action was carried out."""
     asked: list[Any] = []
 
     def act(actions: Any) -> ActionResult:

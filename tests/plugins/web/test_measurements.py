@@ -1,4 +1,4 @@
-"""A measurement is begun once for its key, whatever is refused, lost or killed in between."""
+"""A measurement is begun once for its key, over refusals, losses and kills."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOT_FREE = Response(int(ControlResponse.NOT_FREE))
 
 
 class Commands:
-    """A scheduler that answers as it is told, and keeps the ids that it was asked with."""
+    """A scheduler with given answers that keeps the ids of its requests."""
 
     def __init__(self, *answers: Response) -> None:
         self.answers = list(answers)

@@ -1,4 +1,4 @@
-"""What a panel makes of names that somebody else chose, without a browser."""
+"""A panel with names from outside, without a browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands beside a scan: its number, times, and what was set."""
+"""Facts beside a scan: its number, times, and parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the page is served, and under which name it is found; encrypted with the certificate that the docs make."""
+"""The server: addresses, names, stalled clients; encrypted with the certificate that the docs make."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "watch-and-steer.md"
 
 @pytest.fixture
 def certificate(tmp_path: Path) -> Path:
-    """Made as the how-to says, for this computer."""
+    """Made as in the how-to, for this computer."""
     if shutil.which("openssl") is None:
         pytest.skip("no openssl is found: `apt install openssl`")
     command = re.search(r"^\$ (openssl req .*\\\n.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
@@ -64,7 +64,7 @@ def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) ->
 
 
 def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
-    """By the address it is counted how often somebody was wrong."""
+    """Wrong passwords are counted by address."""
 
     async def origin(scope: Any, receive: Any, send: Any) -> None:
         await hello({**scope, "scheme": scope.get("client", ("",))[0]}, receive, send)
@@ -124,7 +124,7 @@ Serve = Callable[..., Callable[[], socket.socket]]
 
 @pytest.fixture
 def serve() -> Iterator[Serve]:
-    """Serve an application; returns what opens a connection to it."""
+    """Serve an application; returns a function that opens a connection to it."""
     with ExitStack() as stack:
 
         def begin(app: Any = hello, **settings: Any) -> Callable[[], socket.socket]:
@@ -139,12 +139,12 @@ def serve() -> Iterator[Serve]:
 
 
 def status(connection: socket.socket) -> int:
-    """Return the status of the answer that comes next."""
+    """Return the status of the next answer."""
     return int(connection.makefile("rb").readline().split()[1])
 
 
 def closes(connection: socket.socket) -> bool:
-    """Return whether the server ends a connection; an answer before that is passed over."""
+    """Return whether the server ends a connection; an earlier answer is skipped."""
     connection.settimeout(LONG_S)
     with suppress(ConnectionError):
         while connection.recv(1 << 16):

@@ -1,4 +1,4 @@
-"""What a person may write and choose, and what is said about a problem."""
+"""Inputs and choices of a person, and the advice about a problem."""
 
 from __future__ import annotations
 

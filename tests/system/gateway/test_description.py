@@ -1,4 +1,4 @@
-"""The gateway does what its OpenAPI description says, as far as thousands of requests made from it can tell."""
+"""The gateway follows its OpenAPI description, in thousands of requests generated from it."""
 
 from __future__ import annotations
 

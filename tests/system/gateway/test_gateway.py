@@ -1,4 +1,4 @@
-"""A program that has nothing but HTTP takes part in an experiment."""
+"""A program that speaks only HTTP takes part in an experiment."""
 
 from __future__ import annotations
 
@@ -214,7 +214,7 @@ def test_strangers_take_neither_control_nor_its_lease_from_the_owner_of_a_token(
 
 
 def _wait_until_dropped(process: psutil.Process, port: int) -> None:
-    """Wait until a process has no connection any more with a client at a port."""
+    # until the process has no connection left with a client at this port
     end_s = time.monotonic() + DEADLINE_S
     while any(one.raddr and one.raddr.port == port for one in process.net_connections()):
         assert time.monotonic() < end_s, "it keeps its connection"
@@ -222,7 +222,7 @@ def _wait_until_dropped(process: psutil.Process, port: int) -> None:
 
 
 def _streaming(run: GatewayRun, path: str) -> socket.socket:
-    """A connection by which events are streamed, of which little is taken unless it is read."""
+    # a small receive buffer: the stream stalls unless it is read
     host, _, port = Client(run.url).address.partition(":")
     connection = socket.socket()
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -23,7 +23,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def served() -> Iterator[str]:
-    """The origin of the page, which is not that of the gateway."""
+    """The origin of the page, different from the gateway's."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(SAMPLE))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
