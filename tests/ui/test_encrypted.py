@@ -30,7 +30,7 @@ def night(browser: Any, tmp_path: Path) -> Iterator[Night]:
     one.close()
 
 
-def test_a_person_with_the_own_password_takes_over_and_is_gone_after_signing_out(night: Night, browser: Any) -> None:
+def test_a_person_with_a_password_takes_over_and_can_not_after_signing_out(night: Night, browser: Any) -> None:
     assert night.url.startswith("https://")
     context = browser.new_context(ignore_https_errors=True)  # nobody has signed this certificate
     try:

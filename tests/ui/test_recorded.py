@@ -104,7 +104,7 @@ def test_a_moment_of_the_night_is_shown_as_it_was(
     keep(page, "recorded-night")
 
 
-def test_it_is_played(ended: Night, opened: Opened) -> None:
+def test_a_recorded_night_is_played(ended: Night, opened: Opened) -> None:
     page = opened(ended.url)
     look_at(page, ended, 1)
     page.click("#scrubber [data-part=play]")
@@ -144,7 +144,7 @@ def test_notes_of_the_night_and_of_the_morning_are_kept(ended: Night, opened: Op
     assert "&lt;b&gt;tip&lt;/b&gt; changed here" in report.text()
 
 
-def test_nothing_can_be_steered(ended: Night, opened: Opened) -> None:
+def test_a_recorded_night_can_not_be_steered(ended: Night, opened: Opened) -> None:
     page = opened(ended.url, person="Eve")
     page.wait_for_function("window.afspm?.scrubber")
     assert not page.locator("button:has-text('Take over'):visible").count()
@@ -152,7 +152,7 @@ def test_nothing_can_be_steered(ended: Night, opened: Opened) -> None:
     assert not page.locator("button:has-text('Scan here'):visible").count()
 
 
-def test_on_a_phone_it_fits(ended: Night, opened: Opened, keep: Callable[[Any, str], None]) -> None:
+def test_a_recorded_night_fits_a_phone(ended: Night, opened: Opened, keep: Callable[[Any, str], None]) -> None:
     page = opened(ended.url, width=390, height=844)
     look_at(page, ended, 2)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

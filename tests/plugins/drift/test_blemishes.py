@@ -65,7 +65,7 @@ def test_a_scar_of_one_scan_is_made_up_there_and_not_in_the_other(thick: int) ->
     assert abs(mended.first.values - clean)[inside].mean() < 0.8 * abs(first - clean)[inside].mean()
 
 
-def test_what_is_made_up_tells_nothing_of_the_displacement() -> None:
+def test_made_up_pixels_carry_no_information_about_the_displacement() -> None:
     first, second, theta = seen_twice()
     made_up = np.zeros(first.shape, dtype=bool)
     made_up[30:33] = True
@@ -76,7 +76,7 @@ def test_what_is_made_up_tells_nothing_of_the_displacement() -> None:
     assert (~known).any(axis=1).sum() == 3
 
 
-def test_scans_without_scars_are_left_as_they_are() -> None:
+def test_scans_without_scars_stay_unchanged() -> None:
     first, second, theta = seen_twice()
     mended = without_scars_of_one(Scene(everywhere(first), everywhere(second)), theta)
     assert mended.first.values is first
@@ -95,7 +95,7 @@ def test_a_spike_of_one_scan_is_mended_and_a_feature_of_both_is_left(wide: int) 
     assert mended[20] == pytest.approx(clean[20])
 
 
-def test_crossing_lines_are_taken_away_with_the_rows() -> None:
+def test_crossing_lines_are_removed_with_the_rows() -> None:
     """Offsets, tilts and bends of the rows of both scans are removed; features stay."""
     random, turn = np.random.default_rng(2), np.radians(30.0)
     x, y = np.meshgrid(np.arange(60.0) - 29.5, np.arange(60.0) - 29.5)
@@ -110,7 +110,7 @@ def test_crossing_lines_are_taken_away_with_the_rows() -> None:
     assert lines.seen(features[:, None], everything).std() > 0.4 * features.std()
 
 
-def test_doubt_beyond_what_was_fitted_grows_no_further() -> None:
+def test_doubt_is_limited_to_the_range_of_the_fit() -> None:
     certain, small = Doubt(1.0, 1.0, 0.01, 0.1), Doubt(1e4, 1e3, 3.0, 1.0)
     assert certain.spread == pytest.approx(SPREAD["all"])
     assert small.spread == pytest.approx(SPREAD["most"])

@@ -59,7 +59,7 @@ def test_an_error_is_logged_where_no_caller_takes_it(caplog: pytest.LogCaptureFi
     assert "second.nc with first.nc: ZeroDivisionError: oh" in record.getMessage()
 
 
-def test_unguarded_an_error_shows() -> None:
+def test_an_unguarded_estimator_raises() -> None:
     with pytest.raises(ZeroDivisionError):
         unguarded(Broken()).register(*pair())
 
@@ -78,7 +78,7 @@ def test_without_an_expectation_nothing_is_bridged() -> None:
     assert estimator(Broken(), lambda failure: None).register(*pair()).outcome is RegistrationOutcome.FAILED
 
 
-def test_a_failed_pair_tells_no_velocity() -> None:
+def test_a_failed_pair_gives_no_velocity() -> None:
     """A coarse estimate has no shear, which is not a shear of zero."""
     first, second = pair()
     down = DriftScan(second.values, second.region, second.start_s, second.end_s, False, second.key)

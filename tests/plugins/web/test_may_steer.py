@@ -48,7 +48,7 @@ def test_a_nameless_person_may_not_steer(steering: Steering, person: str) -> Non
     assert "Sign in" in steering.do(Visitor(person), cast("Any", str)).result(5.0).text
 
 
-def test_a_page_that_is_still_open_after_signing_out_steers_no_more(steering: Steering, access: Access) -> None:
+def test_an_open_page_steers_no_more_after_signing_out(steering: Steering, access: Access) -> None:
     cookie = access.enter("Ada", "", "x")
     visitor = access.visitor(cookie)
     assert visitor is not None

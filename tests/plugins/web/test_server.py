@@ -46,7 +46,7 @@ async def hello(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": scope["scheme"].encode()})
 
 
-def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) -> None:
+def test_a_client_that_trusts_the_certificate_connects_encrypted(certificate: Path) -> None:
     bound = listening("127.0.0.1", 0)
     server = WebServer(hello, bound, certificate, certificate.with_suffix(".key"))
     url = url_of("127.0.0.1", bound.getsockname()[1], encrypted=True)
@@ -63,7 +63,7 @@ def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) ->
         server.stop()
 
 
-def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
+def test_a_forged_header_is_not_taken_as_the_client_s_address() -> None:
     """Wrong passwords are counted by address."""
 
     async def origin(scope: Any, receive: Any, send: Any) -> None:
@@ -83,14 +83,14 @@ def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
         server.stop()
 
 
-def test_what_is_no_certificate_is_refused(certificate: Path) -> None:
+def test_a_malformed_certificate_is_refused(certificate: Path) -> None:
     with listening("127.0.0.1", 0) as bound:
         for wrong in (certificate.with_name("none.crt"), PAGE):
             with pytest.raises(ConfigError, match="certificate or certificate_key can't be loaded"):
                 WebServer(hello, bound, wrong, certificate.with_suffix(".key"))
 
 
-def test_a_port_that_is_taken_is_told_unless_any_will_do() -> None:
+def test_a_taken_port_is_an_error_unless_any_port_will_do() -> None:
     with listening("127.0.0.1", 0) as first:
         taken = first.getsockname()[1]
         with pytest.raises(ConfigError, match=f"can't listen at 127.0.0.1, port {taken}"):
@@ -109,7 +109,7 @@ def test_a_port_that_is_taken_is_told_unless_any_will_do() -> None:
         ("::", f"http://{socket.gethostname()}:8080"),
     ],
 )
-def test_where_it_is_can_be_typed_into_a_browser(host: str, url: str) -> None:
+def test_the_url_works_in_a_browser(host: str, url: str) -> None:
     assert url_of(host, 8080, encrypted=False) == url
 
 
@@ -168,7 +168,7 @@ def test_head_of_the_greatest_length_is_answered(serve: Serve) -> None:
     assert status(connection) == 200
 
 
-def test_half_requests_keep_nobody_out(serve: Serve) -> None:
+def test_half_requests_do_not_block_other_clients(serve: Serve) -> None:
     connect = serve(most_requests=2)
     halves = [connect() for _ in range(2 * web_server.MOST_UNFINISHED)]
     for half in halves:
@@ -180,7 +180,7 @@ def test_half_requests_keep_nobody_out(serve: Serve) -> None:
     assert closes(halves[0])
 
 
-def test_tls_handshakes_that_never_end_keep_nobody_out_and_end_in_time(certificate: Path) -> None:
+def test_endless_tls_handshakes_do_not_block_other_clients_and_end_in_time(certificate: Path) -> None:
     bound = listening("127.0.0.1", 0)
     address = bound.getsockname()
     server = WebServer(hello, bound, certificate, certificate.with_suffix(".key"), head_s=2.0)
@@ -236,7 +236,7 @@ def test_body_that_does_not_come_ends_the_connection(serve: Serve) -> None:
     assert closes(connection)
 
 
-def test_only_requests_that_are_being_answered_count(serve: Serve) -> None:
+def test_only_requests_in_progress_count(serve: Serve) -> None:
     go_on, loops = asyncio.Event(), list[asyncio.AbstractEventLoop]()
 
     async def slow(scope: Any, receive: Any, send: Any) -> None:
