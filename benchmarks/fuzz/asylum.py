@@ -1,4 +1,4 @@
-"""Random calls of the emulated Asylum: its functions and values with odd arguments, and requests that are none."""
+"""Random calls of the emulated Asylum: its functions and values with odd arguments, and malformed requests."""
 
 from __future__ import annotations
 
@@ -105,5 +105,5 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
 
 
 def cases() -> Iterator[tuple[type[AsylumFuzzer], AsylumEmulator]]:
-    """Yield the emulators to be called."""
+    """Yield the emulators to call."""
     yield AsylumFuzzer, AsylumEmulator()
