@@ -385,8 +385,8 @@ def test_limits_hold_in_tip_coordinates_and_the_refusal_names_both_places() -> N
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(HERE))
     (reply,) = lab.replies()
     assert reply.code == ControlResponse.PARAM_ERROR
-    assert "(1.5e-06, 0) m at the tip" in reply.reason
-    assert "(0, 0) m on the sample" in reply.reason
+    assert "(1.5, 0) µm at the tip" in reply.reason
+    assert "(0, 0) nm on the sample" in reply.reason
     assert not lab.forwards()
 
 

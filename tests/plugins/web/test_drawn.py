@@ -309,11 +309,11 @@ def test_processes_of_a_lost_computer_are_not_shown_as_alive() -> None:
     assert silent == {"series": (ELSEWHERE - 1 - 29) * S}, "and what has ended there has ended"
     state = watch.overview.processes["series"]
     assert process_words(state, silent["series"])[:2] == (
-        "never heard from", "for 9 min 30 s: its supervisor has ended or can't be reached",
+        "no report", "for 9 min 30 s: its supervisor has ended or can't be reached",
     )  # fmt: skip
     html = time_line_html(watch.overview, ELSEWHERE * S, silent)
-    assert html.count("process-never-heard-from") == 1
-    assert "process-never-heard-from" not in time_line_html(gone(), ELSEWHERE * S)
+    assert html.count("process-no-report") == 1
+    assert "process-no-report" not in time_line_html(gone(), ELSEWHERE * S)
 
 
 def test_a_faster_simulated_night_makes_no_process_count_as_gone() -> None:

@@ -51,6 +51,7 @@ class _PlanSession:
     def __init__(self, where: str | Path, name: str) -> None:
         self.source = f"afspm://{Path(where).as_posix()}"
         self._open = partial(connect, where, name)
+        # a scope blocks: its calls must not run in the event loop
         self._thread = ThreadPoolExecutor(1, "afspm")
         self._scope: Scope | None = None
         self._running: Future[Any] | None = None
@@ -70,11 +71,12 @@ class _PlanSession:
             self._scope.interrupt()
 
     def _ask(self, ask: Callable[[Scope], T]) -> T:
+        # connected on first use, in the thread that uses it
         if self._scope is None:
             self._scope = self._open()
         try:
             return ask(self._scope)
-        except KeyboardInterrupt:  # which would end the event loop
+        except KeyboardInterrupt:  # it would end the event loop
             raise InterruptedError("the measurement was stopped") from None
 
 
@@ -85,7 +87,7 @@ class _ParameterBackend(SignalBackend[float]):
         super().__init__(float)
         self._session = session
         self._parameter = parameter
-        self._told: Callback[Reading[float]] | None = None
+        self._callback: Callback[Reading[float]] | None = None
         self._reading = Reading(value=np.nan, timestamp=0.0)
 
     def source(self, name: str, read: bool) -> str:
@@ -113,14 +115,14 @@ class _ParameterBackend(SignalBackend[float]):
         return await self.get_value()
 
     def set_callback(self, callback: Callback[Reading[float]] | None) -> None:
-        self._told = callback
+        self._callback = callback
         if callback is not None:
             callback(self._reading)
 
-    def _take(self, told: Reading[Value]) -> Reading[float]:
-        self._reading = Reading(value=float(told["value"]), timestamp=told["timestamp"])
-        if self._told is not None:
-            self._told(self._reading)
+    def _take(self, reading: Reading[Value]) -> Reading[float]:
+        self._reading = Reading(value=float(reading["value"]), timestamp=reading["timestamp"])
+        if self._callback is not None:
+            self._callback(self._reading)
         return self._reading
 
 
@@ -138,8 +140,8 @@ class _Measurement(StandardReadable, Triggerable):
         return described | {f"{self.name}-{field}": key for field, key in self._keys.items()}
 
     async def read(self) -> dict[str, Reading[Any]]:
-        told: dict[str, Reading[Any]] = await super().read()
-        return told | {f"{self.name}-{field}": reading for field, reading in self._readings.items()}
+        readings: dict[str, Reading[Any]] = await super().read()
+        return readings | {f"{self.name}-{field}": reading for field, reading in self._readings.items()}
 
     async def _measured(self, ask: Callable[[Scope], T]) -> T | None:
         # None: the plan was aborted, and the measurement stopped

@@ -62,19 +62,19 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     """
     console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
     contents, unreadable = read_all(paths)
-    for told in unreadable:
-        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    for reason in unreadable:
+        aside.print(f"left out: {reason}", markup=False, soft_wrap=True)
     if not contents:
         raise InvalidValue("there is nothing to follow: no file was read", hint="name scans, or folders of them")
     found = series(contents, channel)
-    for told in found.left_out:
-        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    for reason in found.left_out:
+        aside.print(f"left out: {reason}", markup=False, soft_wrap=True)
     begun = day_and_time(round(found.scans[0].mid_s * NS_PER_S), UTC, seconds=False)
     console.print(f"{counted(len(found.scans), 'scan')} of {found.channel} from {begun} on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
     console.print(analysis.record.summary())
-    truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # of one simulated run
+    truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # only a single run has one truth
     for path in written(found, analysis, truth_m, output, aside):
         console.print(str(path), markup=False, soft_wrap=True)
 
@@ -99,7 +99,7 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
         folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
         found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in suffixes())
         of_the_controller = [file for file in found if file.suffix != RECORDED]
-        # the record has the same scans once more, where drift was compensated in sample coordinates
+        # the record contains the same scans again, with places in sample coordinates where drift was corrected
         yield from of_the_controller if (path / JOURNAL_FILE).exists() and of_the_controller else found
 
 

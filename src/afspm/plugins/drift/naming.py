@@ -38,7 +38,7 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
     except AfspmError as error:
         where = f"{name}: {error.where}" if error.where else name
         raise ConfigError(error.what, where=where, hint=error.hint) from error
-    except Exception as error:  # anybody's constructor
+    except Exception as error:  # the constructor may be a user's own code, and raise anything
         raise ConfigError(f"the {what} {name} can't be made with these settings: {error}") from error
 
 
@@ -68,7 +68,7 @@ def _check_settings(what: str, name: str, class_: type[object], settings: PlainM
     # settings are checked before the constructor runs, so that a typo gives its own error
     try:
         parameters = list(inspect.signature(class_).parameters.values())[given:]
-    except ValueError:  # a class of C code without a signature
+    except ValueError:  # C extensions may have no signature
         return
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return

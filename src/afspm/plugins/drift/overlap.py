@@ -28,7 +28,7 @@ def intersection_m(first: Region, second: Region) -> Array:
     """
     if first.frame is not second.frame:
         raise InvalidValue(f"a region in {first.frame.value} and one in {second.frame.value} coordinates can't overlap")
-    # About one centre, in units of one size: far from the origin the digits of the corners would be used up.
+    # About one centre, in units of one size: far from the origin the corners would lose digits.
     origin, unit = np.array(first.center_m), max(*first.size_m, *second.size_m)
     corners: list[XY] = ((first.corners_m() - origin) / unit).tolist()
     sides: list[XY] = ((second.corners_m() - origin) / unit).tolist()
@@ -160,7 +160,7 @@ def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float)
     """
     _in_sample(asked, scanned)
     if not tolerance_m > 0.0:
-        raise InvalidValue(f"a tolerance of {tolerance_m} m", hint="above zero")
+        raise InvalidValue(f"the tolerance must be above zero, and is {tolerance_m * 1e9:g} nm")
     off_m = float(np.linalg.norm(asked.corners_m() - scanned.corners_m(), axis=1).max())
     if off_m + 2.0 * sd_m <= tolerance_m:
         return ""

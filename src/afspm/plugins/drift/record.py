@@ -128,9 +128,9 @@ class DriftRecord:
         for k, key in enumerate(self.keys):
             (xx, xy), (_, yy) = self.covariance_m2[k]
             numbers = (*self.center_m[k], *self.drift_m[k], xx, yy, xy, *self.rate_m_s[k])
-            told = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
+            fields = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
             how = (self.outcomes[k].label, str(self.failures[k]))
-            yield [key, *told, "yes" if self.matched[k] else "no", self.reasons[k], *how]
+            yield [key, *fields, "yes" if self.matched[k] else "no", self.reasons[k], *how]
 
     @classmethod
     def read(cls, path: Path) -> DriftRecord:

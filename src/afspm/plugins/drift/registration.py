@@ -38,7 +38,9 @@ class DriftScan:
         if self.values.ndim != 2 or min(self.values.shape) < 2:
             raise InvalidValue(f"a scan of shape {self.values.shape} can't be registered", hint="2 x 2 pixels at least")
         if not (np.isfinite((self.start_s, self.end_s)).all() and self.end_s >= self.start_s):
-            raise InvalidValue(f"a scan from {self.start_s} s to {self.end_s} s can't be")
+            raise InvalidValue(
+                f"a scan needs finite times with the start before the end, not {self.start_s} s and {self.end_s} s"
+            )
 
     @property
     def mid_s(self) -> float:

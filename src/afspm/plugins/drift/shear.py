@@ -22,8 +22,8 @@ from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Regist
 
 Array = NDArray[np.float64]
 
-_SAFETY = 2.0  # of the standard deviation of the shear, which is derived from that of the displacement
-_CONTRADICTION = 16.0  # chi2 of both routes' difference
+_SAFETY = 2.0  # on the standard deviation of the shear, since it is derived from the displacement's
+_CONTRADICTION = 16.0  # chi2 of the difference between both routes
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +99,7 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
     first, second = delay_per_length_s_m(reference), delay_per_length_s_m(scan)
     if first is None or second is None or not np.isfinite(found.covariance_m2).all():
         return None
-    if found.failure:  # a coarse estimate knows no shear
+    if found.failure:  # a coarse estimate has no shear
         return None
     difference = second - first
     if abs(difference) < 0.1 * max(abs(first), abs(second)):
@@ -161,20 +161,20 @@ def _freed(scan: DriftScan, velocity_m_s: Array) -> DriftScan:
     x, y = (float(v) for v in velocity_m_s)
     try:
         values = undistorted(scan.values, scan.region, (x, y), scan.duration_s, upwards=scan.upwards is not False)
-    except InvalidValue:  # as fast as the scan: no guess
+    except InvalidValue:  # the sample moves as fast as the scan
         return scan
     return replace(scan, values=values)
 
 
 def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_s: Array) -> DriftVelocity:
-    # Both routes of a registration, combined if they agree. `freed_m_s` is the drift already taken out of the scans.
+    # Combines both routes of a registration if they agree. `freed_m_s` is the drift already removed from the scans.
     time_s = (first.mid_s + second.mid_s) / 2
     sheared = velocity_by_shear(first, second, found)
     if not found.accepted or sheared is None:
         return DriftVelocity.refused(found.reason or "no shear between the scans can be found", time_s, found)
     by_shear, shear_covariance = sheared[0] + freed_m_s, sheared[1]
     between_s, middles_s = _between_s(first, second, found), second.mid_s - first.mid_s
-    # rows that are freed are all as they were at the middle, but for what the guess was wrong by
+    # freed rows are as at the middle, except for the error of the guess
     by_displacement = (found.displacement_m + freed_m_s * (between_s - middles_s)) / between_s
     covariance = found.covariance_m2 / between_s**2
     difference, both = by_displacement - by_shear, covariance + shear_covariance
@@ -196,7 +196,7 @@ def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_
 
 
 def _between_s(first: DriftScan, second: DriftScan, found: Registration) -> float:
-    # from the passage of the overlap in the first scan to that in the second
+    # from the rows of the overlap in the first scan to its rows in the second
     there_m = found.center_m + found.displacement_m
     late_s, later_s = row_delay_s(first, found.center_m) or 0.0, row_delay_s(second, there_m) or 0.0
     return second.mid_s + later_s - first.mid_s - late_s

@@ -53,12 +53,12 @@ def _read(path: Path) -> tuple[Plain, Array]:
             try:
                 entry: Plain = json.loads(line)
             except ValueError:
-                continue  # cut off by a kill
+                continue  # a line cut off by a kill
             if entry["event"] == "start" and start is None:
                 start = entry
             scan = entry.get("scan")
             if isinstance(scan, dict) and "compensated_start_m" in scan:
                 followed += [(scan[f"{at}_s"], *scan[f"compensated_{at}_m"][:2]) for at in ("start", "end")]
     if start is None:
-        raise ValueError("it has no beginning")
+        raise ValueError("the entry of the simulator's start is missing")
     return start, np.array(sorted(followed), dtype=np.float64)

@@ -121,5 +121,5 @@ def _verdict(rows: Sequence[Summary]) -> str:
         return "The defaults did not come to the end of a night"
     if default.is_best:
         return "The defaults are the best."
-    told = f"they are {default.median:.3g} nm off, the best ({best.label}) {_spread(best)} nm."
-    return f"The defaults hold: {told}" if default.holds else f"The defaults do not hold: {told}"
+    figures = f"they are {default.median:.3g} nm off, the best ({best.label}) {_spread(best)} nm."
+    return f"The defaults hold: {figures}" if default.holds else f"The defaults do not hold: {figures}"

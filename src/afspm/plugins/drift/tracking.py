@@ -18,7 +18,7 @@ from afspm.plugins.drift.registration import DriftScan, Registration
 Array = NDArray[np.float64]
 
 FORECAST_VERSION = 2
-"""Of all kinds of forecast as plain data."""
+"""Version of all forecasts as plain data."""
 
 
 @dataclass(frozen=True, eq=False)

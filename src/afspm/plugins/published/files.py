@@ -40,7 +40,7 @@ _MEANINGLESS: Final = (
 )  # fmt: skip
 """Settings that only say how Python is to decode or to name packets: decoding is the wire's, naming is [cache]'s."""
 CHANNEL: Final = "Height"
-"""The channel of the simulated microscope that stands for the one that a published picture was given."""
+"""The simulated microscope's channel, in place of the channel of a published picture."""
 
 Becomes = Callable[[object, Table], Settings]
 
@@ -296,7 +296,7 @@ def _velocity(value: Any, table: Table) -> Settings:
 
 
 _LINES, _WIDTH_M = 128, 1e-6
-"""Of a scan that nothing was set for."""
+"""Of a scan with default settings."""
 _PICTURES: Final = ("ImageTranslator", "DriftImageTranslator")
 _EVERY: Final[dict[str, PublishedSetting]] = {
     **_gone("a process waits for its next message and never sleeps", "loop_sleep_s", "poll_timeout_ms"),
@@ -375,7 +375,7 @@ CLASSES: Final[dict[str, PublishedClass]] = {
     "GxsmTranslator": PublishedClass("Gxsm", _EVERY | _HANDLERS | _GXSM),
     "NanonisTranslator": PublishedClass("Nanonis", _EVERY | _HANDLERS | _NANONIS),
 }
-"""By the name of the class, in whichever module of the published implementation it was."""
+"""By the name of the class, without its module, which varied between versions."""
 
 _OWN = "derive a class of your own from afspm.Component, with on_scan, on_state … or a `run`"
 _TRANSLATOR = 'derive a class of your own from afspm.translator.Driver: "afspm new driver"'
@@ -385,7 +385,7 @@ INSTEAD: Final[dict[str, str]] = {
     **dict.fromkeys(("AfspmComponent", "AfspmComponentBase", "AfspmComponentUI"), _OWN),
     **dict.fromkeys(("MicroscopeTranslator", "ConfigTranslator", "MapTranslator", "SXMTranslator"), _TRANSLATOR),
 }
-"""What to write instead of a published class that calls code written against the published implementation."""
+"""Advice for published classes that call code written for the published implementation."""
 
 
 def convert(tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:

@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 SETTLED_S: Final = 0.05
-"""After a subscription others of the same peer follow: it is replayed to once all are there, since it drops what is
-older than the newest that it has had, whatever the envelope."""
+"""Real time from a subscription to its replay. A peer subscribes several times in a row, and drops packets older than
+the newest that it received under any envelope, so the replay waits for all its subscriptions."""
 LINGER_S: Final = 1.0
-"""Real time after the end of the experiment in which answers still go out."""
+"""Real time after the end of the experiment for last answers."""
 MOST_EXTRA: Final = 50
-"""Subscriptions to messages that version 1 does not have."""
+"""Largest number of subscriptions to messages unknown to version 1."""
 _PROBLEM_REQUESTS = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
 _NO_PROBLEM = b"\0"
 _NAMELESS = b"a client without a name: set the socket's identity to the component's name"
@@ -58,7 +58,7 @@ class PublishedPeers:
     """
 
     opens_plain: ClassVar[bool] = True
-    """Programs without keys can command the microscope by it: the experiment file has to allow that."""
+    """Programs without keys can command the microscope through it, so the experiment file has to allow it."""
 
     def __init__(self, serve: str, publish: str, *, as_translator: bool = False) -> None:
         self._serve, self._publish = serve, publish
@@ -92,7 +92,7 @@ class _PeerClient:
 
     def __init__(self, bridge: _PeersPort, name: str) -> None:
         self._bridge = bridge
-        # closed with all that it holds when the peer goes: by that the scheduler knows of it
+        # closed when the peer goes: the scheduler notices a client's end by its connection
         self.network = Network.from_launch(bridge.launch.name, bridge.launch.keys)
         address = bridge.launch.sockets.control
         if address is None:
@@ -105,7 +105,7 @@ class _PeerClient:
     def ask(self, identity: bytes, frames: list[bytes], *, takes_control: bool) -> None:
         sent: list[list[bytes]] = []
         if takes_control:
-            # refused while another client is in control; then the command is refused as well, and says so
+            # refused while another client is in control; then the command is refused, too, with the reason
             control_id = self._bridge.next_id(self.name)
             sent.append([bytes([ControlRequest.REQUEST_CTRL]), _NO_PROBLEM, control_id.encode()])
         request_id = self._bridge.next_id(self.name)
@@ -186,11 +186,11 @@ class _PeersPort(BasePort[Incoming]):
         super().close()
         self._outside.close()
 
-    # --- what comes from outside ---
+    # --- from outside ---
 
     def _requests(self) -> list[Incoming]:
         while frames := receive_frames(self._router):
-            # drained after the message was received: so an earlier connection of this descriptor is forgotten
+            # drained after the message was received, so that an earlier connection of this descriptor is forgotten
             gone = self._changes()
             identity, content = frames[0].bytes, [frame.bytes for frame in frames[1:]]
             if content[:1] != [b""]:
@@ -260,7 +260,7 @@ class _PeersPort(BasePort[Incoming]):
         if client is None or identity in self._identities.values():
             return  # it has a newer connection
         if client.asked:
-            client.leaves = True  # its last request is carried out all the same
+            client.leaves = True  # its last request is still carried out
         else:
             self._leave(client)
 
@@ -273,7 +273,7 @@ class _PeersPort(BasePort[Incoming]):
 
     def _subscriptions(self) -> list[Incoming]:
         for prefix in self._outlet.subscriptions():
-            # a message that version 1 does not have comes to a peer that asks for it by its name
+            # a peer gets messages unknown to version 1 if it subscribes by their names
             if prefix == wire.KILL.decode() or prefix.startswith(tuple(self._listened)):
                 continue
             if len(self._listened) < MOST_EXTRA:
@@ -282,7 +282,7 @@ class _PeersPort(BasePort[Incoming]):
                 self.warnings.warning(f"a subscription to {prefix!r} is one too many")
         return []
 
-    # --- what comes from inside ---
+    # --- from inside ---
 
     def _listen(self, prefixes: Sequence[str]) -> None:
         self._listened += prefixes
@@ -308,7 +308,7 @@ class _PeersPort(BasePort[Incoming]):
                 state = wire.decode(message, packet.payload).state
             elif message == CONTROL_STATE.name:
                 if self._as_translator:
-                    return  # the scheduler outside has one of its own
+                    return  # the scheduler outside publishes its own
                 packet = self._with_names_outside(packet)
         except WireError as error:
             self.warnings.warning(f"dropped a packet of the scheduler: {error}")
@@ -319,10 +319,10 @@ class _PeersPort(BasePort[Incoming]):
     def _with_names_outside(self, packet: Packet) -> Packet:
         # a peer compares the holder of control with its own name
         prefix = f"{self.launch.name}{PERSON}"
-        told = wire.decode(CONTROL_STATE.name, packet.payload)
-        if told.holder is None or not told.holder.startswith(prefix):
+        control = wire.decode(CONTROL_STATE.name, packet.payload)
+        if control.holder is None or not control.holder.startswith(prefix):
             return packet
-        payload = wire.encode(replace(told, holder=told.holder.removeprefix(prefix)))[1]
+        payload = wire.encode(replace(control, holder=control.holder.removeprefix(prefix)))[1]
         return Packet(packet.envelope, payload, packet.time_ns)
 
 
@@ -338,7 +338,7 @@ class _Outlet:
     ) -> None:
         self.pacing = Pacing()
         self._history, self._clock, self._warnings = history, clock, warnings
-        self._joined: set[str] = set()  # prefixes of late joiners that are to be replayed to
+        self._joined: set[str] = set()  # prefixes of late joiners that wait for a replay
         self._replay_s = math.inf
         self.socket = outside.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -356,14 +356,14 @@ class _Outlet:
         while frames := receive_frames(self.socket):
             kind, subscription = frames[0].bytes[:1], frames[0].bytes[1:]
             if kind != b"\1":
-                continue  # a SUB socket drops by itself what it does not want any more
+                continue  # an ended subscription: the SUB socket itself drops the packets
             try:
                 prefixes = version_1.topics_meant(subscription.decode())
             except UnicodeDecodeError:
                 self._warnings.warning("dropped a subscription that is no text")
                 continue
             for prefix in prefixes:
-                # in this mode a subscription is for the one peer whose message was received last
+                # XPUB_MANUAL: the subscription applies to the peer whose message was received last
                 self.socket.setsockopt(zmq.SUBSCRIBE, prefix.encode())
             meant += prefixes
         if meant:

@@ -30,7 +30,7 @@ CACHE_WITHIN_S: Final = 2.0
 """Real time in which a scheduler of version 1 has sent its cache. It does not say when it is done."""
 LINGER_S: Final = 1.0
 MOST_ANSWERS: Final = 256
-"""Answers remembered of each client, for requests that are repeated."""
+"""Remembered answers per client, for repeated requests."""
 
 
 class PublishedScheduler:
@@ -127,7 +127,7 @@ class _ClientOutside:
     def follow(self) -> list[Incoming]:
         for event in self.monitor.drain():
             was_sent, self._is_open, self._is_sent = self._is_sent, event.kind == CONNECTED, False
-            if was_sent:  # asked again it might be done twice
+            if was_sent:  # repeated, it might be carried out twice
                 why = "the connection to the scheduler was lost before it answered"
                 detail = ResponseDetail.OUTCOME_UNKNOWN
                 self._is_sent = True
@@ -178,7 +178,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._ends_s = math.inf
         self._outside = version_1.outside(launch)
         self._sub = self._outside.socket(zmq.SUB)
-        self._sub.setsockopt(zmq.SUBSCRIBE, b"")  # one: their scheduler takes in one subscription a loop
+        self._sub.setsockopt(zmq.SUBSCRIBE, b"")  # a single one: their scheduler processes one subscription per loop
         self._monitor = Monitor(self._outside, self._sub, CONNECTED)
         self._opens_s = math.inf
         self._outside.connect(self._sub, publish)
@@ -207,7 +207,7 @@ class _SchedulerPort(BasePort[Incoming]):
         if not version_1.has_request(request.kind):
             return version_1.unknown_request(request.kind, "scheduler", request.id)
         if request.kind == ControlRequest.RMV_EXP_PRBLM and request.subject not in self._flagged | self._unpublished:
-            return Response(int(ControlResponse.SUCCESS))  # it ends over a problem that is not set
+            return Response(int(ControlResponse.SUCCESS))  # their scheduler ends if the problem is not set
         return None
 
     def note(self, request: Request, response: Response) -> None:
@@ -229,7 +229,7 @@ class _SchedulerPort(BasePort[Incoming]):
         super().close()
         self._outside.close()
 
-    # --- our components ---
+    # --- inside: components ---
 
     def _requests(self) -> list[Incoming]:
         if self._router is not None:
@@ -247,7 +247,7 @@ class _SchedulerPort(BasePort[Incoming]):
                 name = self._names.pop(connection, "")
                 client = self._clients.get(name)
                 if client is not None and client.connection == connection:
-                    # closed: their scheduler knows no other sign by which a client is gone
+                    # closed: their scheduler notices a client's end only by its connection
                     self._forget(name)
 
     def _asked(self, connection: int, name: str, user: str | None, frames: list[bytes]) -> None:
@@ -286,7 +286,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.forget(client.monitor.socket)
         client.close()
 
-    # --- their scheduler ---
+    # --- outside: their scheduler ---
 
     def _connected(self) -> list[Incoming]:
         if self._monitor.drain() and self._router is None:

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 STOPPED_WITHIN_S: Final = 2.0
 """Real time that their translator has to stop its measurement when the experiment ends."""
 _STOPS: Final = {ScopeState.SCANNING: STOP_SCAN, ScopeState.SPEC: STOP_SPEC}
-_OWN = b"own"  # stands where the numbers of requests do
+_OWN = b"own"  # the id of this process's own requests, which clients' requests don't have
 
 
 class PublishedTranslator:
@@ -197,14 +197,16 @@ class _TranslatorPort(ZmqServerPort):
         self._commander = b""
         self._in_hand: Request | None = None
         self._number = 0
-        self._memory = memory  # outlives a restart: a request that their side may have carried out is not sent again
+        self._memory = (
+            memory  # saved: after a restart, a request that their side may have carried out is not sent again
+        )
         self._outcomes = RequestOutcomes(memory.setdefault("requests", {}), all_or_nothing=False)
         self._state = ScopeState.UNDEFINED
         self._ends_s = math.inf
         self._is_lost = False
         self._outside = version_1.outside(launch)
         self._dealer = self._outside.socket(zmq.DEALER)
-        self._dealer.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a translator that is gone
+        self._dealer.setsockopt(zmq.IMMEDIATE, 1)  # no request is queued for a translator that is gone
         self._dealer_monitor = Monitor(self._outside, self._dealer, DISCONNECTED)
         self._sub = self._outside.socket(zmq.SUB)
         self._sub.setsockopt(zmq.SUBSCRIBE, b"")
@@ -233,7 +235,7 @@ class _TranslatorPort(ZmqServerPort):
         super().close()
         self._outside.close()
 
-    # --- our scheduler ---
+    # --- inside: the scheduler ---
 
     def _take(self, arrived: RequestReceived) -> None:
         before, epoch = self._commander, Epoch.decode(arrived.epoch)
@@ -280,7 +282,7 @@ class _TranslatorPort(ZmqServerPort):
             frames = version_1.request_frames(Request(int(ControlRequest.ACTION), stop))
             send_frames(self._dealer, [_OWN, b"", *frames])
 
-    # --- their translator ---
+    # --- outside: their translator ---
 
     def _answers(self) -> list[Served]:
         while frames := receive_frames(self._dealer):

@@ -37,11 +37,11 @@ class Archive:
 
     def past(self, problems: ProblemNames) -> Overview | None:
         """Return the overview of the run so far, without log lines; None if there is no record of it yet."""
-        if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has only that of another run
+        if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has no journal of its own
             return None
         try:
             with open_run(self._folder) as run:
-                # of all others the scheduler has kept enough for a late joiner
+                # of other messages the scheduler's cache is enough
                 return run.overview([one.name for one in wire.declared() if one.in_past], problems)
         except (AfspmError, ImportError) as error:
             self._log.debug("the earlier part of the run can't be read: %s", error)
@@ -86,7 +86,7 @@ def allowed_region(folder: Path) -> Region | None:
         box = _section(folder, "limits").get("region")
         return None if box is None else _region(box)
     except (ValueError, KeyError, TypeError, AttributeError, AfspmError):
-        return None  # it is only drawn: the scheduler, which enforces it, has read it by itself
+        return None  # only for the map: the scheduler reads and enforces the limits itself
 
 
 def adjustable_parameters(folder: Path) -> tuple[str, ...]:

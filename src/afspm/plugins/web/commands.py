@@ -61,7 +61,7 @@ def dashboard(
     folder = _run_here(where)
     if folder is None:
         raise typer.Exit(_start_part(where))
-    typer.echo(f"opening the page of {folder.name} …")  # before what takes seconds to load
+    typer.echo(f"opening the page of {folder.name} …")  # loading the page takes seconds
     if goes_on(folder):
         raise typer.Exit(_join(folder, settings))
     _serve_recorded(folder, settings)
@@ -176,7 +176,7 @@ def _join(folder: Path, settings: Plain) -> int:
         return 0
     require(Dashboard)
     with looking(folder):
-        pass  # somebody is there
+        pass  # raises if the scheduler does not answer
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
     code = _run_as_guest(folder, Dashboard(**settings), DASHBOARD)
     if code == ExitCode.ENDED:

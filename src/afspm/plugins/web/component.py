@@ -42,7 +42,7 @@ class WebComponent(Component):
     has_people = True
     listens = ("",)
     stalled_s: ClassVar[float] = STALLED_S
-    longest_step_s = 60.0  # the first import of everything, on a busy computer
+    longest_step_s = 60.0  # on a busy computer the first import takes long
 
     def __init__(self, host: str, port: int | None, certificate: Path | None, certificate_key: Path | None) -> None:
         if (certificate is None) != (certificate_key is None):

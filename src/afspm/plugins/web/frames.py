@@ -44,6 +44,7 @@ class ChannelFrame:
     def complete(self) -> bool:
         return self.time_ns is not None
 
+    # by number, for the cache of pictures: arrays have no truth value
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ChannelFrame) and self.number == other.number
 
@@ -82,7 +83,7 @@ class FrameStore:
         before = self._newest.get(scan.channel)
         time_ns = scan.time_ns or time_ns
         if before is not None and before.time_ns is not None and time_ns <= before.time_ns:
-            return  # a replay: what is there is newer
+            return  # a replay of an older scan
         self._came.pop(scan.channel, None)
         began_ns = before.began_ns if before is not None and not before.complete else None
         frame = ChannelFrame(
@@ -105,11 +106,13 @@ class FrameStore:
             and before.began_ns == lines.began_ns
             and before.values.shape == lines.shape
         )
+        # a growing frame already has its memory
         if not grows and not self._has_room(lines):
             return
         picture = lines.into(before.values if grows and before is not None else None)
         came = self._came[lines.channel] if grows else np.zeros(lines.shape[0], np.bool_)
         last = lines.first_row + len(lines.values)
+        # a row above is already there: the scan runs downwards
         downwards = last < len(came) and bool(came[last])
         came[lines.first_row : last] = True
         self._came[lines.channel] = came

@@ -15,12 +15,14 @@ from collections.abc import Callable, Mapping
 from afspm.basics.errors import ConfigError
 
 LONGEST_NAME = 40
+# some hundredths of a second per password: slow for guessing, quick enough for a request
 _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
 AGAIN_S = 3.0
-"""Real time between two tries that are looked at, after too many wrong ones. To refuse all would lock out the owner of
-the right password: anyone on the same computer could be wrong five times a minute in the same name."""
+"""Real time between two checked tries, after too many wrong ones. To refuse all would lock out the owner of the right
+password: any program on the same computer could try five wrong ones a minute under the same name."""
+# bounded: addresses and wrong names are chosen by clients
 _MOST_REMEMBERED = 1000
 
 
@@ -76,7 +78,7 @@ class Passwords:
     def __init__(self, host: str, password_hash: str, people: Mapping[str, str], now_s: Callable[[], float]) -> None:
         for person, kept in {"": password_hash, **people}.items():
             _require_hash(person, kept)
-        # "" is the name of those who only look
+        # "" is the name for the common password
         self._hashes = {**people, "": password_hash}
         self._local = is_loopback(host)
         self._now_s = now_s
@@ -113,6 +115,7 @@ class Passwords:
         """
         if self.is_open or (not person and self.lets_look):
             return True
+        # a fast hash, only in memory: it recognises a password that scrypt has accepted before
         shown = hashlib.sha256(f"{address}\0{person}\0{password}".encode()).digest()
         prover = self._prover(person, address)
         with self._lock:
@@ -121,9 +124,9 @@ class Passwords:
                 return True
             if not self._may_try(prover):
                 return False
-        # for a name that nobody has it takes as long as for the others
-        kept = self._hashes.get(person) or _NOBODYS
-        if not matches(password, kept) or kept is _NOBODYS:
+        # an unknown name takes as long as a known one
+        kept = self._hashes.get(person) or _UNKNOWN
+        if not matches(password, kept) or kept is _UNKNOWN:
             return False
         with self._lock:
             self._tries.pop(prover, None)
@@ -139,11 +142,11 @@ class Passwords:
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()
 
     def _prover(self, person: str, address: str) -> _Prover:
-        # wrong passwords slow down neither other persons at the same address, nor the same person elsewhere
+        # wrong passwords slow down neither other persons at this address, nor this person elsewhere
         return address, person if person in self._hashes else None
 
     def _may_try(self, prover: _Prover) -> bool:
-        # a try counts as wrong until its password is found to be right: many may come at once
+        # a try counts as wrong until it is checked: many may arrive at once
         tries = self._tries.setdefault(prover, _Tries())
         self._tries.move_to_end(prover)
         if len(self._tries) > _MOST_REMEMBERED:
@@ -156,7 +159,7 @@ class Passwords:
 
 
 _Prover = tuple[str, str | None]
-"""An address, and the person whose password is shown there; None: a name that nobody has."""
+"""An address, and the person whose password is tried there; None: an unknown name."""
 
 
 class _Tries:
@@ -196,4 +199,5 @@ def _text(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-_NOBODYS = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"
+# no password has this hash; checking against it takes the same time as for a known name
+_UNKNOWN = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"

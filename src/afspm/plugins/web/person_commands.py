@@ -29,9 +29,9 @@ from afspm.model.geometry import XY
 from afspm.plugins.web.watch import Watch
 from afspm.record.overview import Overview
 
-ANSWER_S = 20.0  # real time that an answer may take
-FREE_S = 60.0  # that the microscope may take to get to a place
-SETTLED_S = 2.0  # what was set is published by then, if it changed anything
+ANSWER_S = 20.0  # real time for an answer
+FREE_S = 60.0  # real time for the microscope to reach a place
+SETTLED_S = 2.0  # a changed setting is published within this time
 
 
 class PersonCommands:
@@ -144,7 +144,7 @@ class PersonCommands:
     # --- within ---
 
     def _ask(self, kind: int, subject: object = None, request_id: str = "") -> Response:
-        self._link.pump(0.0)  # what has come of the connection since we asked last
+        self._link.pump(0.0)  # processes changes of the connection since the last request
         return self._link.request(kind, subject, request_id=request_id, until_s=self._link.until(ANSWER_S))
 
     def _settle(self, done: Callable[[Overview], bool]) -> None:

@@ -20,7 +20,7 @@ from afspm.transport.port import ParentGone
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import ZmqPort
 
-MOST_PERSONS = 32
+MOST_PERSONS = 32  # each takes a thread and a connection
 T = TypeVar("T")
 
 
@@ -35,6 +35,7 @@ class _Person:
     def close(self) -> None:
         if self.port is not None:
             self.port.wake_up(ParentGone())
+            # in its own thread: a ZeroMQ socket may be used by one thread only
             self.thread.submit(self.port.close)
         self.thread.shutdown(wait=False)
 
@@ -58,6 +59,7 @@ class Persons:
         with self._lock:
             one = self._persons.get(person)
             if one is None:
+                # the longest idle one goes; its next request connects again
                 while len(self._persons) >= MOST_PERSONS:
                     self._persons.popitem(last=False)[1].close()
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))

@@ -198,7 +198,7 @@ class Audience:
             self._pages.discard(id(page))
             self._changed.notify_all()
 
-    def wait_told(self, within_s: float) -> bool:
+    def wait_until_end_shown(self, within_s: float) -> bool:
         """Wait until every page shows the end; return False when the time is up."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._pages, within_s)

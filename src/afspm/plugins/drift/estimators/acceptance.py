@@ -20,12 +20,12 @@ Mask = NDArray[np.bool_]
 PARTS = 8  # of the overlap in each direction, at most
 PART_PX = 4  # smaller ones hold too little to correlate
 APART_PX = 4  # nearer than this a repetition is the match itself
-FEW = 10  # with fewer repetitions a surface doesn't repeat itself
-MOST_REPEATS = 30.0  # standard deviations: a place of its own
+FEW = 10  # with fewer repetitions a surface does not count as periodic
+MOST_REPEATS = 30.0  # standard deviations, from which a match counts as unique
 WRONG_AT_MOST = 0.05
-"""The largest probability of being wrong with which a match is accepted. A choice, not fitted: wrong matches among the
-accepted are too few to count in a fit. Of the families, where a third of the pairs share nothing, 0.6 % of the accepted
-are wrong at this value, nearly all of them stampers without a prior."""
+"""Largest accepted probability that a match is wrong. A choice, not fitted: wrong matches among the accepted are too
+few for a fit. In the families, where a third of the pairs are unrelated, 0.6 % of the accepted are wrong at this value,
+nearly all of them stampers without a prior."""
 
 
 @dataclass(frozen=True)

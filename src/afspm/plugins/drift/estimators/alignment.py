@@ -113,7 +113,7 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     # Noise moves with theta as the surface does, and so does the noise left in H; both cancel. The slope therefore
     # changes by H'QJ with a J without noise, and the product of both noises is subtracted.
     one, two, known = pair.warped(theta)
-    if not known.any():  # in a small overlap with next to no features a step may lead out of it
+    if not known.any():  # in a small overlap almost without features a step may leave it
         raise Unusable("without a displacement that fits")
     mean, residual = (one + two) / 2, two - one
     left = without_lines(residual, known, pair.crossing)
@@ -151,8 +151,8 @@ def _signal(
 
 
 def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
-    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the difference
-    # that the curvature is may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
+    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the curvature,
+    # a difference, may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
     # the nuisances act through one gradient and are nearly dependent, and products of columns of 32 bits are not
     # definite any more. Scaled to a diagonal of 1, values below their digits count as nothing.
     total, whole = (_symmetric(each.sum(axis=0)) for each in (curvature, spread))
@@ -194,7 +194,7 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
 
 FLOOR_PX = 1e-3
 CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
-EVEN = 0.2  # a share of the information that one block of rows may well hold
+EVEN = 0.2  # usual share of the information in one block of rows
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,8 @@ from afspm.plugins.drift.overlap import overlap_ratio
 from afspm.plugins.drift.registration import DriftScan, Estimator, LinearSeen, Prior, Registration
 
 COARSE_SD_PX = 0.5
-"""Added to the uncertainty of the coarse estimate, in the larger pixel of both scans: 95 % ellipses then hold 98 % and
-more of the accepted pairs of the families, and of zooms in their survey."""
+"""Added to the standard deviation of the coarse estimate, in the larger pixel of both scans. The 95 % ellipses then
+contain at least 98 % of the accepted pairs of the families, and of zooms in their survey."""
 
 _log = logging.getLogger("afspm.plugins.drift")
 
@@ -80,7 +80,7 @@ class Guarded:
         try:
             found = self.inner.register(_copied(reference), _copied(scan), prior)
             failure = _malformed(found)
-        except Exception as error:  # any code, of a user's own estimator too, may stumble in any way
+        except Exception as error:  # an estimator may be a user's own code, and raise anything
             failure = f"{type(error).__name__}: {error}"
         if failure:
             self._report(PairFailure(self.name, reference.key, scan.key, failure))
@@ -89,12 +89,12 @@ class Guarded:
         return Registration.refused(f"{self.name}: {impossible}") if impossible else found
 
     def _coarse(self, reference: DriftScan, scan: DriftScan, prior: Prior | None, failure: str) -> Registration:
-        # without an expectation one particle is as good as the next: a plain correlation is then sure of wrong ones
+        # without a prior a plain correlation takes one particle for another, with a clear peak
         if prior is None or isinstance(self.inner, Correlation):
             return Registration.failed(failure)
         try:
             found = Correlation().register(reference, scan, prior)
-        except Exception as error:  # what made the estimator stumble may make this one stumble
+        except Exception as error:  # the same values may make this estimator raise, too
             self._report(PairFailure("correlation", reference.key, scan.key, f"{type(error).__name__}: {error}"))
             return Registration.failed(failure)
         if not found.accepted or _malformed(found) or _impossible(found, reference, scan):
@@ -153,5 +153,5 @@ def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> s
         return f"accepted with a sample {unlike}"
     if overlap_ratio(reference.region, scan.region, found.displacement_m) == 0.0:
         far_m = float(np.hypot(*found.displacement_m))
-        return f"accepted with a displacement of {far_m:.3g} m, at which the scans do not overlap"
+        return f"accepted with a displacement of {far_m * 1e9:.3g} nm, at which the scans do not overlap"
     return ""

@@ -30,19 +30,19 @@ from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Regis
 
 Array = NDArray[np.float64]
 
-WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
+WIDEST = (0.01, 0.03)  # prior standard deviations of shear and rotation in the first stage, by x and by y
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
-BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
-FARTHEST_PX = 8.0  # from where the search has found it
+BORDER_PX = 1  # filters and splines have no data beyond the border
+FARTHEST_PX = 8.0  # from the result of the search
 TURNED = 0.03  # radians by which the lines of two scans cross
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
 EXPECTED = 2.0
-"""By which more doubt is allowed where a displacement is expected: nearly all wrong matches are of scans with nothing
-in common and no prior, and most right ones that are doubtful are zooms with one."""
+"""Factor on the allowed probability where a displacement is expected: nearly all wrong matches are of unrelated scans
+without a prior, and most doubtful right matches are zooms with one."""
 DISTRUST = 4.0
-"""By which the variance of the noise is taken for larger than its model says, where the images are weighed against what
-else displaces them. The factor of the ellipses, which grows with doubt, would let the images tell too little there."""
+"""Factor on the noise model's variance where the images are weighed against nuisances. The factor of the ellipses,
+which grows with doubt, would give the images too little weight there."""
 
 
 class LeastSquares:

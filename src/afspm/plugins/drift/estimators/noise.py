@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Real = TypeVar("Real", np.float32, np.float64)
 
 MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
-BLUR_PX = 0.45  # takes what interpolation would alias
+BLUR_PX = 0.45  # removes frequencies that interpolation would alias
 
 
 def cosine_frequencies(shape: tuple[int, ...]) -> Array:
@@ -92,7 +92,7 @@ BLOCK_ROWS = 8
 BLOCKS = 8  # at least, where rows are few, of two rows or more
 CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
-"""Least variance, where the scan's is 1: scans have a few digits, and agreement beyond them is no knowledge."""
+"""Least variance, with the scan's variance 1: scans have a few digits, and agreement beyond them means nothing."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
@@ -197,7 +197,7 @@ def _seen(columns: NDArray[Real], weight: Array, metric: NDArray[Real] | None) -
     x = np.linspace(-1.0, 1.0, columns.shape[2], dtype=columns.dtype)
     rows, lines = columns * root, np.concatenate([root, root * x, root * x**2], axis=1)
     rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
-    # of some rows less is known than a parabola has
+    # some rows have fewer known pixels than a parabola has parameters
     gram = lines @ lines_q.transpose(0, 2, 1) + 1e-5 * np.eye(3, dtype=columns.dtype)
     fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
     rows_q -= fitted @ lines_q
@@ -269,7 +269,7 @@ Small = NDArray[np.float32]
 PATCH_PX, STEP_PX = 8, 4
 TINY = np.finfo(np.float32).tiny
 ENOUGH_PATCHES = 1500
-CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for its own sake
+CERTAIN = 9.0  # times its noise power, from which a coefficient is kept on its own
 
 
 def denoised(image: Array, noise: Array) -> tuple[Array, Array]:

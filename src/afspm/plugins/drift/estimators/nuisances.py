@@ -21,13 +21,13 @@ from afspm.plugins.drift.estimators.warp import CREEP, CREEP_PX, LINEAR
 Array = NDArray[np.float64]
 
 SHEARS: Final = (0.003, 0.01)
-"""By drift during the scans: pixels per pixel along y, where nothing is known of it."""
+"""Candidate shears by drift during the scans, pixels per pixel along y, for an unknown velocity."""
 CALIBRATIONS: Final = (0.0, 0.01)
 TURNS: Final = (0.0, 0.01)
 CREEP_AT: Final = ((0.6, None), (0.2, slice(0, len(CREEP_PX))), (0.2, slice(len(CREEP_PX), 2 * len(CREEP_PX))))
-"""How likely lines creep nowhere, at their left and at their right end."""
+"""Probabilities of creep nowhere, at the left and at the right end of lines."""
 CREEP_SD_PX: Final = 0.5  # of each part
-NONE: Final = 1e-3  # px, or px over ten: so little is nothing
+NONE: Final = 1e-3  # px, or px over ten: counts as zero
 
 
 @dataclass(frozen=True, eq=False)

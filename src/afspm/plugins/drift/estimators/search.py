@@ -18,7 +18,7 @@ from afspm.plugins.drift.registration import DriftScan, Prior
 Array = NDArray[np.float64]
 
 
-GATE = 25.0  # chi² of an expected shift, beyond which nothing is looked for
+GATE = 25.0  # chi² of an expected shift, the limit of the search
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,13 +26,13 @@ Index = NDArray[np.intp]
 
 SPIKE_PX = 2  # along its row
 LEAST_SD = 6.0  # above both neighbours, or below both, in standard deviations of the steps along the rows
-OTHER = 0.5  # how much of that the other scan has, at most
+OTHER = 0.5  # largest share of that in the other scan
 LEAST_SHARED = 0.1  # of a row, for it to be compared
 
 
 SCAR_ROWS = 3
 SCAR_SD = 3.0  # above the rows on both sides of it, or below, in the difference of the scans
-OWN = 0.6  # how much of that the scan itself has, at least: else the scar is in the other one, or an edge
+OWN = 0.6  # least share of that in the scan itself: else the scar is in the other scan, or is an edge
 
 
 def without_scars_of_one(scene: Scene, theta: Array) -> Scene:

@@ -123,8 +123,8 @@ class OverlapBox:
         return np.array([self.x.mean(), self.y.mean()])
 
 
-LEAST_SEARCHED_PX = 32  # of a side of the smaller image: the rest of a smaller one may be too little to compare
-CREEP_PX = (4.0, 9.0)  # within which what a line starts with is gone to 1/e
+LEAST_SEARCHED_PX = 32  # least side of the decimated smaller image: less may be too little to compare
+CREEP_PX = (4.0, 9.0)  # lengths over which creep at the start of a line decays to 1/e
 LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
 CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
 SLOPES = CREEP.stop  # the first of them: they act through the gradient
@@ -220,7 +220,7 @@ def _product(column: Array | tuple[Array, Array]) -> Array:
     return column[0] * column[1] if isinstance(column, tuple) else column
 
 
-NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # of a neighbour, less the one opposite
+NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # on the difference of opposite neighbours
 
 
 def derivative(values: Array, axis: int) -> Array:

@@ -234,7 +234,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
                 show_scan(ax, one)
                 ax.set_xlabel("x / µm")
             row[0].set_ylabel("y / µm")
-            row[1].set_yticklabels([])  # the lines come across
+            row[1].set_yticklabels([])  # the lines between the scans cross them
         points = [_in_frame(one, at) for one, at in ((reference, matches.reference_m), (scan, matches.scan_m))]
         for ax, at in zip(rows[0], points, strict=True):
             ax.plot(at[:, 0], at[:, 1], "o", markersize=4, markerfacecolor="none", markeredgecolor=ORANGE)
@@ -248,7 +248,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
 
 
 def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
-    # positions in the frame before it is turned, µm
+    # positions in the frame before rotation, µm
     angle = scan.region.angle_rad
     cos, sin = np.cos(angle), np.sin(angle)
     center = np.asarray(scan.region.center_m)
@@ -257,7 +257,7 @@ def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
 
 
 def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool_], colours: str | None) -> None:
-    # of many lines some are drawn, evenly chosen: all would hide the scans
+    # an even selection of lines: too many would hide the scans
     from matplotlib import colormaps
 
     chosen = np.flatnonzero(which)
@@ -303,7 +303,7 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
 
 def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
     distance_m = np.hypot(*off_m.T)
-    distance_m[distance_m == 0.0] = np.nan  # the zero of the first scan has no place on a logarithmic axis
+    distance_m[distance_m == 0.0] = np.nan  # a logarithmic axis has no place for the first scan's zero
     ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
     ax.set_ylabel("position error of the scan / nm")
 
@@ -312,7 +312,7 @@ def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
     error_m = record.drift_m - record.drift_m[:1] - truth_m
     unit, factor = unit_of(error_m)
     for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
-        sd = record.sd_m[1:, axis] * factor  # the first is what displacements are counted from
+        sd = record.sd_m[1:, axis] * factor  # displacements are counted from the first scan
         ax.fill_between(hours[1:], -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
         ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, believed - true")
     ax.axhline(0.0, color=GREY, linewidth=0.4)

@@ -48,7 +48,7 @@ class Registered:
     failures: list[str]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # out of a file it is a number
+        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # a saved state has it as a number
 
     @property
     def matched(self) -> bool:
@@ -124,7 +124,7 @@ class Compensated:
 
 
 WorkerJob = StartWorker | ScanJob | Compensated
-"""Jobs for the worker. A scan may come twice: then it is answered as the first time."""
+"""Jobs for the worker. A repeated scan gets the first answer."""
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,13 @@ class RescanWanted:
     """A request to the Rescanner.
 
     Attributes:
-        said: the ScanParameters2d of the region, in the coordinates of components.
+        requested: the ScanParameters2d of the region, in the coordinates of components.
         shape: (rows, columns); None: the shape in force.
         upwards: the direction to scan; None: any.
     """
 
     kind: RescanKind
-    said: bytes
+    requested: bytes
     shape: tuple[int, int] | None
     reason: str
     time_ns: int

@@ -14,7 +14,7 @@ from afspm.scheduler.events import Codec
 P = TypeVar("P", bound=Region | ProbePosition)
 
 SAME = 1e-3
-"""Part of a region's size by which a controller may round: what it tells then is what it was set to."""
+"""Share of a region's size by which a controller may round: within it, the reported region is the one that was set."""
 SAME_PLACE_M = 1e-9
 
 _CANDIDATES = 8
@@ -43,13 +43,13 @@ class PositionPair(Generic[P]):
 
     Attributes:
         sample: as requested by a component.
-        said: the component's message, to the last bit.
+        requested: the component's message, to the last bit.
         tip: as the microscope was set.
         sent: the message that set it.
     """
 
     sample: P
-    said: bytes
+    requested: bytes
     tip: P
     sent: bytes
 
@@ -76,7 +76,7 @@ class TargetPosition(Generic[P]):
     def published(self, tip: P) -> TargetPosition[P] | None:
         """Put in force the place that the microscope publishes; None if the scheduler did not set it."""
         known: list[PositionPair[P]] = [*self.sent] if self.current is None else [self.current, *self.sent]
-        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # the newest first, of those as near
+        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # of equally near ones the newest
         return self.at(min(near, key=lambda place: away_m(place.tip, tip))) if near else None
 
 
@@ -101,10 +101,10 @@ def value_in(name: str, region: Region) -> float:
     return float(_VALUES[name](region))
 
 
-def told_as(name: str, value: float, told: Parameter | None) -> Parameter:
+def in_reported_unit(name: str, value: float, told: Parameter | None) -> Parameter:
     """Return a value in SI as a parameter in the unit that the microscope uses for it."""
     unit = _unit(told or Parameter(name))
-    # 15 digits: what was set as 0.1 nm is told as 0.1, not as 0.09999999999999999
+    # 15 digits: a value set as 0.1 nm reads as 0.1, not as 0.09999999999999999
     return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)
 
 

@@ -27,7 +27,7 @@ from afspm.scheduler.events import Announced, Delegate, ProblemSeen
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
-"""As many unregistered scans in a row are as good as a lost sample: the number of the trackers."""
+"""Unregistered scans in a row that count as a lost sample; the trackers use the same number."""
 _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 
@@ -35,9 +35,9 @@ def respond(draft: DriftDraft, what: FollowUp) -> None:
     """Give a response that was deferred until its scan was published."""
     match what:
         case RespondToScan():
-            _to_scan(draft, what)
+            _respond_to_scan(draft, what)
         case RespondToFailure():
-            _to_failure(draft, what.why)
+            _respond_to_failure(draft, what.why)
         case CallPerson():
             _call_person(draft)
 
@@ -47,13 +47,14 @@ def is_given_up(draft: DriftDraft) -> bool:
     return _MALFUNCTION in draft.control.problems
 
 
-def _to_scan(draft: DriftDraft, what: RespondToScan) -> None:
+def _respond_to_scan(draft: DriftDraft, what: RespondToScan) -> None:
     registered = what.registered
     draft.duties = replace(draft.duties, unregistered=0)
     if not draft.corrects:
-        draft.duties = replace(draft.duties, started=True)  # before correction the velocity has time to show
+        # until correction begins, there is time to measure the velocity
+        draft.duties = replace(draft.duties, started=True)
     elif draft.control.mode is ControlMode.MANUAL:
-        # a person's scan is followed, and not scanned again
+        # a person's scan is followed, but no rescan requested
         if registered.matched and not registered.lost:
             _clear_own_flag(draft)
     elif registered.lost:
@@ -61,24 +62,25 @@ def _to_scan(draft: DriftDraft, what: RespondToScan) -> None:
     elif not draft.duties.started:
         _scan_in_opposite_direction(draft, what.job.upwards)
     elif draft.tally.exceeds(draft.env.settings.most_unregistered):
-        _too_few(draft)
+        _respond_to_low_share(draft)
     else:
         if registered.matched:
             _clear_own_flag(draft)
         if registered.rescan:
-            _want(draft, RescanKind.AGAIN, registered.rescan)
+            _request_rescan(draft, RescanKind.AGAIN, registered.rescan)
 
 
-def _to_failure(draft: DriftDraft, why: str) -> None:
+def _respond_to_failure(draft: DriftDraft, why: str) -> None:
     if not draft.corrects or draft.control.mode is ControlMode.MANUAL:
         return
     unregistered = draft.duties.unregistered + 1
     if unregistered < _MOST_UNREGISTERED:
         draft.duties = replace(draft.duties, unregistered=unregistered)
         if draft.tally.exceeds(draft.env.settings.most_unregistered):
-            _too_few(draft)
+            _respond_to_low_share(draft)
         return
-    draft.duties = replace(draft.duties, unregistered=0)  # a component that goes on gets the flag after as many again
+    # if a component clears the flag, it is flagged again after the same number
+    draft.duties = replace(draft.duties, unregistered=0)
     draft.tally = draft.tally.share_restarted()
     _search(draft, f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}")
 
@@ -91,7 +93,7 @@ def _call_person(draft: DriftDraft) -> None:
     draft.outputs.append(ProblemSeen(_MALFUNCTION, flagged=True, name=draft.env.name))
 
 
-def _too_few(draft: DriftDraft) -> None:
+def _respond_to_low_share(draft: DriftDraft) -> None:
     draft.tally = draft.tally.share_restarted()
     share = f"more than {draft.env.settings.most_unregistered:.0%} of the last {LATELY} scans were not registered"
     _search(draft, f"{share}: {draft.tally.summary()}")
@@ -99,9 +101,9 @@ def _too_few(draft: DriftDraft) -> None:
 
 def _search(draft: DriftDraft, why: str) -> None:
     draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
-    # a component that searches has widened the region: the region of the scans before is what was asked for
+    # a searching component has widened the region itself: a request for that region would be wrong
     if draft.control.solving != _DRIFT:
-        _want(draft, RescanKind.SEARCH, why)
+        _request_rescan(draft, RescanKind.SEARCH, why)
 
 
 def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None:
@@ -113,7 +115,7 @@ def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None
         return
     draft.log("INFO", "thermal-drift is flagged until the first scan was taken in both directions: normal at the start")
     draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
-    _want(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
+    _request_rescan(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
 
 
 def _clear_own_flag(draft: DriftDraft) -> None:
@@ -123,13 +125,13 @@ def _clear_own_flag(draft: DriftDraft) -> None:
         draft.outputs.append(ProblemSeen(_DRIFT, flagged=False, name=draft.env.name))
 
 
-def _want(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
+def _request_rescan(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
     place = draft.places.region.current
     if place is None:
         draft.log("ERROR", f"{reason}, and the region to scan again is unknown")
         return
-    wanted = RescanWanted(kind, place.said, draft.places.shape, reason, draft.now_ns, upwards)
-    level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # one belongs to the beginning of every night
+    wanted = RescanWanted(kind, place.requested, draft.places.shape, reason, draft.now_ns, upwards)
+    level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # it belongs to the start of every night
     draft.log(level, f"requesting a rescan: {reason}")
     draft.outputs.append(Announced(RESCAN, draft.env.codec.encode_rescan(wanted)))
 
@@ -173,7 +175,7 @@ def hand_over(draft: DriftDraft) -> None:
 def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
     """Process the answer for one axis: the controller may accept one axis and refuse the other."""
     if not response.ok:
-        # not free: a scan has begun already, and the rate is handed over after the next
+        # NOT_FREE: a scan has already begun; the rate is handed over after the next one
         if response.code != ControlResponse.NOT_FREE:
             draft.log("ERROR", f"the controller refused the drift rate, {given.name}: {response.reason}")
         return

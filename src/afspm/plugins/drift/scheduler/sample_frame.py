@@ -88,7 +88,7 @@ class SampleFrame:
             case PacketIn():
                 scan_intake.take_packet(draft, event)
             case TranslatorCaughtUp() if draft.gate.held is not None:
-                draft.gate = draft.gate.keep(event)  # the packets that wait came before it
+                draft.gate = draft.gate.keep(event)  # the waiting packets were published before it
             case RequestIn() if event.request.kind == ControlRequest.END_EXPERIMENT and draft.gate.held is not None:
                 why = "the experiment ended before"
                 scan_intake.publish_as_predicted(draft, draft.gate.held, why, "WARNING")
@@ -100,7 +100,7 @@ class SampleFrame:
                 if isinstance(event.purpose, RateGiven):
                     response.rate_answered(draft, event.purpose, event.response)
             case Tick() if draft.following:
-                _respond(draft)  # one in a step, since it may change who is in control
+                _respond(draft)  # one per step, since a response may change which client is in control
             case Tick():
                 draft.outputs.append(event)
                 scan_intake.expire(draft)
@@ -176,7 +176,7 @@ class SampleFrame:
         try:
             saved: SavedDrift = from_plain(SavedDrift, plain)
             return self._with(saved.restored(self.env.settings, self.env.codec))
-        except (AfspmError, AttributeError) as error:  # a forecast of another tracker, plain data of another frame
+        except (AfspmError, AttributeError) as error:  # saved by another tracker or frame
             raise ValueError(f"the saved drift can't be used: {error}") from error
 
     def recalled(self, packets: Iterable[LoggedPacket]) -> SampleFrame:

@@ -68,9 +68,9 @@ _LEVELS = {
     RegistrationOutcome.NEW: "INFO",
 }
 _MOST_TRIES = 2
-"""A scan over which the worker ends is tried as often."""
+"""Tries with a scan during which the worker ends."""
 _MOST_ENDS = 4
-"""After as many ends in a row, without a scan registered between them, the worker is not started again."""
+"""Ends of the worker in a row, without a registered scan in between, after which it is not restarted."""
 
 
 # --- packets ----------------------------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
     """Pass a packet on, or keep it with the scan that it belongs to or follows."""
     if (before := draft.gate.held) is not None:
         draft.gate = draft.gate.keep(event)
-        _look_at(draft, before, event)
+        _find_channel(draft, before, event)
         return
     message, packet = event.header.message, event.packet
     if message == "ScopeStateMsg":
@@ -98,14 +98,14 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
     held = HeldScan(key, _middle_s(draft, scan, event), until_s, scan.filename, scan.region.center_m)
     draft.gate = replace(draft.gate, held=held).keep(event)
     draft.outputs.append(HoldControl(until_s))
-    _look_at(draft, held, event)
+    _find_channel(draft, held, event)
 
 
-def _look_at(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
+def _find_channel(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
     # a state other than SCANNING ends a scan that has no channel to register
     if held.asked:
         return
-    if draft.worker.ends >= _MOST_ENDS:  # a person was called, or decided that the experiment goes on
+    if draft.worker.ends >= _MOST_ENDS:  # a person was called, or has chosen to go on
         publish_as_predicted(draft, held, "drift is no longer followed", "WARNING")
         return
     message, codec = event.header.message, draft.env.codec
@@ -131,7 +131,7 @@ def _register(draft: DriftDraft, held: HeldScan, scan: Scan, event: PacketIn) ->
         upwards = begun.upwards
         durations = draft.places.durations.learn(scan.shape, scan.region.size_m, end_s - start_s)
         draft.places = replace(draft.places, durations=durations)
-    _ask_worker(draft, held, ScanJob(held.key, scan, start_s, end_s, upwards, _meant(draft, scan)))
+    _ask_worker(draft, held, ScanJob(held.key, scan, start_s, end_s, upwards, _requested_region(draft, scan)))
 
 
 def _ask_worker(draft: DriftDraft, held: HeldScan, job: ScanJob) -> None:
@@ -140,7 +140,7 @@ def _ask_worker(draft: DriftDraft, held: HeldScan, job: ScanJob) -> None:
     draft.outputs.append(Delegate(job))
 
 
-def _meant(draft: DriftDraft, scan: Scan) -> Region | None:
+def _requested_region(draft: DriftDraft, scan: Scan) -> Region | None:
     # unknown if the scan was taken elsewhere than the scheduler had set it
     place = draft.places.region.current
     if place is None or not is_same(place.tip, scan.region):
@@ -173,14 +173,14 @@ def take_report(draft: DriftDraft, report: WorkerReport) -> None:
             draft.worker = replace(draft.worker, ends=0)
             _give_up(draft, report.key, report.reason)
         case WorkerGone():
-            _gone(draft, report)
+            _worker_gone(draft, report)
         case Forecasted():
-            _learn(draft, report.forecast)
+            _take_forecast(draft, report.forecast)
 
 
 def _registered(draft: DriftDraft, report: Registered) -> None:
     draft.worker = replace(draft.worker, ends=0)
-    _learn(draft, report.forecast)
+    _take_forecast(draft, report.forecast)
     held, job = draft.gate.held, draft.worker.job
     is_awaited = held is not None and held.key == report.key
     if held is not None and is_awaited:
@@ -188,7 +188,7 @@ def _registered(draft: DriftDraft, report: Registered) -> None:
         draft.gate = draft.gate.settle(report.key, report.matrix if corrects else None)
         _log_if_slow(draft, held)
     if job is None or job.key != report.key:
-        return  # a worker that was restarted repeats its last report
+        return  # a restarted worker repeats its last report
     draft.worker = replace(draft.worker, job=None)
     draft.forecast = replace(draft.forecast, lost=report.lost)
     before_ns = draft.gate.next_ns() if is_awaited else None
@@ -196,17 +196,17 @@ def _registered(draft: DriftDraft, report: Registered) -> None:
     _log_outcome(draft, report, job.scan.filename)
     if is_awaited:
         _release(draft)
-    _follow(draft, RespondToScan(report, job))
+    _respond_later(draft, RespondToScan(report, job))
     response.hand_over(draft)
 
 
-def _gone(draft: DriftDraft, report: WorkerGone) -> None:
+def _worker_gone(draft: DriftDraft, report: WorkerGone) -> None:
     ends = draft.worker.ends + 1
     draft.worker = replace(draft.worker, ends=ends)
     held, job = draft.gate.held, draft.worker.job
     if ends >= _MOST_ENDS:
         draft.log("CRITICAL", f"drift is no longer followed: {report.reason}")
-        _follow(draft, CallPerson())
+        _respond_later(draft, CallPerson())
         if held is not None:
             publish_as_predicted(draft, held, report.reason)
         return
@@ -238,7 +238,7 @@ def restart_if_cleared(draft: DriftDraft) -> None:
         draft.outputs.append(Delegate(StartWorker()))
 
 
-def _learn(draft: DriftDraft, forecast: Plain | None) -> None:
+def _take_forecast(draft: DriftDraft, forecast: Plain | None) -> None:
     try:
         draft.forecast = draft.forecast.learn(forecast)
     except AfspmError as error:
@@ -253,7 +253,7 @@ def _log_if_slow(draft: DriftDraft, held: HeldScan) -> None:
         return
     draft.worker = replace(draft.worker, slow_logged=True)
     text = f"registering a scan took {took_s:.1f} s, and is given up after longest_registration = {limit_s:g} s"
-    draft.log("WARNING", f"{text}: use fewer pixels, or raise it")
+    draft.log("WARNING", f"{text}: use fewer pixels, or raise longest_registration")
 
 
 # --- publication ------------------------------------------------------------------------------------------------------
@@ -263,7 +263,7 @@ def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
     # counted as a failure: after several of them the prediction is not reliable
     held = draft.gate.held
     if held is not None and held.key == key:
-        _follow(draft, RespondToFailure(why))
+        _respond_later(draft, RespondToFailure(why))
         publish_as_predicted(draft, held, why, level)
 
 
@@ -298,12 +298,12 @@ def _log_outcome(draft: DriftDraft, report: Registered, filename: str, level: st
 
 
 def _release(draft: DriftDraft) -> None:
-    # saved first: published again after a kill, the scan must have the same mapping
+    # saved first: a scan published again after a kill must have the same mapping
     draft.outputs += (SaveNow(), *map(Reconsider, draft.gate.waiting))
     draft.gate = draft.gate.opened()
 
 
-def _follow(draft: DriftDraft, what: FollowUp) -> None:
+def _respond_later(draft: DriftDraft, what: FollowUp) -> None:
     # in a step of its own, since a response may change which client is in control
     draft.following = (*draft.following, (draft.now_s, what))
 

@@ -114,7 +114,7 @@ class DriftWireCodec(WireCodec):
         ).SerializeToString()
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
-        params = ScanParameters2d.FromString(wanted.said)
+        params = ScanParameters2d.FromString(wanted.requested)
         if wanted.shape is not None:
             params.data.shape.y, params.data.shape.x = wanted.shape
         message = DriftRescan(

@@ -86,8 +86,8 @@ class DriftCompensationSettings:
                 raise InvalidValue(f"{name} = {value} s is not zero or more", where="drift")
 
         if not 0.0 <= self.most_unregistered <= 1.0:
-            said = f"most_unregistered = {self.most_unregistered} is not a share"
-            raise InvalidValue(said, where="drift", hint="0 to 1")
+            reason = f"most_unregistered = {self.most_unregistered} is not a share"
+            raise InvalidValue(reason, where="drift", hint="0 to 1")
 
     def beside(self, solved: Collection[str]) -> DriftCompensationSettings:
         """Return these settings for a run whose components solve the given problems.

@@ -9,7 +9,7 @@ from afspm.basics.frozen import replace
 from afspm.model import RegistrationOutcome, registration_summary
 
 LATELY = 10
-"""The number of scans by which the share of unregistered ones is judged."""
+"""Number of scans in the share of unregistered ones."""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from afspm.plugins.drift.scheduler.worker import Complaint, main
 
 _FAREWELL_S = 1.0
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# forked, the child would hold the scheduler's sockets and locks
+# spawn: a forked child would hold the scheduler's sockets and locks
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
@@ -90,7 +90,7 @@ class DriftWorkerProcess:
                 end.close()
             self._add(self._life, WorkerGone(f"it can't be started: {error}"))
             return
-        finally:  # only the child holds these: so that their end is the end of the child
+        finally:  # closed here, so that only the child holds them and their end shows its end
             from_us.close()
             to_us.close()
         self._process, self._jobs = process, queue.SimpleQueue()
@@ -106,7 +106,7 @@ class DriftWorkerProcess:
         self._jobs.put(None)
         process.join(within_s)
         process.kill()
-        # not for the thread that reads: a process that an estimator has forked holds the pipe open
+        # no wait for the reading thread: a process forked by an estimator may hold the pipe open
         process.join()
 
     def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:

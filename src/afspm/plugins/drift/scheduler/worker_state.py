@@ -53,8 +53,10 @@ class WorkerStateFile:
             with self.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 state = json.loads(arrays[_JSON].tobytes())
                 found: Plain = _with_arrays(state, arrays)
-        except Exception as error:  # a damaged file makes numpy raise whatever it likes
-            raise FileError(f"can't be read: {error}", where=str(self.path), hint="remove it to begin anew") from error
+        except Exception as error:  # numpy raises many kinds of exceptions for a damaged file
+            raise FileError(
+                f"can't be read: {error}", where=str(self.path), hint="remove it to start without it"
+            ) from error
         return found
 
 

@@ -20,7 +20,7 @@ from afspm.simulation import World
 
 Array = NDArray[np.float64]
 
-SETTLED_S = 7200.0  # the rate is not known at the start: that is another matter than following it
+SETTLED_S = 7200.0  # at the start the rate is unknown; the metrics judge tracking after that
 _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two components, in standard deviations
 
 

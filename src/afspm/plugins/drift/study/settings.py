@@ -54,7 +54,7 @@ class NightSettings:
         if self.pixels * self.line_s > self.every_s:
             raise InvalidValue(
                 f"a scan of {self.pixels * self.line_s:g} s does not fit into {self.every_s:g} s",
-                hint="less pixels, a shorter line_s or a longer every_s",
+                hint="fewer pixels, a shorter line_s or a longer every_s",
             )
         if self.scans < 2:
             raise InvalidValue(f"{self.hours:g} h with a scan every {self.every_s:g} s are not two scans")
@@ -82,7 +82,7 @@ class NightSettings:
             table = plain.get(part, {})
             table = {"class": table} if isinstance(table, str) else dict(table)
             table.setdefault("class", _DEFAULTS[part])
-            plain[part] = table | _told(table["class"], names)
+            plain[part] = table | _settings_of(table["class"], names)
         return cls(**plain)
 
 
@@ -92,6 +92,6 @@ STARTS = ("up-down", "nothing")
 _DEFAULTS = {"estimator": DEFAULT_ESTIMATOR, "tracker": DEFAULT_TRACKER}
 
 
-def _told(name: str, names: Table) -> dict[str, object]:
+def _settings_of(name: str, names: Table) -> dict[str, object]:
     before = f"{name}."
     return {key.removeprefix(before): value for key, value in names.items() if key.startswith(before)}

@@ -9,7 +9,7 @@ from statistics import median
 import numpy as np
 
 BY = "misplaced rms"
-"""What settings are judged by: how far off their place scans are taken, once the rate is known."""
+"""The metric of the ranking: misplacement of scans, once the rate is known."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def _honest(metrics: Mapping[str, float], name: str) -> float:
 
 
 def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    # of the values themselves: between a number and infinity there is nothing
+    # of the values themselves: interpolation with infinity is impossible
     lower = float(np.percentile(values, 25, method="lower"))
     upper = float(np.percentile(values, 75, method="higher"))
     return lower, float(median(values)), upper

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SHORT = 1e-2  # of the fading time: below, differences of exponentials lose their digits and a series is exact enough
+_SHORT = 1e-2  # of the fading time: below, differences of exponentials lose digits, and a series is exact enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ class Models:
         A negative time goes back in a straight line, and adds as much.
         """
         a, q, t = self.fading_per_s, self.density_m2_s3, abs(step_s)
-        reach_s = np.full_like(a, step_s)  # by which the velocity has moved the position
-        left = np.ones_like(a)  # of the velocity
+        reach_s = np.full_like(a, step_s)  # distance per initial velocity
+        left = np.ones_like(a)  # remaining share of the velocity
         if step_s > 0.0:
             left = np.exp(-a * t)
             reach_s = np.where(a > 0.0, -np.expm1(-a * t) / np.where(a > 0.0, a, 1.0), t)

@@ -23,7 +23,7 @@ from afspm.plugins.drift.trackers.similarity import Similarity
 Array = NDArray[np.float64]
 
 AGREEMENT = 25.0  # chi2 of the difference of two references' results
-_ALIKE = 0.05  # by which part the courses of two scans may differ if drift is to shear them alike
+_ALIKE = 0.05  # largest relative difference in pace at which drift shears two scans alike
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class NewestScan:
 
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's velocity includes it.
-        similarity: rotation and scale, by which the scan is straightened; None: only translations are followed.
+        similarity: rotation and scale for straightening the scan; None: only translations are followed.
     """
 
     scan: DriftScan
@@ -90,7 +90,7 @@ class NewestScan:
 
     def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:
         # (2, 2) of the displacement between a scan's middle and a position, with its direction unknown
-        delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # as much later as earlier
+        delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # later or earlier by the same time
         velocity, covariance = self.filters.velocity(number)
         velocity = velocity - compensated_m_s
         return np.asarray(delay_s**2 * (np.outer(velocity, velocity) + covariance))

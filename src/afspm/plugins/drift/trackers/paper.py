@@ -205,7 +205,7 @@ class PaperTracker:
         placed, tried, reason = (None, {}, "") if first else self._match(scan, before.mapping)
         matched = first or placed is not None
         mapping = before.mapping if placed is None else self._averaged(before.mapping, placed)
-        # elsewhere there is nothing to be found, and an error of the estimator says nothing about the sample
+        # only a refusal in an overlap counts: an error of the estimator means nothing about the sample
         state.unmatched = 0 if matched else state.unmatched + any(not one.failure for one in tried.values())
         self._step(scan, before, mapping, [one for one in tried.values() if one.accepted])
         state.queue.append(PlacedScan(scan, mapping))

@@ -19,9 +19,9 @@ from afspm.plugins.drift.registration import DriftScan, LinearSeen
 
 Array = NDArray[np.float64]
 
-_SHEAR_SD = 0.03  # displacement per length along the slow axis, by drift during the scans: nothing is known of it
+_SHEAR_SD = 0.03  # displacement per length along the slow axis, by unknown drift during the scans
 _LEAST_SD = 1e-5  # of a measurement
-_DOUBT = 25.0  # chi2 above which a measurement is not believed before the next one is like it
+_DOUBT = 25.0  # chi2 above which a measurement is not believed until the next one confirms it
 _OF_SCALE, _OF_ANGLE = np.array([1.0, 0.0, 0.0, 1.0]), np.array([0.0, -1.0, 1.0, 0.0])
 
 

@@ -20,7 +20,7 @@ from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
 
-_PAGE = ".page"  # no name of a person begins so
+_PAGE = ".page"  # no person's name begins with a dot
 
 
 @dataclass(frozen=True)
@@ -160,10 +160,10 @@ def refusal(response: Response) -> str:
 def _in_force(parameter: str, response: Response) -> str:
     # in SI where it has a unit, with the prefix that reads well
     if not response.payload:
-        return "not told"
-    said = wire.decode_parameter(response.payload)
-    value = from_parameter(said, None)
-    unit = names.BASE_PARAMETERS.get(parameter) or said.unit or ""
+        return "unknown"
+    parameter_now = wire.decode_parameter(response.payload)
+    value = from_parameter(parameter_now, None)
+    unit = names.BASE_PARAMETERS.get(parameter) or parameter_now.unit or ""
     if isinstance(value, bool) or not isinstance(value, float | int):
         return str(value)
     return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
@@ -238,7 +238,7 @@ class Steering:
             result = action(Actions(commands, self._watch))
         except AfspmError as error:
             result = ActionResult(str(error), ok=False)
-        except Exception as error:
+        except Exception as error:  # a defect in an action is shown to its person, and must not end the page
             self._log.exception("an action of %s failed", person)
             result = ActionResult(f"The action failed: {type(error).__name__}: {error}", ok=False)
         self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")

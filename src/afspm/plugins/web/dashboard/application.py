@@ -58,11 +58,11 @@ def application(
     nicegui.on_exception(_log_error)
     ui.run_with(app, root=root, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
 
-    def wait_told(within_s: float) -> None:
-        services.audience.wait_told(within_s)
+    def wait_until_end_shown(within_s: float) -> None:
+        services.audience.wait_until_end_shown(within_s)
         live.close()
 
-    return Guard(app, access, host), wait_told
+    return Guard(app, access, host), wait_until_end_shown
 
 
 def _log_error(error: Exception) -> None:

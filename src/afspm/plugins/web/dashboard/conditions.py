@@ -48,7 +48,7 @@ class Conditions:
         self._asking = False
         if done.cancelled() or done.exception() is not None:
             return  # the dashboard ends
-        told = done.result().each
-        self._read[began_ns] = {LABELS[name]: one.text for name, one in told.items() if one.ok}
+        values = done.result().each
+        self._read[began_ns] = {LABELS[name]: one.text for name, one in values.items() if one.ok}
         while len(self._read) > KEPT:
             self._read.popitem(last=False)

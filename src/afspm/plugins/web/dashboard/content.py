@@ -21,10 +21,10 @@ from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
 from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
 
-ANEW_S = 0.4  # at most that often, however much is published
-SLOWLY_S = 2.0  # for what takes longer to make
-OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
-NOT_HEARD_OF = "never heard from"
+LEAST_AGE_S = 0.4  # age of the content before it is made again, at any rate of messages
+SLOWLY_S = 2.0  # the same for slow content
+OLD_AFTER_S = 8.0  # a supervisor publishes its processes every 2 s
+NO_REPORT = "no report"
 _STARTING = "starting"
 _AS_USUAL = {_STARTING, "alive", "ended"}
 
@@ -96,7 +96,7 @@ class Contents:
             now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
             if revision != self._revision:
                 self._revision, self._made_s, self._drawn_s = revision, -math.inf, -math.inf
-            if now_s - self._made_s >= ANEW_S or self._watch.ended != self._content.ended:
+            if now_s - self._made_s >= LEAST_AGE_S or self._watch.ended != self._content.ended:
                 self._made_s = now_s
                 self._content = self._make(now_s)
             return self._content
@@ -239,7 +239,7 @@ def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
     for span in lane.spans:
         yield replace(span, end_ns=max(told_ns, span.start_ns)) if span.end_ns is None else span
     if lane.now is not None:
-        yield Span(NOT_HEARD_OF, told_ns)
+        yield Span(NO_REPORT, told_ns)
 
 
 def status_html(watch: Watch, overview: Overview) -> str:
@@ -270,7 +270,7 @@ def _chip(html: str, part: str, style: str = "") -> str:
 
 def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
     status = overview.status
-    state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
+    state = status.state.name.lower().replace("_", " ") if status else NO_REPORT
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
     far = "" if done is None else f" {100 * done[0]:.0f} %<small>ends {time_of_day(now_ns + done[1])}</small>"

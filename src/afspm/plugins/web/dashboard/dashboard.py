@@ -18,7 +18,7 @@ from afspm.plugins.web.server import USUAL_PORT
 from afspm.plugins.web.watch import Audience
 from afspm.record.run_json import experiment_name
 
-TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
+END_SHOWN_WITHIN_S = 1.5  # time for the pages to show the end
 
 
 class Dashboard(WebComponent):
@@ -85,7 +85,7 @@ class Dashboard(WebComponent):
             self.simulated,
             Conditions(self._watch, self._steering.read),
         )
-        app, self._wait_told = application(services, archive, host=self._host, encrypted=self.encrypted)
+        app, self._wait_for_end_shown = application(services, archive, host=self._host, encrypted=self.encrypted)
         self.serve(app, bound)
         if not self.encrypted and not is_loopback(self._host):
             self.log.warning(
@@ -99,6 +99,6 @@ class Dashboard(WebComponent):
         if self._server is None:
             return
         self._watch.end()
-        self._wait_told(TOLD_WITHIN_S)
+        self._wait_for_end_shown(END_SHOWN_WITHIN_S)
         self._steering.close()
         self._server.stop()

@@ -24,9 +24,9 @@ from afspm.record.drawing.curves import profile
 from afspm.record.drawing.palette import DIVERGING, LEVELS, PALETTES
 from afspm.record.drawing.raster import png
 
-POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
+POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
-FINISHED_S = 0.004  # between two of finished ones, for each who looks on, and ten times that at least
+FINISHED_S = 0.004  # between two pictures of finished scans, per viewer; at least ten times that in total
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class Live:
         end_s, growing_s = now_s + POLL_S, now_s + GROWING_S
         self._waiting += 1
         try:
-            # many viewers at full speed get fewer pictures each, and not the experiment less time
+            # with many viewers each gets fewer pictures, so that the experiment keeps its processor time
             finished_s = now_s + FINISHED_S * max(10, self._waiting)
             while True:
                 number, complete = self._newest(channel)

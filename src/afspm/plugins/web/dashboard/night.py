@@ -21,7 +21,7 @@ from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 
 SPECTRA = 8
-"""The spectra before a moment that are read."""
+"""Spectra read before a moment."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +199,7 @@ class StoppedClock:
 def _events(run: Run) -> Iterator[NightEvent]:
     for number, (packet, message, thing) in enumerate(run.messages()):
         if isinstance(thing, Note):
-            yield NightEvent(thing.time_ns, message, thing, f"{message}_{number}")  # two may be about one moment
+            yield NightEvent(thing.time_ns, message, thing, f"{message}_{number}")  # two notes may describe one moment
         else:
             yield NightEvent(packet.time_ns or 0, message, thing, packet.envelope)
 

@@ -27,12 +27,12 @@ from afspm.record.drawing.palette import PALETTES
 
 ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5
-ANSWER_S = 5.0  # a browser that has not drawn the last for so long gets nothing more until it has
+ANSWER_S = 5.0  # a browser that has not drawn the last update within this time gets no more until it has
 THEMES = {"": None, "light": False, "dark": True}
 _HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="/assets/dashboard.css">
 <script type="module" src="/assets/page.js"></script>"""
 LEVELLINGS = {Levelling.LINES: "line by line"}
-"""How levellings are called where their value is no word."""
+"""Labels of levellings whose value is no word."""
 SIMULATED = "SIMULATED: this is not a real microscope"
 
 
@@ -57,7 +57,7 @@ class Services:
 
 
 TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
-"""Of a phone: where each section is then is in the style sheet."""
+"""Tabs on a phone; the style sheet assigns the sections to them."""
 
 
 class Page:

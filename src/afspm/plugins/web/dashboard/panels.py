@@ -14,7 +14,7 @@ from afspm.model import LogLine, ProcessCondition, ProcessState
 from afspm.plugins.web.dashboard.access import Visitor
 from afspm.plugins.web.dashboard.actions import ActionResult, Steering
 from afspm.plugins.web.dashboard.charts import Chart, spectrum_chart
-from afspm.plugins.web.dashboard.content import NOT_HEARD_OF
+from afspm.plugins.web.dashboard.content import NO_REPORT
 from afspm.plugins.web.dashboard.steering_panel import ask_restart
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 from afspm.plugins.web.watch import Watch
@@ -186,7 +186,7 @@ class HealthRow:
         words = process_words(state, unheard_ns)
         for cell, text in zip(self._cells, words, strict=True):
             cell.set_text(text)
-        style = "bad" if state.condition in _BAD or words[0] == NOT_HEARD_OF else words[0].replace(" ", "-")
+        style = "bad" if state.condition in _BAD or words[0] == NO_REPORT else words[0].replace(" ", "-")
         if style != self._style:
             self._dot.classes(remove=f"is-{self._style}", add=f"is-{style}")
             self._style = style
@@ -203,7 +203,7 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
         gone = f"for {duration_text(unheard_ns / NS_PER_S)}: its supervisor has ended or can't be reached"
-        condition, since = NOT_HEARD_OF, gone
+        condition, since = NO_REPORT, gone
     elif state.step_age_s >= 1.0:
         since = f"in the same step for {duration_text(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"

@@ -86,7 +86,7 @@ class PictureCache:
 
     def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
         """Return the picture of a frame, with the range of values of a frame beside it, if there is one."""
-        with self._lock:  # two that want the same wait for one; two that want others share a core anyway
+        with self._lock:  # requests for the same picture wait for one drawing; others would share a core anyway
             return self._drawn(frame, look, beside)
 
 
@@ -120,5 +120,6 @@ class Thumbnails:
     def _draw(self, time_ns: int, channel: str) -> bytes:
         frame = self._frame(time_ns, channel)
         if frame is None:
+            # raised, so that the cache does not keep a missing picture
             raise LookupError(time_ns)
         return shown(flattened(frame.values), SIDE_PX).image

@@ -78,7 +78,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
         night.title, night.simulated, Conditions(watch, partial(steering.do, Visitor())),
     )  # fmt: skip
     encrypted = settings.certificate is not None
-    app, wait_told = application(
+    app, wait_until_end_shown = application(
         services, archive, host=settings.host, encrypted=encrypted,
         page=partial(NightPage, night, pictures), more=NightRequests(night, archive).add_to,
     )  # fmt: skip
@@ -92,7 +92,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     tell(f"the dashboard is at {url}; press Ctrl-C to close it")
     while not stopped.wait(1.0):  # on Windows a signal does not end a wait without a limit
         pass
-    wait_told(0.0)
+    wait_until_end_shown(0.0)
     steering.close()
     server.stop()
 

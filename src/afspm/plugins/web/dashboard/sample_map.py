@@ -153,7 +153,7 @@ class MapView:
         low, high = points_m.min(axis=0), points_m.max(axis=0)
         side = max(*(high - low), 1e-10)
         low, high = low - _MARGIN * side, high + _MARGIN * side
-        # never narrower than the page has room for, nor so flat that nobody could click in it
+        # fits the page's width, and is high enough for clicks
         lacking = np.maximum(_LEAST * (high - low).max() - (high - low), 0.0)
         low, high = low - lacking / 2, high + lacking / 2
         per_m = 1000.0 / float((high - low).max())

@@ -97,7 +97,7 @@ class ScanDialog:
             width = str(self._width.value or "")
             height = width if self._square.value else str(self._height.value or "")
             pixels, angle = str(self._pixels.value or ""), str(self._angle.value or "")
-            if angle == _degrees(self._choice.region):  # as exact as it is set, not as it is shown
+            if angle == _degrees(self._choice.region):  # unedited: as exact as set, not as shown
                 angle = ""
             choice = self._choice.edited(width, height, pixels, angle)
         except (UnitError, InvalidValue) as error:

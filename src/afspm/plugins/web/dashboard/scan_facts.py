@@ -70,7 +70,7 @@ def _centre(xy_m: XY) -> str:
 
 
 def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
-    # one that was interrupted is in the list already
+    # an interrupted scan is already in the list
     number = (overview.scans[-1].number if overview.scans else 0) + (overview.running is not None)
     facts = [("Scan", f"no. {number}")]
     if frame.began_ns is not None:

@@ -73,10 +73,10 @@ class Sessions:
     def find(self, cookie: str) -> Session | None:
         """Return the session of a cookie; None if it was not signed here, or has ended."""
         with self._lock:
-            is_signed, said = self._signer().loads_unsafe(cookie)
-            if not is_signed or not cookie.isascii():  # base64 passes over letters that it doesn't know
+            is_signed, content = self._signer().loads_unsafe(cookie)
+            if not is_signed or not cookie.isascii():  # base64 skips unknown letters
                 return None
-            session, kept = Session(*said), self._kept
+            session, kept = Session(*content), self._kept
             is_over = session.number in kept.ended or session.generation != kept.generations.get(session.person, 0)
             return None if is_over or self._now_s() - session.since_s >= REMEMBERED_S else session
 
@@ -92,6 +92,7 @@ class Sessions:
             oldest_s = self._now_s() - REMEMBERED_S
             kept.ended = {number: since_s for number, since_s in kept.ended.items() if since_s > oldest_s}
             kept.ended[session.number] = session.since_s
+            # forgetting single sessions would revive them: a new key ends them all
             if len(kept.ended) > MOST_ENDED:
                 self._kept = _Kept()
             self._save()
@@ -103,7 +104,8 @@ class Sessions:
 
     def _save(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # on a full disk they end with this process
+            # on a full disk, ended sessions are remembered only until this process ends
+            with contextlib.suppress(OSError):
                 replace_file(self._file, [json.dumps(asdict(self._kept)).encode()], mode=0o600)
 
 
@@ -113,4 +115,4 @@ def _read(file: Path | None) -> _Kept:
     try:
         return _Kept(**json.loads(file.read_bytes()))
     except (OSError, ValueError, TypeError):
-        return _Kept()  # none yet, or damaged: everybody signs in anew
+        return _Kept()  # missing or damaged: every person signs in again

@@ -28,7 +28,7 @@ _HEADERS = {
     "x-frame-options": "DENY",
     "x-content-type-options": "nosniff",
     "referrer-policy": "same-origin",
-    # nothing comes from anywhere else, and nothing goes there
+    # the page loads nothing from other sites, and sends nothing there
     "content-security-policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
     "connect-src 'self' ws: wss:; frame-ancestors 'none'",
@@ -125,7 +125,7 @@ def _set_cookie(answer: Response, cookie: str, *, secure: bool) -> Response:
 
 
 def _password_in(asked: HTTPConnection) -> tuple[str, str] | None:
-    # of a program; not in a link: any page could hold one, and a person who follows it would steer under another name
+    # for programs; not accepted in a link: any page could contain one, and its reader would steer under another name
     shown = asked.headers.get("authorization", "")
     if not shown.startswith("Bearer "):
         return None

@@ -105,7 +105,7 @@ async def ask_in_dialog(
             ui.button("Cancel", on_click=lambda: dialog.submit(None), color=None).props("no-caps flat autofocus")
             ui.button(yes, on_click=agree).props("no-caps unelevated")
     answer = await dialog
-    if not dialog.is_deleted:  # it is with the page, if the browser was closed
+    if not dialog.is_deleted:  # a closed browser has already deleted it
         dialog.clear()
         dialog.delete()
     return bool(answer)

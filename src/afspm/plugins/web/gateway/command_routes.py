@@ -39,9 +39,9 @@ from afspm.plugins.web.gateway.views import parameter_model
 from afspm.plugins.web.person_commands import PersonCommands
 
 LONGEST_WAIT_S = 25.0
-"""What is in between often cuts off what waits for 30 s."""
+"""Proxies often cut off requests after 30 s."""
 PUBLISHED_WITHIN_S = 1.0
-Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT_S, description="for so many seconds at most")]
+Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT_S, description="longest wait, s")]
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 _SECURITY = (Depends(HTTPBasic(auto_error=False)), Depends(HTTPBearer(auto_error=False)))
 _CONTROL, _LEASE, _SCAN, _SPECTRUM = ControlAsked(), LeaseModel(), ScanAsked(), SpectrumAsked()  # without a body
@@ -147,7 +147,7 @@ class CommandRoutes:
     async def act(self, asked: Request, name: Name) -> DoneModel:
         """Start an action of the microscope, in control; returns when it is accepted. `stop-scan` stops a scan."""
         if name in (names.START_SCAN, names.START_SPEC):
-            raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"{name} is asked for by POST /v1/scans or /v1/spectra")
+            raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"request {name} by POST /v1/scans or /v1/spectra")
         await self._services.command(asked, lambda commands: commands.act(name))
         return DoneModel()
 
@@ -185,7 +185,7 @@ class CommandRoutes:
         try:
             await self._services.command(asked, lambda commands: commands.end())
         except RefusedRequest as error:
-            if error.model.code is not RefusalCode.EXPERIMENT_ENDED:  # which may come before the answer
+            if error.model.code is not RefusalCode.EXPERIMENT_ENDED:  # the end may be published before the answer
                 raise
         return DoneModel()
 

@@ -33,6 +33,7 @@ from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
 from afspm.storage.packet_log import log_folder, logged_packets
 
+# both bounds: notes and log lines may be long
 MOST_EVENTS, MOST_BYTES = 20_000, 16 << 20
 
 
@@ -92,6 +93,7 @@ class EventHistory:
                 return
             if isinstance(thing, ProcessStates) and not self._has_changed(thing):
                 return
+            # encoded once for all streams
             data = {"time": iso_utc(time_ns), "data": _data(thing, time_ns, self._problems)}
             event = Event(time_ns, kind, json.dumps(data, allow_nan=False))
             self._events.append(event)
@@ -109,7 +111,7 @@ class EventHistory:
         return EventBatch(tuple(one for one in found if one.kind in kinds), newest_ns, missed)
 
     def _has_changed(self, states: ProcessStates) -> bool:
-        # a supervisor publishes all its processes every 2 s: as events they were most of a night's memory
+        # a supervisor publishes all its processes every 2 s: as events they took most of a night's memory
         now = tuple(replace(one, step_age_s=0.0) for one in states.processes)
         before, self._processes[states.supervisor] = self._processes.get(states.supervisor), now
         return now != before
@@ -143,7 +145,7 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, obje
                     newest_ns = packet.time_ns or newest_ns
                     yield message, thing, newest_ns
         except AfspmError:
-            pass  # the recorder is just making it; the log has it
+            pass  # the recorder is just creating the file; the packet log has the events
     for entry in () if state_dir is None else logged_packets(log_folder(state_dir)):
         packet = entry.packet
         try:

@@ -51,7 +51,7 @@ class GatewayGuard:
         why = wrong_origin(asked.headers, only_here=self._only_here, what="gateway", allowed=self._origins)
         is_foreign = asked.headers.get("sec-fetch-site") == "cross-site"
         if why is None and is_foreign and asked.headers.get("origin") not in self._origins:
-            why = "a page of another site may not ask this gateway"
+            why = "a page of another site may not send requests to this gateway"
         if why is not None:
             raise RefusedRequest(RefusalCode.WRONG_ORIGIN, why)
 
@@ -89,9 +89,9 @@ class _Body:
 
     @classmethod
     async def bounded(cls, asked: HTTPConnection, receive: Receive) -> Receive:
-        told = asked.headers.get("content-length", "0")
-        if not told.isdecimal() or int(told) > MOST_BODY_BYTES:
-            raise RefusedRequest(RefusalCode.TOO_LARGE, f"a body of {told[:20]} bytes")
+        length = asked.headers.get("content-length", "0")
+        if not length.isdecimal() or int(length) > MOST_BODY_BYTES:
+            raise RefusedRequest(RefusalCode.TOO_LARGE, f"a body of {length[:20]} bytes")
         return cls(receive).next
 
     async def next(self) -> Message:

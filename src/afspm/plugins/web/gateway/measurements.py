@@ -29,7 +29,10 @@ _RUNNING, _DONE, _FAILED = (one.value for one in MeasurementState)
 _WHY = {
     CycleOutcome.INTERRUPTED: (RefusalCode.INTERRUPTED, "it was stopped before its end"),
     CycleOutcome.VANISHED: (RefusalCode.NO_RESULT, "the microscope is free again without a result"),
-    CycleOutcome.ANOTHER: (RefusalCode.NO_RESULT, "not what was asked for was measured: who else sets the microscope?"),
+    CycleOutcome.ANOTHER: (
+        RefusalCode.NO_RESULT,
+        "another measurement than requested was taken: does another program set the microscope?",
+    ),
 }
 
 
@@ -133,6 +136,7 @@ class Measurements:
 
     def _begin(self, commands: PersonCommands, who: str, key: str, target: Target) -> Measurement:
         plan = target.facts()
+        # the key with another target would return another measurement than requested
         with self._lock:
             known = self.find(who, key)
             if known is not None and known.plan != plan:
@@ -172,6 +176,7 @@ class Measurements:
         key = (one.who, one.key)
         with self._lock:
             followed = self._followed.get(key)
+            # the measurement may begin, or even end, before the answer arrives
             is_seen = followed is None or followed.cycle.begun
             if response.ok or is_seen:
                 one.is_certain = True

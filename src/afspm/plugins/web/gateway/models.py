@@ -19,11 +19,11 @@ LONGEST_LEASE_S = 3600.0
 
 def _no_truth(value: object) -> object:
     if isinstance(value, bool):
-        raise ValueError("a number, not true or false")  # which Python would take for 1 and 0
+        raise ValueError("a number, not true or false")  # Python would take them for 1 and 0
     return value
 
 
-NUMERIC = BeforeValidator(_no_truth)  # last: what comes after it is not in the description
+NUMERIC = BeforeValidator(_no_truth)  # last: later validators are missing in the description
 NUMBER = Annotated[float, Field(allow_inf_nan=False), NUMERIC]
 PLACE = Annotated[float, Field(ge=-1.0, le=1.0), NUMERIC]
 LENGTH = Annotated[float, Field(gt=0.0, le=1.0), NUMERIC]
@@ -84,7 +84,7 @@ class StateModel(_Answer):
     you: str | None = Field(description="the name that the scheduler knows you by; None: you only look")
     in_control: bool = Field(description="you are the holder")
     ended: bool
-    silent_s: float = Field(description="real seconds since the experiment was heard of")
+    silent_s: float = Field(description="real seconds since the last message of the experiment")
     last_event: str | None = Field(description="id of the newest event, for Last-Event-ID")
 
 

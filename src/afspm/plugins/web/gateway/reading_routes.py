@@ -84,6 +84,7 @@ class ParameterCache:
         return views.parameter_model(name, response)
 
     async def _response(self, name: str) -> ModelResponse:
+        # a program that polls must not keep the microscope busy: one read serves all clients for a second
         now_s = asyncio.get_running_loop().time()
         known = self._asked.get(name)
         if known is None or now_s - known[0] >= FRESH_S:
@@ -91,6 +92,7 @@ class ParameterCache:
                 del self._asked[next(iter(self._asked))]
             task = asyncio.ensure_future(self._services.read(lambda commands: commands.get(name)))
             known = self._asked[name] = now_s, task
+        # shielded: other clients may wait for the same read
         return await asyncio.shield(known[1])
 
 

@@ -24,9 +24,9 @@ from afspm.transport.process.parent import StopRequested
 
 T = TypeVar("T")
 MOST_WAITING = 16
-"""Requests of one name that wait for their turn."""
+"""Largest number of waiting requests of one name."""
 READER = ".reader"
-"""Asks for values in nobody's name; no name of a person begins so."""
+"""Name for reads without a person's name; no person's name begins with a dot."""
 
 
 @dataclass
@@ -53,7 +53,7 @@ class GatewayServices:
     def who(self, asked: Request) -> str:
         """Return the scheduler's name for a request's client. Raises RefusedRequest for a request without a name."""
         if not (person := self.person_of(asked)):
-            raise RefusedRequest(RefusalCode.NAME_NEEDED, "what is done is in the record with a name")
+            raise RefusedRequest(RefusalCode.NAME_NEEDED, "the record keeps a name with each action")
         return self.persons.name_of(person)
 
     async def do(self, asked: Request, action: Callable[[PersonCommands], T]) -> T:
@@ -74,9 +74,12 @@ class GatewayServices:
             raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_WAITING} requests of {person} wait already")
         self.waiting[person] += 1
         try:
-            # a client that goes away in between does not call off what the scheduler is asked for
+            # shielded: a client that disconnects does not cancel its request to the scheduler
             return await asyncio.shield(asyncio.wrap_future(self.persons.submit(person, action)))
-        except (Exception, StopRequested) as error:  # the second: the experiment ended meanwhile
+        except (
+            Exception,
+            StopRequested,
+        ) as error:  # any error becomes a refusal; StopRequested: the experiment ended meanwhile
             raise of_error(error) from error
         finally:
             self.waiting[person] -= 1

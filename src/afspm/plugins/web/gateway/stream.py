@@ -9,7 +9,7 @@ from afspm.plugins.web.gateway.events import EventHistory
 from afspm.plugins.web.gateway.models import END, MISSED
 from afspm.plugins.web.watch import Bell, Watch
 
-ALIVE_S = 10.0  # then a comment is sent, so that what is in between keeps the connection
+ALIVE_S = 10.0  # interval of comments, so that proxies keep the connection
 AT_ONCE = 200
 RETRY_MS = 1000
 MOST_STREAMS = 64
@@ -29,6 +29,7 @@ async def server_sent(
         if batch.missed_until_ns is not None:
             missed = {"after": str(after_ns), "until": str(batch.missed_until_ns)}
             yield _event(str(max(after_ns, 0)), MISSED, json.dumps({"time": None, "data": missed}))
+        # one piece for all: each piece is a write to the socket
         if batch.events:
             yield "".join(_event(str(one.time_ns), one.kind, one.text) for one in batch.events)
         is_behind = batch.newest_ns > after_ns
