@@ -154,7 +154,7 @@ def recovery() -> Iterator[Row]:
 def _component_back_s(run: Running) -> float:
     began_s = perf_counter()
     os.kill(run.pids["watcher"], signal.SIGKILL)
-    run.wait_for(r"watcher .*killed by SIGKILL")  # what it said before it died is no sign of life
+    run.wait_for(r"watcher .*killed by SIGKILL")  # lines from before its death are no sign of life
     run.wait_for(r"watcher .*started, process")
     run.wait_for(r"watcher .*knows the state")
     return perf_counter() - began_s

@@ -216,7 +216,7 @@ def _write(folder: Path) -> None:
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     control = ControlState(ControlMode.AUTOMATED, "series")
     store = RecordStore(folder, RecordSettings({"experiment": "long"}))
-    with mock.patch.object(os, "fsync"):  # only to be quick: nobody cuts the power here
+    with mock.patch.object(os, "fsync"):  # only to be quick: no power cut here
         for number in range(SCANS):
             time_ns = START_NS + number * 60_000_000_000
             things: list[tuple[str, object]] = [

@@ -59,7 +59,7 @@ class Malice:
 
     def request(self) -> list[bytes]:
         frames = self._spoilt(self._requests)
-        # whoever may end the experiment, or tell the translator that it has ended, is asked not to
+        # calls that end the experiment, or announce its end to the translator, are left out
         ending = (bytes([ControlRequest.END_EXPERIMENT]), wire.CLOSE)
         return [b"\6" if frame in ending else frame for frame in frames]
 

@@ -127,7 +127,7 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         features = [_with_spread(each, one, spread).features() for one, each in found]
         x = np.array([list(one.values()) for one in features])
         right = np.median(x[wrong == 0.0], axis=0)
-        scale = np.maximum(x.std(axis=0), 1e-9)  # what none of the pairs tells apart weighs nothing
+        scale = np.maximum(x.std(axis=0), 1e-9)  # a feature equal in all pairs gets no weight
         weights = _logistic((x - right) / scale, wrong)
         probability = 1.0 / (1.0 + np.exp(-weights[0] - (x - right) / scale @ weights[1:]))
         accepted = probability <= acceptance.WRONG_AT_MOST

@@ -69,7 +69,7 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
 
     def _named(self) -> tuple[str, list[Any]]:
         kind = self.chance.random()
-        if kind < 0.4:  # whatever is put is used by what is done next
+        if kind < 0.4:  # a later call uses the value
             names = ";".join(self.chance.choices(tuple(NUMBERS), k=self.chance.choice((1, 1, 2))))
             return "PV", [names, self._value("v")]
         if kind < 0.5:

@@ -99,7 +99,7 @@ class GxsmFuzzer(Fuzzer[GxsmEmulator]):
     def named(self) -> tuple[str, tuple[Any, ...]]:
         """Return a call."""
         kind = self.chance.random()
-        if kind < 0.4:  # whatever is set is used by what is done next
+        if kind < 0.4:  # a later call uses the setting
             ref = self.chance.choice(self._refs)
             return "set", (ref, self._set_to(ref))
         if kind < 0.5:

@@ -32,7 +32,7 @@ def night(browser: Any, tmp_path: Path) -> Iterator[Night]:
 
 def test_a_person_with_a_password_takes_over_and_can_not_after_signing_out(night: Night, browser: Any) -> None:
     assert night.url.startswith("https://")
-    context = browser.new_context(ignore_https_errors=True)  # nobody has signed this certificate
+    context = browser.new_context(ignore_https_errors=True)  # a self-signed certificate
     try:
         page = context.new_page()
         page.goto(night.url)

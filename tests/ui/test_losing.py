@@ -39,7 +39,7 @@ def test_a_killed_dashboard_is_back_at_the_same_address_and_so_is_the_page(
 def test_old_data_are_marked(night: Night, opened: Opened) -> None:
     page = opened(night.url)
     page.wait_for_selector("#trouble", state="hidden")
-    # the one who would start it anew, too: together they are a computer that stands still
+    # the supervisor, too: together they are a frozen computer
     frozen = (night.process.pid, pid_of(night, "scheduler"))
     for pid in frozen:
         os.kill(pid, signal.SIGSTOP)

@@ -78,7 +78,7 @@ class Night(AfspmProcess):
             self.url = self.wait_for_url("dashboard")
             published = [one.name for one in wire.declared() if one.source in (Role.TRANSLATOR, Role.SCHEDULER)]
             self.follower = Follower(self.folder, "terminal", tuple(published))
-        except BaseException:
+        except BaseException:  # also Ctrl-C must not leave the experiment running
             super().close()
             raise
         self.follower.catch_up()

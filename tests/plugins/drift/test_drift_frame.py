@@ -518,7 +518,7 @@ def test_place_is_read_again_after_the_move_before_an_action() -> None:
     lab.knows(forecast((1.4e-6, 0.0)))
     lab.ask(ControlRequest.ACTION, names.START_SCAN)
     lab.answer(lab.sent())
-    lab.places[names.SCAN_TOP_LEFT_X] = 2e-6  # somebody is at the panel
+    lab.places[names.SCAN_TOP_LEFT_X] = 2e-6  # a person uses the controller's panel
     lab.scope_is(ScopeState.FREE)
     assert lab.forwards() == []
     assert "outside the region" in lab.replies()[-1].reason

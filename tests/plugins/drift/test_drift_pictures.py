@@ -192,7 +192,7 @@ def test_a_table_that_can_not_be_written_for_a_while_ends_nothing(
 
 def test_a_missing_channel_is_logged_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lab = night(tmp_path)
-    lab.at(450.0, lambda: caplog.clear() if "'Z'" in caplog.text else pytest.fail("nothing was said"))
+    lab.at(450.0, lambda: caplog.clear() if "'Z'" in caplog.text else pytest.fail("nothing was logged"))
     lab.at(1500.0, lab.kill)
     assert run(DriftPictures(channel="Z"), lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
     assert "no pictures: only 0 of 9 scans can be read" in caplog.text

@@ -103,7 +103,7 @@ def test_a_scan_too_far_from_its_requested_region_needs_a_rescan(rule: RescanRul
     made = estimation(WorkerStateFile(None), rule)
     assert not made.register(*drift_scan(0, 20, 20), asked).rescan  # nothing was known before
     assert bool(made.register(*drift_scan(1, 35, 28), asked).rescan) is again
-    assert not made.register(*drift_scan(2, 60, 60), None).rescan  # nobody asked for it
+    assert not made.register(*drift_scan(2, 60, 60), None).rescan  # no requested region
 
 
 def test_a_tracker_that_can_not_follow_a_compensation_raises() -> None:

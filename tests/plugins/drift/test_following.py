@@ -29,6 +29,6 @@ def test_the_oracle_knows_the_truth() -> None:
     """Otherwise all comparisons with it would be meaningless."""
     night = Night("rough", 2, 12)
     for number, (drift_m, update) in enumerate(night.followed(tracker("bank", Oracle(night.drift)))):
-        # The rows that both scans of the first pair show were taken at other times, and nobody knows the rate yet.
+        # The rows that both scans of the first pair show were taken at other times, and the rate is unknown yet.
         tolerated_m = 1.0 * NM if number < 4 else 0.05 * NM
         assert -update.after.mapping.translation_m - drift_m == pytest.approx(np.zeros(2), abs=tolerated_m)

@@ -57,7 +57,7 @@ class PublishedScheduler:
             raise ConfigError(
                 "a scheduler of the published implementation enforces no limits",
                 where="limits",
-                hint="leave [limits] away, or let our Scheduler arbitrate and their programs join by PublishedPeers",
+                hint="leave out [limits]; or use afspm's Scheduler, and let their programs join by PublishedPeers",
             )
         self._serve, self._publish = serve, publish
 

@@ -74,7 +74,7 @@ class Watch:
         self.connected = False
         self.ended = False
         self.changes = 0
-        self._heard_s = clock.monotonic_s()
+        self._last_message_s = clock.monotonic_s()
         self._changed = threading.Condition()
         self._callbacks: list[Callable[[], None]] = []
 
@@ -110,9 +110,10 @@ class Watch:
             elif isinstance(thing, Spectrum):
                 self.spectra.take(thing, time_ns)
             elif message == "DriftMapping":
+                # without correction components use tip coordinates, so the map needs no conversion
                 is_mapping = len(thing.matrix) == 6 and thing.correcting
                 self.tip_to_sample = np.array(thing.matrix, dtype=np.float64).reshape(2, 3) if is_mapping else None
-            self._heard_s = self.clock.monotonic_s()
+            self._last_message_s = self.clock.monotonic_s()
             self.connected = True
             self._announce()
 
@@ -124,7 +125,7 @@ class Watch:
 
     def silent_s(self) -> float:
         """Return the real seconds since the last message."""
-        return self.clock.monotonic_s() - self._heard_s
+        return self.clock.monotonic_s() - self._last_message_s
 
     def on_change(self, callback: Callable[[], None]) -> None:
         """Call `callback` after each change, in the thread that brings it; it must not wait."""

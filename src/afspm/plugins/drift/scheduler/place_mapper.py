@@ -429,7 +429,7 @@ def _both_places(place: PositionPair[Any]) -> str:
         x, y = where.center_m if isinstance(where, Region) else where.xy_m
         return position_text((x, y))
 
-    return f"that is {centre(place.tip)} at the tip, asked for at {centre(place.sample)} on the sample"
+    return f"that is {centre(place.tip)} at the tip, requested at {centre(place.sample)} on the sample"
 
 
 def _position(mapping: Mapping, xy_m: tuple[float, float]) -> ProbePosition:

@@ -56,6 +56,7 @@ class Dashboard(WebComponent):
         self._people, self._password_hash = dict(people or {}), password_hash
 
     def on_start(self) -> None:
+        # imported here: a file is checked also where the extra `dashboard` is not installed
         from afspm.plugins.web.dashboard.actions import Steering
         from afspm.plugins.web.dashboard.application import application
         from afspm.plugins.web.dashboard.conditions import Conditions

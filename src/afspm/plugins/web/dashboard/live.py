@@ -87,6 +87,7 @@ class Live:
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return PlainTextResponse("the values of this scan are no longer kept here", 404)
+        # facts in a header of the picture, so that both always belong together
         headers = {"X-Frame": drawn.head(self._facts(drawn.frame)), "Cache-Control": "no-store"}
         return Response(drawn.png, media_type="image/png", headers=headers)
 

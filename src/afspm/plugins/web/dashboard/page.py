@@ -129,6 +129,7 @@ class Page:
         try:
             theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
         except TimeoutError:
+            # a slow or sleeping browser: the next refresh tries again
             return
         self._theme.remember(theme)
         if content.ended:

@@ -51,6 +51,7 @@ class SteeringSession:
 
         async def doing() -> None:
             result = await self.carry_out(action)
+            # the viewer may have closed the page meanwhile; a background task has no page of its own
             if not self._client.is_deleted:
                 with self._client:
                     self.say(result)

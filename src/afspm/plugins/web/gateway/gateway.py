@@ -57,12 +57,14 @@ class Gateway(WebComponent):
                 where="gateway",
                 hint="`afspm dashboard --make-password` makes a line of people; or listen on 127.0.0.1",
             )
+        # "*" lets every page in, and "null" is the origin of any local file or sandboxed frame
         if any(one in ("*", "null") for one in origins):
             raise ConfigError("origins names pages one by one", where="gateway", hint='e.g. ["http://localhost:3000"]')
         self._passwords = Passwords(host, "", people or {}, ExperimentClock.real().now_s)
         self._origins = tuple(origins)
 
     def on_start(self) -> None:
+        # imported here: a file is checked also where the extra `gateway` is not installed
         from afspm.plugins.web.gateway.application import application
         from afspm.plugins.web.gateway.events import EventHistory, fill
         from afspm.plugins.web.gateway.measurements import Measurements
