@@ -1,4 +1,4 @@
-"""The shear of an image by drift while it is taken, and the drift velocity from two frames in opposite directions.
+"""The shear of an image by drift while it is taken, and the drift velocity from two opposite frames.
 
 Rows are taken one after the other, so a feature at `p` when half of the scan is done is found at
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative

@@ -42,7 +42,6 @@ refused, again: scans that could not be registered, and that were taken again.""
 
 
 def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
-    """Simulate a night, in a worker, and return its metrics."""
     return night(settings, seed).metrics()
 
 

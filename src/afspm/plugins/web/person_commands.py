@@ -87,7 +87,6 @@ class PersonCommands:
         return self._ask(ControlRequest.PARAM, to_parameter(parameter, value, unit))
 
     def supports(self, action: str) -> Response:
-        """Ask whether the microscope has an action."""
         return self._ask(ControlRequest.ACTION_SUPPORT, action)
 
     def act(self, action: str) -> Response:
@@ -137,7 +136,6 @@ class PersonCommands:
 
     @property
     def measures_spectrum(self) -> bool:
-        """True while the microscope measures a spectrum."""
         with self._watch.reading() as overview:
             return overview.status is not None and overview.status.state is ScopeState.SPEC
 

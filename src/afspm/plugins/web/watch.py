@@ -118,7 +118,6 @@ class Watch:
             self._announce()
 
     def end(self) -> None:
-        """Note that the experiment has ended."""
         with self._changed:
             self.ended = True
             self._announce()
@@ -189,7 +188,6 @@ class Audience:
         self._changed = threading.Condition()
 
     def join(self, page: object) -> None:
-        """Add a page that was opened."""
         with self._changed:
             self._pages.add(id(page))
 

@@ -48,7 +48,7 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The end of the iteration: theta, and the normal equations there by block of rows, over the variance of the noise.
+    """The end of the iteration: theta and its normal equations by block of rows, over the variance of the noise.
 
     J is the gradient without noise, H its shrunk estimate (`noise.denoised`).
 

@@ -49,7 +49,6 @@ class Correlation:
             raise ConfigError(f"{self.height!r} must be above 0", where="height")
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `Estimator`."""
         images: list[Image] = []
         for name, one in (("reference", reference), ("scan", scan)):
             try:

@@ -75,7 +75,6 @@ class Features:
                 raise ConfigError(f"{getattr(self, name)!r} is not a number from 1", where=name)
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `Estimator`."""
         images: list[Image] = []
         for name, one in (("reference", reference), ("scan", scan)):
             try:

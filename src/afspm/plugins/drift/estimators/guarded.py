@@ -76,7 +76,6 @@ class Guarded:
         return f"<estimator {self.name}: {self.inner!r}>"
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `Estimator`."""
         try:
             found = self.inner.register(_copied(reference), _copied(scan), prior)
             failure = _malformed(found)

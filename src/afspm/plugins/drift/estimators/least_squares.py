@@ -70,7 +70,6 @@ class LeastSquares:
         self._wrong_at_most = wrong_at_most
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `afspm.plugins.drift.registration.Estimator`."""
         images = []
         for name, each in (("reference", reference), ("scan", scan)):
             try:

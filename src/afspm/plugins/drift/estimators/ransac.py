@@ -31,7 +31,6 @@ class Transform:
         return mapped
 
     def shift_at(self, point: Array) -> Array:
-        """Return the displacement of one point."""
         moved: Array = self(point[None])[0] - point
         return moved
 

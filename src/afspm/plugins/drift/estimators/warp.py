@@ -52,7 +52,7 @@ class Spline:
         return values, known
 
     def on_grid(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """Return `at` for a grid of one pixel with axes x and y; much faster, row by row and column by column."""
+        """Return `at` for a grid of one pixel with axes x and y; much faster, by rows and columns."""
         values, known = self.coefficients, np.ones((y.size, x.size), dtype=bool)
         picked = []
         for axis, at in enumerate((y, x)):

@@ -97,7 +97,10 @@ class ScanPair:
 
 
 def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
-    """Draw each pair as a row of two scans in their own frames, with the displacement as an arrow in the second."""
+    """Draw each pair as a row of two scans, with the displacement as an arrow in the second.
+
+    Scans are shown in their own frames.
+    """
     with styled():
         made = figure(2 * _PAIR_INCHES, (_PAIR_INCHES + 0.15) * len(pairs))
         for row, pair in zip(made.subplots(len(pairs), 2, squeeze=False), pairs, strict=True):

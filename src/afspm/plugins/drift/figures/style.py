@@ -85,5 +85,4 @@ def show_scan(ax: Axes, scan: DriftScan) -> None:
 
 
 def letter(ax: Axes, text: str) -> None:
-    """Label a part of a figure."""
     ax.set_title(text, loc="left", weight="bold", size=9)

@@ -141,7 +141,6 @@ class PlaceMapper:
         self._mapping_at = mapping_at
 
     def finish(self) -> Places:
-        """Return the places after the step."""
         return Places(**{name: self.__dict__[name] for name in _PARTS})
 
     # --- requests ---

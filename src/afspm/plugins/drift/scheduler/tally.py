@@ -20,7 +20,6 @@ class RegistrationTally:
     lately: tuple[bool, ...] = ()
 
     def add(self, outcome: RegistrationOutcome) -> RegistrationTally:
-        """Count a scan."""
         lately = self.lately
         if outcome is not RegistrationOutcome.NEW:
             lately = (*lately, outcome.is_registered)[-LATELY:]
@@ -31,7 +30,6 @@ class RegistrationTally:
         return sum(self.counts.values())
 
     def summary(self) -> str:
-        """Return the counts as a text."""
         return registration_summary(outcome for outcome, count in self.counts.items() for _ in range(count))
 
     def exceeds(self, most_unregistered: float) -> bool:

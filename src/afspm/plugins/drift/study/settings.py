@@ -61,7 +61,6 @@ class NightSettings:
 
     @property
     def scans(self) -> int:
-        """Number of planned scans."""
         return int(self.hours * 3600.0 / self.every_s + 1e-9)
 
     @classmethod

@@ -94,13 +94,11 @@ class BankTracker:
 
     @property
     def forecast(self) -> Forecast:
-        """See `Tracker`."""
         if (filters := self._state.filters) is None:
             return replace(BankForecast.at_start(), compensation=self._state.compensation)
         return self._forecast_of(filters)
 
     def add(self, scan: DriftScan) -> Update:
-        """See `Tracker`."""
         state = self._state
         require_newer(scan, state.newest_s)
         state.newest_s = scan.mid_s
@@ -346,7 +344,6 @@ class BankTracker:
         return (1.0 - self._references.choice.overlap_min) * min(scan.region.size_m) / 2
 
     def state(self) -> Plain:
-        """See `Tracker`."""
         return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: PlainMapping) -> None:

@@ -155,7 +155,6 @@ class Filters:
         return replace(self, mean=mean, covariance=covariance)
 
     def without_scan(self, number: int) -> Filters:
-        """Remove one of the stored scans."""
         kept = np.delete(np.arange(self.mean.shape[1]), range(4 + 4 * number, 8 + 4 * number))
         return replace(self, mean=self.mean[:, kept], covariance=self.covariance[:, kept][:, :, kept])
 

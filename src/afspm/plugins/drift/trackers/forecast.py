@@ -101,7 +101,6 @@ class BankForecast:
         )
 
     def at(self, time_s: float) -> Prediction:
-        """See `Forecast`."""
         step_s = time_s - self.time_s
         transition, gained = self.models.over(step_s)
         means = (transition @ self.mean[..., None])[..., 0]
@@ -115,5 +114,4 @@ class BankForecast:
         return Prediction(time_s, mapping, covariance[:2, :2], mean[2:], covariance[2:, 2:])
 
     def to_dict(self) -> Plain:
-        """See `Forecast`."""
         return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)

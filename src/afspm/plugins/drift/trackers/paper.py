@@ -112,7 +112,6 @@ class PaperForecast:
         return Prediction(time_s, mapping, covariance, velocity, self.rate_covariance)
 
     def to_dict(self) -> Plain:
-        """See `Forecast`."""
         return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)
 
 
@@ -193,11 +192,9 @@ class PaperTracker:
 
     @property
     def forecast(self) -> Forecast:
-        """See `Tracker`."""
         return self._state.forecast
 
     def add(self, scan: DriftScan) -> Update:
-        """See `Tracker`."""
         state = self._state
         require_newer(scan, state.newest_s)
         first = state.newest_s is None
@@ -271,7 +268,6 @@ class PaperTracker:
         state.newest_s = scan.mid_s
 
     def state(self) -> Plain:
-        """See `Tracker`."""
         return snapshot(self._state, "paper", VERSION)
 
     def restore(self, state: PlainMapping) -> None:

@@ -99,7 +99,6 @@ class Similarity:
         return replace(self, error=self.error[now], covariance=self.covariance[np.ix_(now, now)])
 
     def without_scan(self, number: int) -> Similarity:
-        """Remove one of the references."""
         kept = np.delete(np.arange(len(self.error)), 1 + number)
         return replace(self, error=self.error[kept], covariance=self.covariance[np.ix_(kept, kept)])
 

@@ -16,7 +16,9 @@ KEPT = 2_000
 
 
 class Conditions:
-    """Reads a few parameters at the start of each scan, one read at a time; a scan that begins meanwhile has none.
+    """Reads a few parameters at the start of each scan, one read at a time.
+
+    A scan that begins during a read has no conditions.
 
     Args:
         ask: carries out an action in the name of the page, without waiting.

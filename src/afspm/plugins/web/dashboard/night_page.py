@@ -1,4 +1,4 @@
-"""The page of a recorded night: the page of a running experiment at one moment, with a slider through the night.
+"""The page of a recorded night: a running experiment's page at one moment, with a slider through the night.
 
 Also the requests of its scripts (its scans, the difference of two, its report), and its one action, a note.
 """
@@ -95,7 +95,6 @@ class NightRequests:
         self._archive = archive
 
     def add_to(self, app: FastAPI) -> None:
-        """Serve /night/scans, /night/difference and /night/report."""
         app.get("/night/scans", response_model=None)(self._scans)
         app.get("/night/difference", response_model=None)(self._difference)
         app.get("/night/report", response_model=None)(self._report)

@@ -156,7 +156,6 @@ class Theme:
         self._name = ""
 
     def next(self) -> None:
-        """Choose the next of the three."""
         names = list(THEMES)
         self._set(names[(names.index(self._name) + 1) % len(names)])
         ui.run_javascript(f"window.afspm?.keepTheme({json.dumps(self._name)})")

@@ -38,7 +38,6 @@ class ChartPanel:
         self._chart.set_visibility(False)
 
     def show(self, chart: Chart) -> None:
-        """Show this chart."""
         if chart == self._shown:
             return
         self._shown = chart
@@ -97,7 +96,6 @@ class LogPanel:
         self._html = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0" role="log" aria-live="off"')
 
     def show(self, lines: Sequence[LogLine], names: Iterable[str]) -> None:
-        """Show these lines."""
         every = [_EVERYTHING, *sorted({*names, *(line.name for line in lines)})]
         if every != self._name.options:
             self._name.set_options(every, value=self._name.value)

@@ -35,7 +35,6 @@ class ModeButtons:
             self._automated.set_visibility(False)
 
     def show(self) -> None:
-        """Show the button that applies now."""
         if self._manual is not None and self._automated is not None:
             is_manual, may = self._session.content.is_manual, self._session.may_steer
             self._manual.set_visibility(may and not is_manual)
@@ -55,7 +54,6 @@ class ProblemBar:
         self._box.set_visibility(False)
 
     def show(self) -> None:
-        """Update the lines."""
         flags, may = self._session.content.problems, self._session.may_steer
         if (flags, may) == self._shown:
             return
@@ -151,6 +149,5 @@ class SteeringPanel:
 
 
 async def ask_restart(session: SteeringSession, name: str) -> None:
-    """Restart a process, after a question."""
     if await asked(f"Restart {name}?", "The process is ended and restarted. Its data on disk is kept.", "Restart"):
         session.do(lambda a: a.restart(name))

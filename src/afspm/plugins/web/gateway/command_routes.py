@@ -55,7 +55,6 @@ class CommandRoutes:
         self._bell = services.bell
 
     def router(self) -> APIRouter:
-        """Return the routes."""
         router = APIRouter(dependencies=[*_SECURITY, Depends(self._services.who)])
         accepted: Plain = {"status_code": 202, "response_model": MeasurementModel}
         router.post("/control", response_model=ControlModel)(self.request_control)

@@ -73,7 +73,6 @@ class GatewayGuard:
 
 
 def answer(refused: RefusedRequest) -> JSONResponse:
-    """Return a refusal as a response."""
     headers = {"Cache-Control": "no-store"}
     if refused.status == 401:
         headers["WWW-Authenticate"] = 'Basic realm="afspm", charset="UTF-8"'

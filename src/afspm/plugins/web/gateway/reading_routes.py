@@ -105,7 +105,6 @@ class ReadingRoutes:
         self._parameters = ParameterCache(services)
 
     def router(self) -> APIRouter:
-        """Return the routes."""
         router = APIRouter()
         for path, answers, model in (
             ("/state", self.state, StateModel),
