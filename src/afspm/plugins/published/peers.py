@@ -227,6 +227,7 @@ class _PeersPort(BasePort[Incoming]):
         if client is not None:
             client.leaves = False  # it is back
         else:
+            # a client for each peer, so that the scheduler arbitrates control between them
             client = self._clients[key] = _PeerClient(self, self._name_inside(identity))
             self._poller.register(client.link.socket, client.receive)
             self._poller.register(client.link.monitor.socket, client.follow)

@@ -78,6 +78,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
 
     line = f"{_recorded(folder, name, settings).to_json()}\n"
     command = [sys.executable, "-P", "-m", "afspm.plugins.web.dashboard.recorded"]
+    # a process of its own: the page of a running experiment may already have used this process's NiceGUI
     with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, encoding="utf-8") as process:
         assert process.stdin is not None
         process.stdin.write(line)

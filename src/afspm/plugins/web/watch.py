@@ -101,6 +101,7 @@ class Watch:
 
     def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
         """Process a published message."""
+        # only stored here, and drawn on request: the component must read its socket before it fills
         with self._changed:
             self.overview.take(message, thing, time_ns, envelope)
             if isinstance(thing, Scan):

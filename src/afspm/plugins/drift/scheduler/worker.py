@@ -64,6 +64,7 @@ def main(jobs: Connection, reports: Connection, settings: DriftCompensationSetti
 
 
 def _end_with_parent() -> None:
+    # at once, even during a registration: otherwise it would overwrite the state that the next worker has read
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])
