@@ -1,1 +1,1 @@
-"""How fast it is, beside bare pyzmq in the same run: `python -m benchmarks`."""
+"""Speed beside bare pyzmq in the same run: `python -m benchmarks`."""

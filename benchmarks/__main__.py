@@ -59,7 +59,7 @@ def main(arguments: list[str]) -> int:
 def _measured(name: str, measure: Measurement) -> Iterator[Row | Failure]:
     try:
         yield from measure()
-    except Exception as error:  # whatever went wrong with one measurement, the others are still of use
+    except Exception as error:  # a failed measurement of any kind must not lose the others
         traceback.print_exc()
         yield Failure(name, f"{type(error).__name__}: {error}")
 

@@ -1,9 +1,9 @@
 """`python -m benchmarks.chaos [--nights N] [--seed S]`: nights in which processes are killed and frozen.
 
 Each night is the sample `experiments/tip_repair`, shortened, as real processes. At moments drawn from a seed (also at
-its start and at its end) one, two or all of its processes are killed or stand still for a while. It has to end by
-itself all the same, with every scan there once. What the seed draws is printed with what was wrong; when a blow falls
-depends on the computer too, so the same seed is the same plan, not the same night.
+its start and its end) one, two or all of its processes are killed or frozen for a while. The night must still end by
+itself, with every scan recorded once. The plan is printed with the faults found. The moment of a blow depends on the
+computer, too, so an equal seed gives an equal plan, not an equal night.
 """
 
 from __future__ import annotations
@@ -82,10 +82,10 @@ MOMENTS = (
 
 @dataclass(frozen=True)
 class Blow:
-    """What befalls whom and when: `late_s` after the log's line `after` came for the first time.
+    """A blow to some processes: `late_s` after the first log line `after`.
 
     Attributes:
-        frozen_s: how long they stand still; 0.0: they are killed.
+        frozen_s: how long they are frozen; 0.0: they are killed.
     """
 
     after: str
@@ -95,7 +95,7 @@ class Blow:
 
 
 def blows(seed: int) -> list[Blow]:
-    """What happens in the night of this seed."""
+    """Return the blows in the night of this seed."""
     chance = random.Random(seed)
     drawn = []
     for _ in range(chance.randint(1, 9)):
@@ -109,7 +109,7 @@ def blows(seed: int) -> list[Blow]:
 
 @dataclass
 class Night:
-    """One run of the sample, with what is done to it."""
+    """One run of the sample, with its blows."""
 
     folder: Path
     plan: list[Blow]
@@ -124,7 +124,7 @@ class Night:
         self._incoming: queue.SimpleQueue[str | None] = queue.SimpleQueue()
 
     def run(self) -> list[str]:
-        """Returns what was wrong."""
+        """Run the night and return the faults found."""
         over = self.folder / "over.toml"
         over.write_text(OVER.format(speed=SPEED, minutes=MINUTES), encoding="utf-8")
         command = (sys.executable, "-m", "afspm", "run", str(SAMPLE), str(over), "--verbose")
@@ -153,7 +153,7 @@ class Night:
         self._incoming.put(None)
 
     def _strike_until_the_end(self) -> bool:
-        """True once the run has ended, False when it has not for too long."""
+        # True once the run has ended, False after a time limit
         deadline_s = CLOCK.monotonic_s() + DEADLINE_S
         while (now_s := CLOCK.monotonic_s()) < deadline_s:
             soonest_s = min([deadline_s, *(at_s for at_s, _ in (*self._due, *self._thaw))])
@@ -203,7 +203,7 @@ class Night:
 
 
 def _send(pid: int, number: signal.Signals) -> bool:
-    """False: it is gone, or somebody else's by now."""
+    # False: the process is gone, or its number belongs to another program by now
     with contextlib.suppress(OSError):
         if b"afspm" in Path(f"/proc/{pid}/cmdline").read_bytes():
             os.kill(pid, number)
@@ -212,7 +212,7 @@ def _send(pid: int, number: signal.Signals) -> bool:
 
 
 def found_wrong(folder: Path) -> Iterator[str]:
-    """What should not be so in the folder of a run that has ended."""
+    """Yield the faults in the folder of a run that has ended."""
     with (folder / "metadata.csv").open(newline="", encoding="utf-8") as file:
         rows = [row for row in csv.DictReader(file) if row["measurement"] == "scan"]
     several = {key: n for key, n in Counter((row["filename"], row["channel"]) for row in rows).items() if n > 1}
@@ -266,7 +266,7 @@ def _wrong_with_picture(folder: Path, scans: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of the night of a seed; `folder` is kept only if something was wrong."""
+    """The result of the night of a seed; `folder` is kept only after a fault."""
 
     seed: int
     took_s: float
@@ -276,7 +276,7 @@ class Verdict:
 
 
 def nights(count: int, seed: int) -> Iterator[Verdict]:
-    """So many nights, of `seed` and those after it."""
+    """Run `count` nights, with `seed` and the seeds after it."""
     for number in range(seed, seed + count):
         folder = Path(tempfile.mkdtemp(prefix=f"chaos-{number}-"))
         night = Night(folder, blows(number))
@@ -289,7 +289,7 @@ def nights(count: int, seed: int) -> Iterator[Verdict]:
 
 
 def main() -> int:
-    """Returns the exit code: 1 if a night was not complete."""
+    """Run the nights; return exit code 1 after a fault."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--nights", type=int, default=20)
     parser.add_argument("--seed", type=int, default=random.randrange(10**6))

@@ -15,7 +15,7 @@ from benchmarks.rows import Row, measurement
 
 
 def scan(pixels: int) -> Scan:
-    """A square scan of noise."""
+    """Return a square scan of noise."""
     values = np.random.default_rng(1).normal(size=(pixels, pixels))
     return Scan(Region((0.0, 0.0), (2e-6, 2e-6)), "Height", "m", values, 1_800_000_000_000_000_000)
 
@@ -29,7 +29,7 @@ def _timed(work: Callable[[], object], repeats: int = effort(20, 1)) -> float:
 
 @measurement
 def codec() -> Iterator[Row]:
-    """A copy into fresh memory, as that is what encoding has to make too."""
+    """Compare with a copy into fresh memory, which encoding also needs."""
     subject = scan(512)
     source = subject.values.tobytes()
     payload = wire.encode(subject)[1]

@@ -1,4 +1,4 @@
-"""A request on its way client, scheduler, translator and back, against REQ, ROUTER/DEALER proxy, REP."""
+"""A request from client through scheduler to translator and back, against REQ, ROUTER/DEALER proxy, REP."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ class Client:
         self._ask(ControlRequest.REQUEST_CTRL, 0)
 
     def act(self) -> None:
-        """One action, there and back."""
+        """Send one action and wait for its answer."""
         self._ask(ControlRequest.ACTION, "stop-scan")
 
     def start(self) -> None:
-        """The start of a measurement: its key is saved before it is passed on."""
+        """Start a measurement: its key is saved before the request is forwarded."""
         self._ask(ControlRequest.ACTION, "start-scan")
 
     def round_trip_us(self) -> float:
-        """The median of many."""
+        """Return the median of many round trips."""
         return _median_us(self.act)
 
     def round_trips_us(self, seconds: float) -> list[float]:
-        """One after the other for so long."""
+        """Return the round trips within this time, one after the other."""
         began, took = perf_counter(), []
         while (now := perf_counter()) < began + seconds:
             self.act()

@@ -1,6 +1,6 @@
-"""What the translators of vendors' controllers add of their own to a request: all but the wait for the controller.
+"""The time that translators of vendors' controllers add to a request: everything except the wait for the controller.
 
-The emulated controllers are processes of their own, and what they take is not counted.
+The emulated controllers are processes of their own, and their time is not counted.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FRAME = ScanParameters(Region((1e-7, -5e-8), (4e-7, 3e-7), 0.1), (48, 64), "m")
 
 
 class Waiting:
-    """How long was waited for a controller."""
+    """The time spent waiting for a controller."""
 
     def __init__(self) -> None:
         self.s = 0.0
@@ -66,8 +66,10 @@ class Waiting:
 
 
 class Answers:
-    """A network that nothing is lost in and that takes no time. It knows when it was given the last answer, and how
-    long was waited for the controller until then."""
+    """A network without losses and delays.
+
+    It notes the time of the last answer, and how long was waited for the controller until then.
+    """
 
     def __init__(self, waiting: Waiting) -> None:
         self.clock = CLOCK
@@ -92,7 +94,7 @@ class Answers:
 
 
 def translator(vendor: str, processes: Roles, folder: Path, port: Answers) -> Translator:
-    """A translator in this process, connected to an emulated controller in another."""
+    """Return a translator in this process, connected to an emulated controller in another."""
     address = processes.start("emulator", vendor=vendor, folder=str(folder / "files"))
     microscope = entry_points.load(entry_points.DRIVERS, VENDORS[vendor])
     memory = Memory(folder / "state.json", synced=False)
@@ -102,7 +104,7 @@ def translator(vendor: str, processes: Roles, folder: Path, port: Answers) -> Tr
 
 
 def own_s(made: Translator, port: Answers, waiting: Waiting, request: Request) -> float:
-    """From a request to its answer, less the wait for the controller."""
+    """Return the time from a request to its answer, minus the wait for the controller."""
     frames = wire.encode_request(request)
     waiting.s, began = 0.0, perf_counter()
     made.handle(RequestReceived(frames))

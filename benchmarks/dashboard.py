@@ -1,4 +1,4 @@
-"""The dashboard in a browser: how soon a scan is on the page, alone and with many who look on."""
+"""The dashboard in a browser: the delay of a scan, for one viewer and with many."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ MS_PER_NS = 1e-6
 
 @measurement
 def dashboard() -> Iterator[Row]:
-    """From the publication of a scan until the browser has drawn it; the clock is that of one computer."""
+    """Measure from the publication of a scan until the browser has drawn it; both use the clock of one computer."""
     with _browser() as browser, Stage() as stage:
         if browser is None:
             return
@@ -52,7 +52,7 @@ def dashboard() -> Iterator[Row]:
 
 @measurement
 def looked_at() -> Iterator[Row]:
-    """What the experiment notices of many who look on: a scan a second is published, and all of it recorded."""
+    """Measure the effect of many viewers on the experiment: a scan a second is published, and all are recorded."""
     with roles() as processes:
         publish, serve = processes.scheduler(*processes.start("translator", scan_every_s=1.0).split(), recorded=True)
         url = processes.dashboard(publish, serve)
@@ -90,7 +90,7 @@ def latency_ms(page: Any, stage: Stage, seed: int, side: int = SIDE) -> float:
 
 
 def open_page(browser: Any, url: str) -> Any:
-    """A page that has been drawn once."""
+    """Return a page that has been drawn once."""
     page = browser.new_page(viewport={"width": 1400, "height": 1000})
     page.goto(url)
     page.wait_for_selector("text=is in control")
@@ -100,7 +100,7 @@ def open_page(browser: Any, url: str) -> Any:
 
 @contextmanager
 def viewers(url: str, count: int) -> Iterator[None]:
-    """So many look on while in the block, from a process of their own."""
+    """Run `count` viewers while in the block, in a process of their own."""
     command = (sys.executable, "-m", "benchmarks.viewers", url, str(count))
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdin is not None
@@ -114,14 +114,14 @@ def viewers(url: str, count: int) -> Iterator[None]:
 
 
 def cpu_s(pid: int) -> float:
-    """Processor time of a process so far (Linux)."""
+    """Return the processor time of a process so far (Linux)."""
     fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager
 def _browser() -> Iterator[Any]:
-    """None where there is none."""
+    # None without a browser
     program = os.environ.get("AFSPM_CHROMIUM") or shutil.which("chromium") or shutil.which("google-chrome")
     try:
         from playwright.sync_api import sync_playwright

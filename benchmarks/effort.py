@@ -1,4 +1,4 @@
-"""How much is measured: everything, or each row once in its shortest form (`python -m benchmarks --short`).
+"""The extent of measurements: everything, or each row once in its shortest form (`python -m benchmarks --short`).
 
 The short form shows that a row still works. Its figures mean nothing.
 """
@@ -15,5 +15,5 @@ SHORT = "short"
 
 
 def effort(full: T, short: T) -> T:
-    """Return `full`, or `short` where only the working of the rows is tried."""
+    """Return `full`, or `short` in a test of the rows."""
     return short if os.environ.get(VARIABLE) == SHORT else full

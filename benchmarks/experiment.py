@@ -1,6 +1,4 @@
-"""A whole experiment: how soon it is up, how soon a killed process is back, how soon all has ended, and what it costs
-while nothing happens.
-"""
+"""A whole experiment: times of start, restart after a kill, and end, and its cost while idle."""
 
 from __future__ import annotations
 
@@ -95,7 +93,7 @@ class Running:
             self._lines.put(line)
 
     def wait_for(self, pattern: str) -> None:
-        """Wait for a line of the log, from where the last wait ended."""
+        """Wait for a line of the log, from the end of the last wait."""
         while True:
             line = self._lines.get(timeout=DEADLINE_S)
             if started := re.search(r"(\w+) +started, process (\d+)", line):
@@ -158,14 +156,14 @@ def recovery() -> Iterator[Row]:
 def _component_back_s(run: Running) -> float:
     began_s = perf_counter()
     os.kill(run.pids["watcher"], signal.SIGKILL)
-    run.wait_for(r"watcher .*killed by SIGKILL")  # what it said before it died is no sign of life
+    run.wait_for(r"watcher .*killed by SIGKILL")  # lines from before its death are no sign of life
     run.wait_for(r"watcher .*started, process")
     run.wait_for(r"watcher .*knows the state")
     return perf_counter() - began_s
 
 
 def _back_s(name: str) -> float:
-    """From the kill until the one in control has an answer of the microscope again."""
+    # from the kill until the component in control has an answer of the microscope again
     with running() as run:
         run.wait_for(r"watcher .*knows the state")
         scope = afspm.connect(run.runs, name="benchmark")
@@ -219,7 +217,7 @@ def idle() -> Iterator[Row]:
 
 
 def _cpu_s(pids: list[int]) -> float:
-    """Time that these processes have been computing, user and system."""
+    # user and system time
     ticks = 0
     for pid in pids:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

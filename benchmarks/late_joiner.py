@@ -1,4 +1,4 @@
-"""A component that comes late gets what the scheduler has cached, against the same bytes by a bare XPUB and SUB."""
+"""A late component receives the scheduler's cache, against the same bytes by a bare XPUB and SUB."""
 
 from __future__ import annotations
 

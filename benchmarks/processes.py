@@ -1,4 +1,4 @@
-"""The processes that are measured against each other, each in one role."""
+"""The processes of a measurement, each in one role."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PORTS = FreePorts()
 
 
 class Roles(ExitStack):
-    """Starts processes, and ends them when the block is left.
+    """Starts processes, and ends them at the end of the block.
 
     Attributes:
-        run_folder: of the scheduler that was started last; if it is recorded, its record is there.
+        run_folder: of the scheduler started last; its record, if any, is there.
     """
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Roles(ExitStack):
         self.run_folder = Path()
 
     def start(self, role: str, **arguments: Any) -> str:
-        """A process of `benchmarks.roles`; returns the line that it prints when it is ready."""
+        """Start a process of `benchmarks.roles`; return its line when it is ready."""
         process = subprocess.Popen(
             [sys.executable, "-m", "benchmarks.roles", role, json.dumps(arguments)], stdout=subprocess.PIPE, text=True
         )
@@ -51,10 +51,10 @@ class Roles(ExitStack):
         class_: str = "afspm.scheduler.Scheduler",
         **settings: Any,
     ) -> tuple[str, str]:
-        """The real scheduler, which keeps its state on disk; returns the addresses (publish, serve).
+        """Start the real scheduler, which keeps its state on disk; return the addresses (publish, serve).
 
         Args:
-            recorded: there is a recorder, too, as in every experiment.
+            recorded: start a recorder, too, as in every experiment.
         """
         folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
         self.run_folder = Path(folder)
@@ -77,7 +77,7 @@ class Roles(ExitStack):
         return publish, serve
 
     def dashboard(self, publish: str, serve: str) -> str:
-        """The real dashboard of a scheduler; returns the address of its page, where it answers in a moment."""
+        """Start the real dashboard of a scheduler; return the address of its page, where it answers in a moment."""
         port = int(PORTS.address().rpartition(":")[2])
         launch = Launch(
             "dashboard",
@@ -93,11 +93,11 @@ class Roles(ExitStack):
         return f"http://127.0.0.1:{port}"
 
     def microscope(self, **settings: Any) -> str:
-        """The real translator of a simulated microscope; returns the address where it is asked."""
+        """Start the real translator of a simulated microscope; return the address of its control server."""
         return self.translator("afspm.simulation.simulator.Simulator", **settings)[1]
 
     def translator(self, class_: str, **settings: Any) -> tuple[str, str]:
-        """The real translator of a microscope; returns the addresses (publish, serve)."""
+        """Start the real translator of a microscope; return the addresses (publish, serve)."""
         folder = self.enter_context(tempfile.TemporaryDirectory(ignore_cleanup_errors=True))
         publish, serve = PORTS.address(), PORTS.address()
         launch = Launch(

@@ -1,5 +1,7 @@
-"""Files of scans, of 1024 x 1024 pixels and four channels, as the emulated controllers write them: read, against
-`np.fromfile` of as many bytes."""
+"""Reading scan files of the emulated controllers, 1024 x 1024 pixels and four channels, against `np.fromfile`.
+
+Both read the same number of bytes.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,7 @@ Paths = list[Path]
 
 
 def picture(channel: int) -> np.ndarray:
-    """No two channels alike, and nothing that could be packed."""
+    """Return incompressible values, different for each channel."""
     return np.random.default_rng(channel).normal(size=(PIXELS, PIXELS)).astype(np.float32)
 
 
@@ -42,7 +44,7 @@ def igor(folder: Path) -> Paths:
 
 
 def sxm(folder: Path) -> Paths:
-    """Each signal forward and backward: twice as much as of the others."""
+    """Write each signal forward and backward: twice as much data as the others."""
     channels = [(k, name, "m", picture(k), picture(-k + 10)) for k, name in enumerate(CHANNELS)]
     path = folder / "scan001.sxm"
     scan = nanonis.SxmContent(
@@ -65,7 +67,7 @@ def sxm(folder: Path) -> Paths:
 
 
 def netcdf(folder: Path, write: Callable[[gxsm.GxsmScanFile], bytes]) -> Paths:
-    """A file for each channel."""
+    """Write a file for each channel."""
     paths = []
     for k, name in enumerate(CHANNELS):
         paths.append(folder / f"scan001-Xp-{name}.nc")

@@ -1,4 +1,4 @@
-"""What the record costs an experiment, and how soon a long run is open."""
+"""The cost of recording for an experiment, and the time to open a long run."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _SCAN, _NUMBERS = scan(512), itertools.count()
 
 @measurement
 def recording() -> Iterator[Row]:
-    """With a recorder beside without one."""
+    """Compare runs with a recorder and without."""
     with roles() as processes:
         clients = []
         for recorded in (True, False):
@@ -97,7 +97,7 @@ def recording() -> Iterator[Row]:
 
 
 class FreshLine(Line):
-    """One that publishes another scan each time: one that comes again is not recorded again."""
+    """A line that publishes a different scan each time: a repeated scan is not recorded again."""
 
     def scans_per_s(self, payload: bytes, count: int) -> float:
         fresh = iter([_fresh() for _ in range(count)])
@@ -114,7 +114,7 @@ def _fresh() -> bytes:
 
 
 class RecordedLine(FreshLine):
-    """One with a recorder beside it."""
+    """A line with a recorder beside it."""
 
     def ours(self, subscribers: int, *, recorded: bool = False) -> None:
         super().ours(subscribers, recorded=recorded)
@@ -126,12 +126,12 @@ class RecordedLine(FreshLine):
         return super().scans_per_s(payload, count)
 
     def wait_until_recorded(self) -> None:
-        """Until all are, but for the last, which waits a second for more channels."""
+        """Wait until all scans are recorded but the last, which waits a second for more channels."""
         counted = "SELECT count(*) FROM packets WHERE message = 'Scan2d'"
         self._wait(lambda asked: asked(counted) >= self._published - 1)
 
     def wait_until_sure(self) -> None:
-        """Until what was written ahead may be written over."""
+        """Wait until the write-ahead log may be overwritten."""
         self.wait_until_recorded()
         log = log_folder(self._folder)
         self._wait(lambda asked: not LogReader(log, committed(log) or START).read(1))
@@ -146,7 +146,7 @@ class RecordedLine(FreshLine):
 
 
 def _paced_ms(line: Line, payload: bytes) -> float:
-    """From the publication of a scan to its arrival."""
+    # from the publication of a scan to its arrival
     times = []
     for _ in range(PACED):
         began = perf_counter()
@@ -157,7 +157,7 @@ def _paced_ms(line: Line, payload: bytes) -> float:
 
 
 def _at_pace_per_s(line: Line, payload: bytes) -> float:
-    """How many scans a second arrive that are published at an even pace."""
+    # arriving scans per second, of scans published at an even pace
     began = perf_counter()
     for number in range(FAST):
         while (left_s := began + number / FAST - perf_counter()) > 0.0:
@@ -171,7 +171,7 @@ def _flood_per_s(line: Line, payload: bytes) -> float:
 
 
 def _recorded_mb_per_s(line: RecordedLine, payload: bytes) -> float:
-    """How fast a flood is in the record, on the disk."""
+    # until the flood is in the record, on the disk
     began = perf_counter()
     line.scans_per_s(payload, FLOOD)
     line.wait_until_recorded()
@@ -179,7 +179,7 @@ def _recorded_mb_per_s(line: RecordedLine, payload: bytes) -> float:
 
 
 def _written_mb_per_s(payload: bytes) -> float:
-    """How fast the same bytes are on the disk if each scan is just a file, and waited for as the recorder does."""
+    # each scan is a plain file, synced as the recorder does
     with tempfile.TemporaryDirectory() as folder:
         began = perf_counter()
         for number in range(FLOOD):
@@ -189,7 +189,7 @@ def _written_mb_per_s(payload: bytes) -> float:
 
 @measurement
 def long_run() -> Iterator[Row]:
-    """A run of ten thousand scans: opened, its table made, the last scan read; and all that it came to."""
+    """Measure a run of ten thousand scans: opening, its table, the last scan, and its overview."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         _write(folder)
@@ -216,7 +216,7 @@ def _write(folder: Path) -> None:
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     control = ControlState(ControlMode.AUTOMATED, "series")
     store = RecordStore(folder, RecordSettings({"experiment": "long"}))
-    with mock.patch.object(os, "fsync"):  # only to be quick: nobody cuts the power here
+    with mock.patch.object(os, "fsync"):  # only to be quick: no power cut here
         for number in range(SCANS):
             time_ns = START_NS + number * 60_000_000_000
             things: list[tuple[str, object]] = [

@@ -58,7 +58,7 @@ def bare_rep(back: str) -> None:
 
 
 def translator(scan_every_s: float | None = None) -> None:
-    """Answers every request with a success, having read it; publishes a scan of 512² now and then."""
+    """Answer every request with a success, having read it; publish a scan of 512² now and then."""
     clock = ExperimentClock.real()
     port = ZmqServerPort(Network(), clock, serve=ANY, publish=ANY)
     ready(str(port.publish_address), port.serve_address)
@@ -77,13 +77,13 @@ def translator(scan_every_s: float | None = None) -> None:
 
 
 def emulator(vendor: str, folder: str) -> None:
-    """An emulated controller."""
+    """Run an emulated controller."""
     made = find_emulator(vendor)(port=0)
     made.run(ExperimentClock.real(), Path(folder), logging.getLogger(vendor), ready)
 
 
 def proxy_sockets(publisher: str, queue: int) -> tuple[Any, Any]:
-    """Return the sockets of a proxy, towards the publisher and towards its subscribers, whose address is printed."""
+    """Return the sockets of a proxy towards the publisher and the subscribers; print the address of the latter."""
     context: zmq.Context[Any] = zmq.Context()
     front, back = context.socket(zmq.XSUB), context.socket(zmq.XPUB)
     for socket in (front, back):
@@ -99,7 +99,7 @@ def bare_packet_proxy(publisher: str, queue: int) -> None:
 
 
 def bare_logging_proxy(publisher: str, queue: int) -> None:
-    """Append each packet to a file, which is written over now and then, before passing the packet on."""
+    """Append each packet to a file of bounded size before passing the packet on."""
     front, back = proxy_sockets(publisher, queue)
     poller = zmq.Poller()
     poller.register(front, zmq.POLLIN)
@@ -119,7 +119,7 @@ def bare_logging_proxy(publisher: str, queue: int) -> None:
 
 
 class Tally:
-    """Tells the measuring process when something arrives for the first time, and when the last of a batch does."""
+    """Notifies the measuring process of the first arrival and of the last one of a batch."""
 
     def __init__(self, address: str) -> None:
         self._socket: Any = zmq.Context.instance().socket(zmq.PUSH)
@@ -161,7 +161,7 @@ def our_subscriber(source: str, tally: str, name: str) -> None:
 
 
 def bare_replayer(count: int, size: int) -> None:
-    """Sends so many messages to everyone who subscribes."""
+    """Send `count` messages to every subscriber."""
     socket: Any = zmq.Context.instance().socket(zmq.XPUB)
     socket.setsockopt(zmq.XPUB_VERBOSE, 1)
     ready(bound(socket))
@@ -175,7 +175,7 @@ def bare_replayer(count: int, size: int) -> None:
 
 
 def soaked_component(source: str, noise: str) -> None:
-    """Hears a scheduler and a publisher of nonsense, and passes on what is published as "Mark"."""
+    """Receive from a scheduler and from a publisher of nonsense, and publish each "Mark" again."""
     port = ZmqPort(Network(), "Soaked", ExperimentClock.real(), subscribe=[source, noise], publish=ANY)
     ready(str(port.publish_address))
     while True:

@@ -1,4 +1,4 @@
-"""The rows of the benchmark table: what is measured, and what is asked of it.
+"""The rows of the benchmark table: the measurements, and their targets.
 
 A measurement is a function that yields rows, registered with `@measurement`; put it into a module of this package and
 name the module in `__main__.MODULES`.
@@ -17,12 +17,12 @@ class Row:
     """One line.
 
     Attributes:
-        name: what was measured.
+        name: of the measured quantity.
         unit: of `ours` and `bare`.
-        ours, bare: medians; `bare` is None where there is nothing to compare with.
-        ratio: ours over bare; ours itself where there is nothing to compare with.
-        target: what `ratio` is to be.
-        better: whether a low or a high ratio is wanted.
+        ours, bare: medians; `bare` is None without a comparison.
+        ratio: ours over bare; without a comparison ours itself.
+        target: for `ratio`.
+        better: whether a low or a high ratio is better.
     """
 
     name: str
@@ -58,8 +58,8 @@ class Failure:
     """A measurement that broke off.
 
     Attributes:
-        name: of the measurement; the rows that it had yielded before are good.
-        error: what was raised.
+        name: of the measurement; rows yielded before are good.
+        error: the exception's text.
     """
 
     name: str
@@ -81,6 +81,6 @@ def measurement(function: M, name: str = "") -> M:
 
 
 def alternate(ours: Callable[[], float], bare: Callable[[], float], times: int) -> tuple[float, float]:
-    """Medians of both, measured in turn, so that whatever else the machine does is shared by both."""
+    """Return the medians of both, measured in turn, so that other load on the machine affects both alike."""
     pairs = [(ours(), bare()) if n % 2 else (bare(), ours())[::-1] for n in range(times)]
     return statistics.median(p[0] for p in pairs), statistics.median(p[1] for p in pairs)

@@ -1,7 +1,7 @@
 """From a scan's end to its publication in sample coordinates, through the real scheduler and its worker.
 
-The estimator answers at once, so that the way of a scan is measured and not its registration: the worker's state is on
-the disk, and the mapping announced, before a scan is published.
+The estimator answers at once, so that the registration itself is not measured. Before a scan is published, the worker's
+state is on the disk, and the mapping announced.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class _Line:
         self._listener = listener
 
     def published_s(self, payload: bytes) -> float:
-        """How long a scan takes to the listener, s."""
+        """Return the time of a scan from publication to the listener, s."""
         began = perf_counter()
         self._translator.publish("Scan2d", payload)
         while perf_counter() - began < _FIRST_S:

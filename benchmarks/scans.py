@@ -1,7 +1,7 @@
 """Scans through the scheduler to many subscribers, against PUB, XSUB/XPUB proxy, SUB.
 
-The scheduler writes each packet into a file before it publishes it. So does the proxy that it is compared with; a proxy
-that writes nothing stands beside it in a row of its own.
+The scheduler writes each packet into a file before it publishes it. So does the proxy for comparison; a proxy without a
+file has a row of its own.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ QUEUE = 1000
 
 
 class Line:
-    """A publisher in this process, the middle in another, and subscribers each in its own."""
+    """A publisher in this process, scheduler or proxy in another, and subscribers each in its own."""
 
     def __init__(self, processes: Roles) -> None:
         self._publish: Callable[[bytes, bytes], None]
@@ -88,7 +88,7 @@ class Line:
                 there += self._tally.recv() == b"there"
 
     def scans_per_s(self, payload: bytes, count: int) -> float:
-        """How many scans a second arrive at every subscriber."""
+        """Return the rate at which scans arrive at every subscriber."""
         gc.collect()
         began = perf_counter()
         for _ in range(count):
@@ -121,7 +121,7 @@ def scans() -> Iterator[Row]:
 
 @measurement
 def scans_beside_a_proxy_without_a_log() -> Iterator[Row]:
-    """What the log costs: a write of each packet into a file, on the same two cores."""
+    """Measure the cost of the log: a write of each packet into a file, on the same two cores."""
     with roles() as processes:
         bare, ours = Line(processes), Line(processes)
         bare.bare(1)

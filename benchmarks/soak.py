@@ -1,9 +1,9 @@
 """`python -m benchmarks.soak [COUNT]`: malformed requests and packets (default: a million) against real processes.
 
-A scheduler, a translator with its simulated microscope and a component, each in a process of its own, are sent what no
-well-meaning peer would: truncated and overlong messages, wrong numbers of frames, unknown numbers, random bytes, bytes
-that are not even ZeroMQ, frames that are said to be gigabytes, connections that never finish to greet, under known
-names and ever new ones. After every batch each must answer as before, and in the end none may have grown.
+A scheduler, a translator with its simulated microscope and a component, each in a process of its own, receive hostile
+input: truncated and overlong messages, wrong numbers of frames, unknown numbers, random bytes, bytes that are not even
+ZeroMQ, frames that announce gigabytes, unfinished handshakes, under known names and ever new ones. After every batch
+each must answer as before, and in the end none may have grown.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Malice:
 
     def request(self) -> list[bytes]:
         frames = self._spoilt(self._requests)
-        # whoever may end the experiment, or tell the translator that it has ended, is asked not to
+        # calls that end the experiment, or announce its end to the translator, are left out
         ending = (bytes([ControlRequest.END_EXPERIMENT]), wire.CLOSE)
         return [b"\6" if frame in ending else frame for frame in frames]
 
@@ -119,7 +119,7 @@ class Soak:
         processes.callback(self._close_unfinished)
 
     def batch(self, count: int) -> None:
-        """So many messages to each of the three, in a third each; then all must still serve."""
+        """Send `count` messages, a third to each of the three processes; then check that all still serve."""
         targets = []
         for target in (self._scheduler, self._translator):
             dealer = self._context.socket(zmq.DEALER)
@@ -142,7 +142,7 @@ class Soak:
             dealer.close(linger=10_000)
 
     def _strangers(self) -> None:
-        """Peers that speak no ZeroMQ, send what is too large, or subscribe to nonsense."""
+        # peers that speak no ZeroMQ, send oversized data, or subscribe to nonsense
         for address in (self._scheduler, self._translator, self._scheduler_publish):
             with socket.create_connection(("127.0.0.1", int(address.rpartition(":")[2]))) as raw:
                 raw.sendall(self._random.randbytes(200))
@@ -166,7 +166,7 @@ class Soak:
         subscriber.close(linger=100)
 
     def _burst(self) -> None:
-        """A peer that says more than any queue holds, with heartbeats in between, and hangs up in the middle."""
+        # a peer that sends more than any queue holds, with heartbeats in between, and hangs up in the middle
         for target in (self._scheduler, self._translator):
             peer = self._context.socket(zmq.DEALER)
             peer.setsockopt(zmq.SNDHWM, 0)
@@ -181,7 +181,7 @@ class Soak:
             connection.close()
 
     def check(self) -> None:
-        """Scheduler, translator and component must answer as before. Raises TimeoutError."""
+        """Check that scheduler, translator and component answer as before. Raises TimeoutError."""
         for port in (self._friend, self._translators_friend):
             self._asked += 1
             request = Request(ControlRequest.ACTION_SUPPORT, "start-scan", id=f"Friend/soak/{self._asked}")
@@ -198,7 +198,7 @@ class Soak:
         raise TimeoutError("the component no longer passes on what it hears")
 
     def memory_mb(self) -> list[float]:
-        """The resident memory of each process (on Linux; elsewhere nothing is measured)."""
+        """Return the resident memory of each process (on Linux; elsewhere nothing is measured)."""
         return [_resident_mb(pid) for pid in self._pids]
 
 
@@ -207,7 +207,7 @@ def _is_answer(incoming: Any, request_id: str) -> bool:
 
 
 def _until(port: ZmqPort, frames: list[bytes], request_id: str) -> None:
-    """Ask until the answer comes."""
+    # asks until the answer comes
     deadline_s = CLOCK.monotonic_s() + 60.0
     while CLOCK.monotonic_s() < deadline_s:
         port.send(frames)
@@ -225,10 +225,10 @@ def _resident_mb(pid: int) -> float:
 
 
 def soak(count: int, seed: int = 1) -> Iterator[dict[str, Any]]:
-    """Yields, ten times, how many were sent and how large the processes are.
+    """Yield, ten times, the number of messages sent and the sizes of the processes.
 
     Raises:
-        TimeoutError, MemoryError: somebody no longer serves, or has grown.
+        TimeoutError, MemoryError: a process no longer serves, or has grown.
     """
     with roles() as processes:
         run = Soak(processes, seed)

@@ -1,4 +1,4 @@
-"""A dashboard and a stage to publish on: everything that it shows comes from whoever stands there, at their time."""
+"""A dashboard and a stand-in for the scheduler: everything on the page is published by the caller, at its time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ REGION = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
 class Stage(ExitStack):
-    """Publishes as a scheduler does, in real time; a real dashboard listens.
+    """Publishes as a scheduler does, in real time, to a real dashboard.
 
     Attributes:
         url: of the dashboard.
@@ -92,13 +92,13 @@ class Stage(ExitStack):
         return now_ns
 
     def memory_bytes(self) -> int:
-        """What the dashboard has in memory."""
+        """Return the dashboard's resident memory."""
         status = Path(f"/proc/{self.process.pid}/status").read_text(encoding="utf-8")
         line = next(line for line in status.splitlines() if line.startswith("VmRSS"))
         return int(line.split()[1]) * 1024
 
     def _serve(self) -> None:
-        """Whoever subscribes is answered."""
+        # answers new subscribers
         while not self._over.is_set():
             with self._lock:
                 self._port.poll(0.0)
@@ -120,7 +120,7 @@ class Stage(ExitStack):
 
 
 def picture(side: int, seed: int = 0) -> NDArray[np.float64]:
-    """Values that are as hard to compress as those of a real scan."""
+    """Return values as incompressible as those of a real scan."""
     rng = np.random.default_rng(seed)
     rough = rng.normal(size=(side, side)).cumsum(axis=1)
     return np.asarray(1e-10 * (rough - np.linspace(0, 1, side)[None, :] * rough[:, -1:]))

@@ -1,4 +1,4 @@
-"""What a translator adds of its own, with a controller that answers at once."""
+"""The time that a translator adds, with a controller that answers at once."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ LASTS_S = effort(1.7, 0.1)
 
 
 class Instant(Driver):
-    """Knows everything at once. Its scans last `LASTS_S`, and hold the moment at which they were over."""
+    """Answers everything at once. Its scans last `LASTS_S`, and contain the time of their end."""
 
     parameters_file = Path(__file__).with_name("instant.toml")
 

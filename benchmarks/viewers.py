@@ -1,8 +1,8 @@
-"""`python -m benchmarks.viewers URL COUNT`: as many viewers of a dashboard, without the browsers.
+"""`python -m benchmarks.viewers URL COUNT`: this number of viewers of a dashboard, without browsers.
 
-Each does what a browser does on the wire: has the page, its websocket, the answers that it gives, and picture after
-picture. Prints "ready" when all have seen one, and ends with its standard input. They stand for other computers: so
-whoever is measured on this one goes first.
+Each does what a browser does on the wire: it gets the page, its websocket with its replies, and picture after picture.
+Prints "ready" when all have a picture, and ends with its standard input. The viewers stand for other computers, so on
+this one the measured processes have priority.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from afspm.transport.process.priority import step_back
 
 
 async def view(url: str, seen: asyncio.Semaphore) -> None:
-    """Look on until cancelled."""
+    """View the page until cancelled."""
     async with aiohttp.ClientSession() as session:
         async with session.get(url) as answer:
             page = await answer.text()

@@ -1,4 +1,4 @@
-"""How well drift is estimated: pairs of scans of known drift, what no estimator can do better, and what ours do.
+"""Accuracy of drift estimation: pairs of scans with known drift, bounds for any estimator, and the estimators' errors.
 
 `python -m benchmarks.drift` measures all of it; `pairs.pair` is the generator.
 """

@@ -1,7 +1,7 @@
-"""`python -m benchmarks.drift`: how well drift is estimated, beside the bound and beside the methods of features.
+"""`python -m benchmarks.drift`: accuracy of drift estimation, beside the bound and the methods of features.
 
 Prints tables, writes build/bench-drift.json (the lines with a target, in the form of build/bench.json) and
-build/bench-drift.txt (all that was printed). Returns 1 if a target was missed.
+build/bench-drift.txt (all printed text). Returns 1 if a target was missed.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _available(names: Sequence[str], console: Console) -> tuple[str, ...]:
-    """Those that can be made here; the first has to be."""
+    # the first one is under test, so it must be available
     estimator_named(names[0])
     found = [names[0]]
     for name in names[1:]:

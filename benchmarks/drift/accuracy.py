@@ -1,4 +1,4 @@
-"""How near estimates come to the bound, on every surface under every condition, beside the methods of features."""
+"""Errors of estimates over the bound, on every surface under every condition, beside the methods of features."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def jobs(plan: Plan) -> list[Trial]:
 
 
 def _published(plan: Plan) -> tuple[str, ...]:
-    """Where there is the library that it needs."""
+    # it needs the library of the methods of features
     return (PUBLISHED,) if "brief" in plan.estimators else ()
 
 
@@ -80,12 +80,12 @@ def _own_table(name: str, own: dict[tuple[str, str], Cell]) -> Table:
 
 
 def _unknown(cell: str, surface: str, figures: Cell) -> str:
-    """Cu, the bound of who has to learn the surface from the scans; known for a Gaussian one."""
+    # Cu: the bound for a surface that must be learnt from the scans; known for a Gaussian one
     return _px(figures.bound_px * unknown_rough(CONDITIONS[cell.partition("+")[0]])) if surface == "rough" else ""
 
 
 def _beside_table(plan: Plan, results: Sequence[Outcome]) -> Table:
-    """One line a condition and estimator: geometric means over the surfaces, over the pairs that all have seen."""
+    # one line per condition and estimator: geometric means over the surfaces, over the pairs given to all estimators
     table = _table("beside others, on the same pairs", "|estimator|n|RMS px|ratio to Cb|failed|accepted|wrong|ms")
     for cell in PAIRS:
         for name in (*plan.estimators, *(_published(plan) if cell == WITH_PUBLISHED else ())):
@@ -103,7 +103,7 @@ def _beside_table(plan: Plan, results: Sequence[Outcome]) -> Table:
 
 
 def _shared(plan: Plan, results: Sequence[Outcome], cell: str) -> list[Outcome]:
-    """Outcomes of the pairs that every estimator was given; none if there is but one estimator."""
+    # pairs given to every estimator; none if there is only one estimator
     seeds = {o.seed for o in results if o.cell == cell and o.estimator == plan.estimators[-1] != plan.ours}
     return [o for o in results if o.cell == cell and o.seed in seeds]
 
@@ -144,7 +144,7 @@ def _hard_rows(own: dict[tuple[str, str], Cell]) -> Iterator[Row]:
 
 
 def _beside_rows(plan: Plan, results: Sequence[Outcome]) -> Iterator[Row]:
-    """On the surfaces where both have found anything, over all pairs."""
+    # on surfaces where both found anything, over all pairs
     here = [o for o in results if o.cell == WITH_PUBLISHED]
     pairs = [
         [Cell.of(o for o in here if (o.surface, o.estimator) == (s, name)).rms_px for name in (PUBLISHED, plan.ours)]

@@ -1,10 +1,10 @@
-"""What no estimator can do better: Cramér-Rao bounds of the displacement at the middle of the overlap.
+"""Cramér-Rao bounds of the displacement at the middle of the overlap, for any estimator.
 
 With J the derivatives of the difference of both images and Q the precision of the noise of one row, the covariance of
-any unbiased estimate is at least (sum over rows of J^T Q J / f + P)^-1, f the noise of both images over that of one and
-P the precision of what is known before. Van Trees, "Detection, Estimation, and Modulation Theory", part I, 2.4.
+any unbiased estimate is at least (sum over rows of J^T Q J / f + P)^-1, f the noise of both images over the noise of
+one and P the prior precision. Van Trees, "Detection, Estimation, and Modulation Theory", part I, 2.4.
 
-These bounds know the surface, which an estimator has to learn from the very scans: see `unknown_rough`.
+These bounds know the surface, which an estimator has to learn from the same scans: see `unknown_rough`.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Bounds:
     """Covariances, (2, 2) each, in square standard pixels.
 
     Attributes:
-        white: C, of white noise alone, nothing unknown but the displacement.
-        rows: Cc, with 1/f noise too, and an unknown straight line in each row.
-        full: Cb, with the contrast and, as far as scans may be sheared and turned, that unknown besides.
+        white: C, of white noise alone, with only the displacement unknown.
+        rows: Cc, with 1/f noise, too, and an unknown straight line in each row.
+        full: Cb, with unknown contrast, shear and rotation besides, as far as scans may have them.
     """
 
     white: Array
@@ -36,7 +36,7 @@ class Bounds:
 
 
 def bounds(pair: Pair) -> Bounds:
-    """Of a pair that has an overlap."""
+    """Return the bounds of a pair with an overlap."""
     how = pair.condition
     first, second = pair.frames
     window = _window(pair)
@@ -61,7 +61,7 @@ def bounds(pair: Pair) -> Bounds:
 
 
 def _window(pair: Pair) -> tuple[slice, slice]:
-    """Rows and columns of the reference that the scan has too."""
+    # rows and columns of the reference within the scan
     first, second = pair.frames
     back = np.linalg.solve(
         second.matrix, (first.sample_px(first.offsets_px()) - second.origin_px[:, None, None]).reshape(2, -1)
@@ -73,11 +73,12 @@ def _window(pair: Pair) -> tuple[slice, slice]:
 
 
 def unknown_rough(how: Condition, size: int = 128) -> float:
-    """How many times its bound the error on the rough surface is at least, where nothing is known of the surface.
+    """Return the least error on the rough surface over its bound, if nothing is known of the surface.
 
-    It is a Gaussian field, and of one that is seen twice, with power S and noise N of each, a frequency k tells
-    k² S² / (N² + 2 N S) of a displacement along it, and not k² S / 2 N as if it was known (Hannan and Thomson,
-    Biometrika 58, 77, 1971). On the other surfaces, which are not Gaussian, an estimator can know what an edge is.
+    The surface is a Gaussian field. If it is seen twice, with power S and noise N of each, a frequency k contributes k²
+    S² / (N² + 2 N S) to the information about a displacement along it, instead of k² S / 2 N for a known surface
+    (Hannan and Thomson, Biometrika 58, 77, 1971). On the other surfaces, which are not Gaussian, an estimator can
+    recognise edges.
     """
     f = np.fft.fftfreq(size)
     power = rough_power(f[None, :] ** 2 + f[:, None] ** 2)
@@ -94,7 +95,7 @@ def unknown_rough(how: Condition, size: int = 128) -> float:
 
 
 def row_precision(how: Condition, width: int) -> Array:
-    """Of `width` pixels of one row, with an unknown straight line in it, or what more was taken away from it."""
+    """Return the precision of `width` pixels of one row, with an unknown straight line or polynomial in it."""
     covariance = how.white**2 * np.eye(width)
     if how.one_over_f:
         count = 2 * 128 * 128
@@ -114,7 +115,7 @@ def row_precision(how: Condition, width: int) -> Array:
 
 
 def _linear_precision(how: Condition, height_px: float) -> Array:
-    """Of (xx, xy, yx, yy), as far as drift during the scans and rotation leave it unknown."""
+    # of (xx, xy, yx, yy), as far as drift during the scans and rotation leave it unknown
     shear = 2 * (how.drift_px / height_px) ** 2
     turn = math.radians(how.rotation_deg) ** 2 / 3
     covariance = np.diag([0.0, shear, 0.0, shear]) + turn * np.outer((0, 1, -1, 0), (0, 1, -1, 0))

@@ -1,6 +1,6 @@
-"""What the microscope does to an image: named mixtures of noise, drift and what else happens between two scans.
+"""Effects of the microscope on an image: named mixtures of noise, drift and other changes between two scans.
 
-Noise is in units of the standard deviation of the image without any.
+Noise is in units of the standard deviation of the image without noise.
 """
 
 from __future__ import annotations
@@ -15,34 +15,34 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Condition:
-    """How two scans are taken.
+    """The circumstances of two scans.
 
     Attributes:
-        white: noise of each pixel by itself.
-        row_offset: offset of each row by itself.
+        white: independent noise of each pixel.
+        row_offset: independent offset of each row.
         row_memory: correlation of the offsets of neighbouring rows.
-        row_tilt: rise over each row by itself.
+        row_tilt: independent rise over each row.
         one_over_f: noise of the whole scan as a time series, power as 1 / frequency^exponent.
-        scars: share of the rows with a stretch where something disturbs the tip.
-        scar_rows: the most rows that one of them takes.
+        scars: share of the rows with a stretch where the tip is disturbed.
+        scar_rows: largest thickness of a scar.
         spikes: share of the pixels that are off by some rms heights.
-        lost: share of the rows of which nothing was kept.
-        tilt: up to this much rise over the image.
-        bow: up to this much of a parabola over the image.
-        flatten: order of the polynomial fitted to each row that is taken away; None: none is.
+        lost: share of the rows without data.
+        tilt: largest rise over the image.
+        bow: largest parabola over the image.
+        flatten: order of the polynomial fitted to and subtracted from each row; None: none.
         gain: the contrast of the second scan lies between 1 / gain and gain.
-        bend: contrast is not linear: up to this much of z² / 2 is added to z.
+        bend: largest nonlinearity of contrast: this share of z² / 2 is added to z.
         drift_px: standard deviation of each component of the drift during a scan; scans are independent of each other.
-        rotation_deg: the second scan is turned by up to this much.
+        rotation_deg: largest rotation of the second scan.
         overlap: least and most.
-        calibration: standard deviation of how much longer the axes of the second scan are, each by itself.
-        creep_px: how far lines start beside their place; gone to 1/e within `creep_length_px`.
+        calibration: standard deviation of the stretch of each axis of the second scan.
+        creep_px: displacement at the start of lines; decays to 1/e within `creep_length_px`.
         aspect: height of a pixel over its width.
         blunt: radius of the tip, over the usual one.
         double_px: distance of a second apex that the tip has in both scans.
         second_tip_px: distance of a second apex that the second scan alone has.
         turned_round: the second scan is taken in the other direction.
-        elsewhere: the scans show two places of the sample that have nothing in common.
+        elsewhere: the scans show two unrelated places of the sample.
     """
 
     white: float
@@ -97,7 +97,7 @@ CONDITIONS: dict[str, Condition] = {
 
 
 def measured(image: Array, condition: Condition, random: np.random.Generator, gain: float = 1.0) -> Array:
-    """An image, [y, x] of unit rms, as the microscope gives it."""
+    """Return an image, [y, x] of unit rms, with the effects of the microscope."""
     ny, nx = image.shape
     bend = condition.bend * random.uniform(-1.0, 1.0)
     level = image - image.mean()
@@ -128,14 +128,14 @@ def measured(image: Array, condition: Condition, random: np.random.Generator, ga
 
 
 def flattened(image: Array, order: int = 1) -> Array:
-    """Each row less the polynomial fitted to it (Flatten1)."""
+    """Subtract from each row the polynomial fitted to it (Flatten1)."""
     x = np.linspace(-1.0, 1.0, image.shape[1])
     powers, _ = np.linalg.qr(np.stack([x**k for k in range(order + 1)], axis=1))
     return np.asarray(image - (image @ powers) @ powers.T)
 
 
 def _remembered(values: Array, memory: float) -> Array:
-    """Of the same variance, each like the one before."""
+    # of the same variance, each correlated with the one before
     from scipy.signal import lfilter
 
     if not memory:
@@ -144,13 +144,13 @@ def _remembered(values: Array, memory: float) -> Array:
 
 
 def one_over_f_power(count: int, exponent: float = 1.0) -> Array:
-    """Variance that each frequency k / count, k from 1 to count / 2, brings to a series of unit variance."""
+    """Return the variance of each frequency k / count, k from 1 to count / 2, in a series of unit variance."""
     power = np.arange(1, count // 2 + 1, dtype=np.float64) ** -exponent
     return np.asarray(power / np.sum(power))
 
 
 def _one_over_f(count: int, random: np.random.Generator, exponent: float) -> Array:
-    """A time series of even length, unit rms on average, zero mean and a power spectrum as 1 / frequency^exponent."""
+    # a time series of even length, unit rms on average, zero mean and a power spectrum as 1 / frequency^exponent
     amplitude = np.sqrt(one_over_f_power(count, exponent)) * count / 2
     spectrum = np.zeros(count // 2 + 1, dtype=np.complex128)
     spectrum[1:] = amplitude * (random.standard_normal(count // 2) + 1j * random.standard_normal(count // 2))

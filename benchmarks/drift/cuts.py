@@ -1,7 +1,7 @@
 """Pairs cut out of images of real microscopes, through a known warp and with the noise of another real image.
 
-The images are those of `../shared/data`; the samples of one half are not those of the other. A pair is resampled from
-one image of 256 px by two frames, so its surface, its tip and its artefacts are real, and its displacement is known.
+The images are in `FOLDER`; the two halves share no sample. A pair is resampled from one image of 256 px by two frames,
+so its surface, its tip and its artefacts are real, and its displacement is known.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ NOISY = "nanonis/A151216.123306-02602.sxm"
 
 @dataclass(frozen=True)
 class Cut:
-    """Two scans and what is known about them; see `pairs.Pair`."""
+    """Two scans with their truth; see `pairs.Pair`."""
 
     reference: DriftScan
     scan: DriftScan
@@ -56,12 +56,12 @@ class Cut:
 
 
 def there_are_images() -> bool:
-    """True where the data of real microscopes are."""
+    """Return whether the data of real microscopes are there."""
     return FOLDER.is_dir()
 
 
 def cut(condition: str, seed: int, half: Half, prior_sd_px: float | None = None) -> Cut:
-    """A pair that depends on nothing but the arguments; see `pairs.pair`."""
+    """Return a pair that depends only on the arguments; see `pairs.pair`."""
     random = source(half, seed, len(condition), 77)
     how = replace(drawn_condition(condition, random), white=0.0, second_tip_px=0.0)
     frames = framed(*(Sampling((PIXELS, PIXELS), (1.0, how.aspect)),) * 2, how, random)
@@ -92,8 +92,8 @@ def cut(condition: str, seed: int, half: Half, prior_sd_px: float | None = None)
 
 
 def _placed(frames: tuple[Frame, Frame], image: Array, random: np.random.Generator) -> tuple[Array, float]:
-    """Where in the image the origin of the sample lies, (x, y), and pixels of the image for each of the sample: as
-    the frames fit in."""
+    # where in the image the origin of the sample lies, (x, y), and pixels of the image per pixel of the sample, so that
+    # the frames fit in
     corners = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
     reached = np.concatenate([f.sample_px(corners * f.width_px[:, None]) for f in frames], axis=1)
     low, high = reached.min(axis=1), reached.max(axis=1)
@@ -104,7 +104,7 @@ def _placed(frames: tuple[Frame, Frame], image: Array, random: np.random.Generat
 
 @cache
 def _image(name: str, channel: str) -> Array:
-    """Flattened line by line, as most are looked at, and without the noise of single pixels."""
+    # flattened line by line, as usual for viewing, and without the noise of single pixels
     values = _channel(name, channel)
     return np.asarray(ndimage.gaussian_filter(values - np.median(values, axis=1, keepdims=True), 0.6))
 
@@ -116,7 +116,7 @@ def _channel(name: str, channel: str) -> Array:
 
 
 def _noise(half: Half, random: np.random.Generator) -> Array:
-    """Of unit rms, with the spectrum that the electronics gave it."""
+    # of unit rms, with the spectrum of real electronics
     there = _channel(NOISY, f"{random.choice(NOISE[half])} {random.choice(('Forward', 'Backward'))}")
     row, column = (random.integers(n - PIXELS + 1) for n in there.shape)
     part = flattened(there[row : row + PIXELS, column : column + PIXELS])

@@ -1,8 +1,8 @@
-"""Families of pairs, of which each has a surface, a tip, an instrument and a displacement of its own.
+"""Families of pairs with varied surface, tip, instrument and displacement.
 
-Of the pairs of `SURFACES` and `CONDITIONS` every one is alike but for noise and place, and what is tuned on them learns
-them by heart. Here all parameters are drawn. There are two halves: all that is tuned is fitted on "fitted", and what
-reports give is "unseen", whose seeds (and of the real images, whose samples) no tuning sees.
+Pairs of `SURFACES` and `CONDITIONS` differ only by noise and place, so tuning on them would overfit. Here all
+parameters are drawn. There are two halves: everything tuned is fitted on "fitted", and reported figures are from
+"unseen", whose seeds (and, of real images, whose samples) no tuning uses.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ Relief = Callable[[Grid, Random, Random], Array]
 
 
 def source(half: Half, *numbers: int) -> Random:
-    """Random numbers that the other half has none of."""
+    """Return a random generator that shares no numbers with the other half."""
     return np.random.default_rng([1 + HALVES.index(half), *numbers])
 
 
 def drawn_surface(name: str, random: Random) -> Relief:
-    """A surface of a kind with parameters of its own."""
+    """Return a surface of a kind with drawn parameters."""
     u, log = random.uniform, partial(_log_uniform, random)
     parameters: dict[str, dict[str, float]] = {
         "stamper": {
@@ -56,7 +56,7 @@ def drawn_surface(name: str, random: Random) -> Relief:
 
 
 def drawn_condition(name: str, random: Random) -> Condition:
-    """As a condition of that name, of a microscope of its own."""
+    """Return the condition of that name with drawn parameters."""
     u, log, likely = random.uniform, partial(_log_uniform, random), partial(_likely, random)
     usual = CONDITIONS[name]
     if not usual.drift_px:
@@ -90,7 +90,6 @@ def drawn_condition(name: str, random: Random) -> Condition:
 
 
 def _likely(random: Random, probability: float) -> float:
-    """1 or 0."""
     return float(random.random() < probability)
 
 

@@ -1,9 +1,9 @@
 """`python -m benchmarks.drift.fit`: fit the probabilities and the ellipses of the default estimator.
 
-On the fitted half of the families alone. Writes plugins/drift/estimators/coefficients.py, or with `--figure` a
-reliability diagram of what is there, on both halves. The outcomes of all pairs are kept in build/ as they come: a run
-that was stopped goes on where it was, and one with more rounds adds to them. A change of the estimator asks for new
-ones: delete the file.
+Uses the fitted half of the families alone. Writes plugins/drift/estimators/coefficients.py, or with `--figure` a
+reliability diagram of the present coefficients, on both halves. The outcomes of all pairs are kept in build/ as they
+come: an interrupted run continues, and a run with more rounds adds to them. After a change of the estimator delete this
+file.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def gathered(half: Half, rounds: int, processes: int) -> list[Outcome]:
-    """Return the outcomes of so many rounds: those that are kept, and the missing ones, which are kept from now on."""
+    """Return the outcomes of `rounds` rounds: the kept ones, and the missing ones, which are computed and kept."""
     file = KEPT / f"drift-{half}.pickles"
     file.parent.mkdir(exist_ok=True)
     kept = list(_kept(file))
@@ -82,7 +82,7 @@ def gathered(half: Half, rounds: int, processes: int) -> list[Outcome]:
 
 
 def _round(half: Half, number: int) -> list[Trial]:
-    """A pair of each surface in each cell, and stampers where they are hard."""
+    # a pair of each surface in each cell, and more of stampers in cells where they are hard
     more = trials(half, {cell: [seed + number for seed in MORE_SEEDS] for cell in HARD}, (DEFAULT,))
     return [
         *trials(half, {cell: [SEED + number] for cell in CELLS}, (DEFAULT,)),
@@ -109,14 +109,16 @@ def _outcomes(jobs: Sequence[Trial], processes: int) -> list[Outcome]:
 
 
 def evidence(outcome: Outcome) -> MatchEvidence | None:
-    """What the estimator has found for and against its match; None where it has found none."""
+    """Return the estimator's evidence for its match; None without a match."""
     names = [field.name for field in fields(MatchEvidence)]
     return MatchEvidence(**{name: outcome.quality[name] for name in names}) if outcome.quality else None
 
 
 def fitted(outcomes: Sequence[Outcome]) -> str:
-    """Return the module of coefficients: a logistic regression with a ridge, by features of unit variance, and the
-    spread of the ellipses."""
+    """Return the module of coefficients: a logistic regression with a ridge, and the spread of the ellipses.
+
+    The regression uses features of unit variance.
+    """
     found = [(one, each) for one in outcomes if (each := evidence(one)) is not None]
     wrong = np.array([one.failed for one, _ in found], dtype=np.float64)
     accepted = np.array([one.accepted for one, _ in found])
@@ -125,7 +127,7 @@ def fitted(outcomes: Sequence[Outcome]) -> str:
         features = [_with_spread(each, one, spread).features() for one, each in found]
         x = np.array([list(one.values()) for one in features])
         right = np.median(x[wrong == 0.0], axis=0)
-        scale = np.maximum(x.std(axis=0), 1e-9)  # what none of the pairs tells apart weighs nothing
+        scale = np.maximum(x.std(axis=0), 1e-9)  # a feature equal in all pairs gets no weight
         weights = _logistic((x - right) / scale, wrong)
         probability = 1.0 / (1.0 + np.exp(-weights[0] - (x - right) / scale @ weights[1:]))
         accepted = probability <= acceptance.WRONG_AT_MOST
@@ -156,7 +158,7 @@ def _table(title: str, names: Sequence[str], values: Sequence[float] | Array) ->
 
 
 def _with_spread(found: MatchEvidence, outcome: Outcome, spread: Mapping[str, float]) -> MatchEvidence:
-    """Evidence as it will be with another spread than that which it was found with."""
+    # the evidence was computed with another spread
     changed = math.exp(_log_spread(outcome, spread)) / outcome.quality["spread"]
     return replace(found, sd_px=found.sd_px * math.sqrt(changed))
 
@@ -167,8 +169,8 @@ def _log_spread(outcome: Outcome, spread: Mapping[str, float]) -> float:
 
 
 def _spread(right: Sequence[Outcome]) -> dict[str, float]:
-    """By how much errors of accepted right matches exceed their model, so that ellipses of 95 % hold `COVERED` of them
-    whatever the doubt: linear quantile regression (Koenker and Bassett, Econometrica 46, 33, 1978)."""
+    # Factor on the model of accepted right matches, so that ellipses of 95 % contain `COVERED` of them at any doubt:
+    # linear quantile regression (Koenker and Bassett, Econometrica 46, 33, 1978).
     log_chi2 = np.log([max(one.chi2 * one.quality["spread"], 1e-6) / ELLIPSE_95 for one in right])
     columns = np.array([[1.0, *(one.quality[name] for name in DOUBTS)] for one in right])
     count, free = columns.shape
@@ -185,7 +187,7 @@ def _spread(right: Sequence[Outcome]) -> dict[str, float]:
 
 
 def _logistic(x: Array, wrong: Array) -> Array:
-    """The intercept and the weights."""
+    # the intercept and the weights
     columns = np.concatenate([np.ones((len(x), 1)), x], axis=1)
     penalty = np.full(columns.shape[1], RIDGE)
     penalty[0] = 0.0
@@ -205,7 +207,7 @@ BINS = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 0.7, 0.9, 0.97, 1.0)
 
 
 def drawn(outcomes: Mapping[Half, Sequence[Outcome]], path: Path) -> None:
-    """Draw which share of the matches was wrong, against the probability that was told of them."""
+    """Draw the share of wrong matches against their predicted probability."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.2, 4.0), layout="constrained")

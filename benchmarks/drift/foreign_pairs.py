@@ -1,8 +1,8 @@
 """A second generator of pairs, which shares no code and no assumption with the families.
 
-It judges and is never fitted to: what an estimator has learnt of the habits of one generator does not help it here.
-Surfaces have other statistics, the tip is a pyramid, noise remembers (relaxations and hum), scars are one to three rows
-thick and taper off, values have the steps of a converter. Lengths are in pixels of the reference.
+It judges and is never fitted to, so an estimator can't gain from the habits of the first generator. Surfaces have other
+statistics, the tip is a pyramid, noise has memory (relaxations and hum), scars are one to three rows thick and taper
+off, values have the steps of a converter. Lengths are in pixels of the reference.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ RELAXATIONS_PX = (4.0, 25.0, 150.0)
 
 @dataclass(frozen=True)
 class Circumstances:
-    """How a pair is taken. Heights are in units of the standard deviation of the reference without noise.
+    """The circumstances of a pair. Heights are in units of the standard deviation of the reference without noise.
 
     Attributes:
-        white: noise of each pixel by itself.
+        white: independent noise of each pixel.
         heavy: whether that noise has the heavy tails of Student's t with five degrees of freedom.
         relaxing: noise of each of `RELAXATIONS_PX`, which decays to 1/e within that length.
         hum: amplitude and period, px, of a sine along the lines.
-        offset: of each row by itself, with heavy tails.
+        offset: independent offset of each row, with heavy tails.
         scars: share of rows at which a scar begins.
         spikes: share of the pixels.
         lost: share of the rows.
         bow: of the scanner, in both directions.
         step: of the converter; 0 for none.
-        flattening: what the microscope has done to the rows.
-        gain, bend: contrast of the second scan: its logarithm's largest size, and how far it is from linear.
+        flattening: of the rows by the microscope.
+        gain, bend: contrast of the second scan: largest logarithm, and nonlinearity.
         drift_px: standard deviation of the drift during each scan.
-        turn_rad, stretch: of the sample between the scans, standard deviations; nobody knows of them.
+        turn_rad, stretch: of the sample between the scans, standard deviations; unknown to the estimator.
         creep_px, creep_length_px: of the lines' starts.
         tip: fall of the tip's flanks for each pixel.
         overlap: least and greatest share of the area.
-        frame_turn_rad: by which the second frame is turned; known.
+        frame_turn_rad: rotation of the second frame; known.
         zoom_px: width of the second scan, for a zoom; 0 for a scan like the first.
-        prior_px: standard deviation of what is expected; None where nothing is.
+        prior_px: standard deviation of the prior; None: no prior.
         elsewhere: the second scan shows another place.
     """
 
@@ -137,7 +137,7 @@ def circumstances(cell: str, random: Random) -> Circumstances:
 
 
 def stamper(place: Random, sample: Random, x: Array, y: Array) -> Array:
-    """Rounded bars of random lengths on tracks, with flanks of a hyperbolic tangent."""
+    """Return rounded bars of random lengths on tracks, with flanks of a hyperbolic tangent."""
     turn, pitch = sample.uniform(-0.8, 0.8), sample.uniform(50.0, 130.0)
     wide, flank, unit = pitch * sample.uniform(0.2, 0.4), sample.uniform(0.8, 4.0), sample.uniform(10.0, 25.0)
     along = x * np.cos(turn) + y * np.sin(turn)
@@ -161,14 +161,14 @@ def stamper(place: Random, sample: Random, x: Array, y: Array) -> Array:
 
 
 def rough(place: Random, sample: Random, x: Array, y: Array) -> Array:
-    """A skewed field, longer in one direction."""
+    """Return a skewed field, longer in one direction."""
     longest, power = sample.uniform(8.0, 60.0), sample.uniform(2.8, 4.0)
     made = field(place, x.shape, longest, power, sample.uniform(0.7, 1.4))
     return np.asarray(np.exp(sample.uniform(-0.5, 0.5) * made) + 0.3 * made)
 
 
 def particles(place: Random, sample: Random, x: Array, y: Array) -> Array:
-    """Clustered paraboloids with axes of their own, on a rough ground."""
+    """Return clustered paraboloids with axes of their own, on a rough ground."""
     height = sample.uniform(0.1, 0.8) * field(place, x.shape, sample.uniform(6.0, 25.0), 3.5)
     half, typical = float(x.max()), sample.uniform(2.0, 6.0)
     parents = place.uniform(-half, half, (place.poisson((2 * half) ** 2 / 2500.0) + 2, 2))
@@ -188,7 +188,7 @@ def particles(place: Random, sample: Random, x: Array, y: Array) -> Array:
 
 
 def lattice(place: Random, sample: Random, x: Array, y: Array) -> Array:
-    """Atoms of an oblique lattice under slow strain, with vacancies and adsorbates."""
+    """Return atoms of an oblique lattice under slow strain, with vacancies and adsorbates."""
     turn, a = sample.uniform(0.0, np.pi), sample.uniform(5.0, 14.0)
     b, between = a * sample.uniform(0.85, 1.2), sample.uniform(np.pi / 3, np.pi / 2)
     cell = np.array([
@@ -211,7 +211,7 @@ def lattice(place: Random, sample: Random, x: Array, y: Array) -> Array:
 
 
 def steps(place: Random, sample: Random, x: Array, y: Array) -> Array:
-    """Level sets of a slope with waves, and islands on the terraces."""
+    """Return level sets of a slope with waves, and islands on the terraces."""
     turn, terrace, edge = sample.uniform(0.0, 2 * np.pi), sample.uniform(20.0, 80.0), sample.uniform(0.5, 3.0)
     slope = (x * np.cos(turn) + y * np.sin(turn)) / terrace
     level = slope + sample.uniform(0.1, 0.5) * field(place, x.shape, sample.uniform(15.0, 50.0), 5.0) + place.random()
@@ -239,14 +239,14 @@ def field(random: Random, shape: tuple[int, ...], length_px: float, power: float
 
 @dataclass(frozen=True)
 class Sample:
-    """What a tip sees of a surface, between -half and half px in x and y."""
+    """A surface as imaged by a tip, between -half and half px in x and y."""
 
     coefficients: Array
     half_px: float
 
     @classmethod
     def of(cls, surface: str, half_px: float, place: Random, sample: Random, tip: float) -> Sample:
-        """Draw a surface and touch it with a pyramid."""
+        """Draw a surface and image it with a pyramid."""
         count = 2 * math.ceil(half_px * FINE) + 1
         axis = np.linspace(-half_px, half_px, count)
         height = SURFACES[surface](place, sample, *np.meshgrid(axis, axis))
@@ -260,13 +260,13 @@ class Sample:
         return cls(ndimage.spline_filter(ndimage.gaussian_filter(height, 0.45 * FINE)), half_px)
 
     def at(self, xy: Array) -> Array:
-        """Heights at positions (2, …)."""
+        """Return heights at positions (2, …)."""
         points = (self.coefficients.shape[0] - 1) / 2
         where = (xy / self.half_px + 1.0) * points
         return np.asarray(ndimage.map_coordinates(self.coefficients, where[::-1], mode="nearest", prefilter=False))
 
     def slope(self, xy: Array) -> Array:
-        """Its gradient there, (2, …), per px."""
+        """Return the gradient at positions, (2, …), per px."""
         h = 0.05
         by_x, by_y = (np.reshape(v, (2, *[1] * (xy.ndim - 1))) for v in ((h, 0.0), (0.0, h)))
         return np.stack([self.at(xy + d) - self.at(xy - d) for d in (by_x, by_y)]) / (2 * h)
@@ -274,7 +274,7 @@ class Sample:
 
 @dataclass(frozen=True)
 class Frame:
-    """Where a scan lies: tip position p shows the sample at `seen + matrix @ (p - middle)`; all in px.
+    """The place of a scan: tip position p shows the sample at `seen + matrix @ (p - middle)`; all in px.
 
     Attributes:
         turn_rad: of its axes.
@@ -294,30 +294,30 @@ class Frame:
 
     @property
     def axes(self) -> Array:
-        """Fast and slow axis in its columns."""
+        """Fast and slow axis in the columns."""
         cos, sin = math.cos(self.turn_rad), math.sin(self.turn_rad)
         return np.array([[cos, -sin], [sin, cos]])
 
     def positions(self, creep_px: float, length_px: float) -> Array:
-        """Tip positions (2, y, x) that its pixels show: lines begin beside their place."""
+        """Return tip positions (2, y, x) of its pixels; creep displaces the start of lines."""
         along = (np.arange(self.pixels) - (self.pixels - 1) / 2) * self.step_px
         crept = along + creep_px * self.step_px * np.exp(-np.arange(self.pixels) / length_px)
         u, v = np.meshgrid(crept, along)
         return np.asarray(self.middle[:, None, None] + np.tensordot(self.axes, np.stack([u, v]), 1))
 
     def sample(self, p: Array) -> Array:
-        """Positions (2, …) in the sample."""
+        """Return positions (2, …) in the sample."""
         flat = p.reshape(2, -1)
         return np.asarray((self.seen[:, None] + self.matrix @ (flat - self.middle[:, None])).reshape(p.shape))
 
     def tip(self, sample: Array) -> Array:
-        """Tip positions (2, …) at which the sample is seen."""
+        """Return tip positions (2, …) for positions in the sample."""
         flat = sample.reshape(2, -1)
         back = np.linalg.solve(self.matrix, flat - self.seen[:, None])
         return np.asarray((self.middle[:, None] + back).reshape(sample.shape))
 
     def holds(self, p: Array) -> NDArray[np.bool_]:
-        """Where tip positions (2, …) are within it."""
+        """Return whether tip positions (2, …) are within it."""
         own = np.tensordot(self.axes.T, p - self.middle.reshape(2, *[1] * (p.ndim - 1)), 1)
         return np.asarray((np.abs(own) <= self.width_px / 2 + 1e-9).all(axis=0))
 
@@ -328,9 +328,9 @@ class ForeignPair:
 
     Attributes:
         displacement_px: true displacement of a feature at `center_px` of the reference, in tip coordinates.
-        linear: by how much that changes with the position.
-        bound_px: root of the trace of the Cramér-Rao bound; NaN where nothing is in common.
-        elsewhere: whether nothing is.
+        linear: change of the displacement with the position.
+        bound_px: root of the trace of the Cramér-Rao bound; NaN for unrelated scans.
+        elsewhere: whether the scans are unrelated.
     """
 
     reference: DriftScan
@@ -343,7 +343,7 @@ class ForeignPair:
     elsewhere: bool
 
     def displacement_m(self, at_m: Array) -> Array:
-        """The true displacement of a feature at a position of the reference."""
+        """Return the true displacement of a feature at a position of the reference."""
         return np.asarray(PIXEL_M * self.displacement_px + self.linear @ (at_m - PIXEL_M * self.center_px))
 
 
@@ -419,14 +419,14 @@ def _frames(how: Circumstances, random: Random) -> tuple[Frame, Frame]:
 
 
 def _onto_something(sample: Sample, zoom: Frame, width_px: float, random: Random) -> Frame:
-    """Return a zoom at the one of some places where there is the most to be seen: a survey takes them of targets."""
+    # a survey takes zooms of targets: of some places the one with the largest relief
     reach = (width_px - zoom.width_px) / 2 - 2.0
     places = [replace(zoom, seen=random.uniform(-reach, reach, 2)) for _ in range(5)]
     return max(places, key=lambda at: float(sample.at(at.sample(at.positions(0.0, 1.0))).std()))
 
 
 def recorded(values: Array, how: Circumstances, random: Random) -> Array:
-    """Return what a microscope makes of heights [y, x] of unit variance."""
+    """Return heights [y, x] of unit variance as a microscope records them."""
     ny, nx = values.shape
     x, y = np.linspace(-1.0, 1.0, nx)[None, :], np.linspace(-1.0, 1.0, ny)[:, None]
     white = random.standard_t(5, (ny, nx)) / math.sqrt(5 / 3) if how.heavy else random.standard_normal((ny, nx))
@@ -456,7 +456,7 @@ def recorded(values: Array, how: Circumstances, random: Random) -> Array:
 
 
 def _scar(seen: Array, row: int, random: Random) -> None:
-    """One to three rows in which the tip drags something: it begins at once, and ends at once or slowly."""
+    # one to three rows in which the tip drags something: it begins at once, and ends at once or slowly
     ny, nx = seen.shape
     thick = random.choice(3, p=(0.45, 0.35, 0.2)) + 1
     start, length = random.integers(nx), 5.0 + random.exponential(40.0)
@@ -469,7 +469,7 @@ def _scar(seen: Array, row: int, random: Random) -> None:
 
 
 def levelled(values: Array, flattening: Flattening) -> Array:
-    """Return rows as a controller's software leaves them."""
+    """Return rows flattened as by a controller's software."""
     if flattening == "none":
         return values
     if flattening == "median":
@@ -492,11 +492,8 @@ def _bound(
     gain: float,
     how: Circumstances,
 ) -> float:
-    """Return the root of the trace of the Bayesian Cramér-Rao bound of the shift at `center`.
-
-    Unknown are a line in each row (a parabola where rows were flattened by one), the contrast, and the linear map, of
-    which as much is known as the circumstances say.
-    """
+    # The root of the trace of the Bayesian Cramér-Rao bound of the shift at `center`. Unknown are a line in each row (a
+    # parabola where rows were flattened by one), the contrast, and the linear map, with the prior of the circumstances.
     p = first.positions(0.0, 1.0)
     seen = first.sample(p)
     slope = np.tensordot(first.matrix.T, sample.slope(seen), 1) / unit

@@ -1,4 +1,4 @@
-"""How the default estimator does on pairs of a second generator, `foreign_pairs`, that nothing is fitted to."""
+"""Accuracy of the default estimator on pairs of a second generator, `foreign_pairs`, to which nothing is fitted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RIGHT_ZOOMS = {13: 65, 16: 88, 20: 90, 24: 92}  # %, accepted
 
 @dataclass(frozen=True)
 class ForeignTrial:
-    """A job: one pair, registered by the default estimator, which is not guarded."""
+    """A job: one pair, registered by the default estimator without its guard."""
 
     cell: str
     surface: str
@@ -97,7 +97,7 @@ def _rows(cells: Cells) -> Iterator[Row]:
         return [cells[cell, surface] for surface in SURFACES]
 
     def share(cell: str) -> float:
-        """Of right ones, accepted, %."""
+        # accepted ones among the right ones, %
         right = sum((1.0 - c.failed) * c.count for c in of(cell))
         return 100 * sum((c.accepted - c.wrong) * c.count for c in of(cell)) / max(right, 1.0)
 

@@ -1,8 +1,8 @@
-"""Nights in which a sample drifts and a microscope follows it as a tracker says; the truth is known.
+"""Nights in which a sample drifts and a microscope follows it by a tracker; the truth is known.
 
-The drift: 1.5 µm gone to 1/e in three hours, 300 nm in half an hour, a wave of 150 nm a day, a random walk of 1 nm in
-a quarter of an hour, each in a direction of its own. The scans: 2 µm, 128 px, every 15 minutes, noise "real", every
-row where the drift is while it is taken.
+The drift: 1.5 µm decaying to 1/e in three hours, 300 nm in half an hour, a wave of 150 nm a day, a random walk of 1 nm
+in a quarter of an hour, each in a direction of its own. The scans: 2 µm, 128 px, every 15 minutes, noise "real", every
+row at the drift of its own time.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Drift:
         self._walk_m = np.cumsum(step_m * random.standard_normal((steps, 2)), axis=0)
 
     def at(self, time_s: Array) -> Array:
-        """(…, 2) in m."""
+        """Return the displacement (…, 2) in m."""
         t = np.asarray(time_s, dtype=np.float64)[..., None]
         slow, fast, daily = self._directions
         smooth = -1.5e-6 * np.expm1(-t / 10800.0) * slow - 0.3e-6 * np.expm1(-t / 1800.0) * fast
@@ -59,8 +59,10 @@ class Drift:
         return np.asarray(smooth + walked)
 
     def during_m(self, start_s: float) -> Array:
-        """(2,) mean over the rows of a scan: where it shows the sample as a whole. For a steady drift, that is where
-        the sample is at its middle."""
+        """Return the mean displacement (2,) over the rows of a scan.
+
+        It is the place at which the scan shows the sample; for a steady drift, the place at its middle.
+        """
         rows_s = start_s + ROW_S * np.arange(PIXELS, dtype=np.float64)
         return np.asarray(self.at(np.asarray(rows_s)).mean(axis=0))
 
@@ -93,7 +95,7 @@ class Night:
         self._view = View.of(grid, image / image[_middle(grid)].std())
 
     def scan(self, number: int, start_s: float, center_m: Array, *, upwards: bool = True) -> DriftScan:
-        """The scan of this number (which its noise depends on) of a region of tip coordinates."""
+        """Return a scan of a region of tip coordinates; its noise depends on its number."""
         q = np.stack(np.meshgrid(*[np.arange(PIXELS) - (PIXELS - 1) / 2] * 2))
         order = np.arange(PIXELS) if upwards else np.arange(PIXELS)[::-1]
         sample_m = np.asarray(center_m - self.drift.at(np.asarray(start_s + order * ROW_S, dtype=np.float64)))
@@ -106,8 +108,10 @@ class Night:
         return DriftScan(values, region, start_s, start_s + FRAME_S, upwards, f"{number}")
 
     def followed(self, tracker: Tracker, *, up_and_down: bool = False) -> Iterator[tuple[Array, Update]]:
-        """(2,) where each scan shows the sample, less where the first one does; and what the tracker says of it. A
-        second frame, downwards and right after the first one, is not given out."""
+        """Yield the true displacement (2,) of each scan since the first, and the tracker's update.
+
+        A second frame, downwards and right after the first one, is not yielded.
+        """
         for number in range(self.scans):
             update = self._taken(tracker, number, number * INTERVAL_S)
             yield self.drift.during_m(number * INTERVAL_S) - self.drift.during_m(0.0), update

@@ -24,9 +24,9 @@ ELSEWHERE_PX = 60.0
 
 @dataclass(frozen=True)
 class Frame:
-    """How one scan lies on the sample: pixel offsets `q` from its middle show the sample at `origin + matrix @ q`.
+    """The place of one scan on the sample: pixel offsets `q` from its middle show the sample at `origin + matrix @ q`.
 
-    All in standard pixels. At the start of a line, on the left, the tip creeps: what is seen there lies further on by
+    All in standard pixels. At the start of a line, on the left, the tip creeps: the image there is displaced by
     `creep_px`, less by 1/e every `creep_length_px`.
     """
 
@@ -51,13 +51,13 @@ class Frame:
         return np.stack(np.meshgrid(x, y))
 
     def sample_px(self, q_px: Array) -> Array:
-        """Where in the sample offsets, shape (2, …), lie."""
+        """Return the places in the sample of offsets, shape (2, …)."""
         middle: Array = self.origin_px.reshape(2, *[1] * (q_px.ndim - 1))
         moved: Array = middle + np.einsum("ij,j...->i...", self.matrix, q_px + self._crept_px(q_px))
         return moved
 
     def seen_px(self, sample_px: Array) -> Array:
-        """The offset (2,) at which a place (2,) of the sample is seen."""
+        """Return the offset (2,) at which a place (2,) of the sample appears."""
         straight = np.asarray(np.linalg.solve(self.matrix, sample_px - self.origin_px), dtype=np.float64)
         q = straight
         for _ in range(20):
@@ -74,7 +74,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class View:
-    """A tip's image of a sample, wherever one wants to know it (cubic B-spline on a fine grid)."""
+    """A tip's image of a sample at any position (cubic B-spline on a fine grid)."""
 
     grid: Grid
     coefficients: Array
@@ -84,12 +84,12 @@ class View:
         return cls(grid, ndimage.spline_filter(image, order=3, mode="nearest"))
 
     def at(self, sample_px: Array) -> Array:
-        """Values at positions (2, …) in the sample."""
+        """Return values at positions (2, …) in the sample."""
         where = self.grid.index(sample_px)
         return np.asarray(ndimage.map_coordinates(self.coefficients, where, order=3, mode="nearest", prefilter=False))
 
     def gradient(self, sample_px: Array) -> Array:
-        """Derivatives along x and y at positions (2, …): shape (2, …), per standard pixel."""
+        """Return derivatives along x and y at positions (2, …): shape (2, …), per standard pixel."""
         h = 0.02
         shifts = h * np.eye(2).reshape(2, 2, *[1] * (sample_px.ndim - 1))
         return np.stack([(self.at(sample_px + s) - self.at(sample_px - s)) / (2 * h) for s in shifts])
@@ -100,8 +100,7 @@ class Truth:
     """A feature at `x` of the reference is at `x + displacement_m + linear @ (x - center_m)` in the scan.
 
     Attributes:
-        displacement_m, linear, center_m: as in `plugins.drift.registration.Registration`; the centre is that of the
-            overlap.
+        displacement_m, linear, center_m: as in `plugins.drift.registration.Registration`; the centre of the overlap.
         overlap: area in common over the smaller area.
     """
 
@@ -111,19 +110,19 @@ class Truth:
     overlap: float
 
     def at(self, xy_m: Array) -> Array:
-        """The displacement of a feature at a position of the reference."""
+        """Return the displacement of a feature at a position of the reference."""
         return np.asarray(self.displacement_m + self.linear @ (xy_m - self.center_m))
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two scans and what is known about them.
+    """Two scans and their truth.
 
     Attributes:
-        truth: None when the scans have nothing in common.
-        prior: what a tracker that is right could know: set by `pair(prior_sd_px=…)`.
-        frames, view: where the scans lie in the ideal image of the sample, which has unit rms in the reference (of a
-            pair without truth: that of the reference alone).
+        truth: None for unrelated scans.
+        prior: the prior of an ideal tracker: set by `pair(prior_sd_px=…)`.
+        frames, view: the place of the scans in the ideal image of the sample, which has unit rms in the reference (of a
+            pair without truth: the image of the reference alone).
         gain: of the second scan.
     """
 
@@ -139,13 +138,13 @@ class Pair:
 
     @cached_property
     def overlap(self) -> float:
-        """Area in common over the smaller area; 0 when there is none."""
+        """Area in common over the smaller area; 0 for unrelated scans."""
         return 0.0 if self.truth is None else self.truth.overlap
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """Pixels of one scan, (ny, nx), and how far apart they are along x and y in standard pixels."""
+    """Pixels of one scan, (ny, nx), and their distance along x and y in standard pixels."""
 
     shape: tuple[int, int] = (128, 128)
     step_px: tuple[float, float] = (1.0, 1.0)
@@ -165,16 +164,16 @@ def pair(
     prior_sd_px: float | None = None,
     half: Half | None = None,
 ) -> Pair:
-    """A pair that depends on nothing but the arguments.
+    """Return a pair that depends only on the arguments.
 
     Args:
         surface: one of `SURFACES`.
         condition: one of `CONDITIONS`.
         size: pixels of both scans in each direction.
         samplings: of both scans, in place of `size`.
-        prior_sd_px: give a prior about the true displacement, wrong by so much (for a pair without one: about the
-            displacement that it would have if it had an overlap).
-        half: draw the parameters of surface and condition too; see `families`.
+        prior_sd_px: give a prior about the true displacement with this standard deviation (for unrelated scans: about
+            the displacement that they would have with an overlap).
+        half: draw the parameters of surface and condition, too; see `families`.
     """
     numbers = (seed, list(SURFACES).index(surface), list(CONDITIONS).index(condition))
     if half is None:
@@ -206,7 +205,7 @@ def pair(
 
 
 def framed(first: Sampling, second: Sampling, how: Condition, random: np.random.Generator) -> tuple[Frame, Frame]:
-    """Two frames that overlap as the condition says, the middle of the overlap at the origin of the sample."""
+    """Return two frames with the overlap of the condition, its middle at the origin of the sample."""
     widths = [np.array([(n - 1) * s for n, s in zip(g.shape[::-1], g.step_px, strict=True)]) for g in (first, second)]
     smaller, larger = np.minimum(*widths), np.maximum(*widths)
     overlap, share = random.uniform(*how.overlap), random.random()
@@ -232,7 +231,7 @@ def framed(first: Sampling, second: Sampling, how: Condition, random: np.random.
 def _views(
     surface: Relief, frames: tuple[Frame, Frame], how: Condition, seeds: list[int], random: np.random.Generator
 ) -> tuple[View, View]:
-    """What the tip sees of the sample in each scan; once if it is the same."""
+    # one view if the tip is the same in both scans
     corners = np.array([[-0.5, -0.5, 0.5, 0.5], [-0.5, 0.5, -0.5, 0.5]])
     reach = max(np.abs(f.sample_px(corners * f.width_px[:, None])).max() for f in frames)
     grid = Grid(reach + MARGIN_PX)
@@ -253,7 +252,7 @@ def _views(
 
 
 def _apart(far_px: float, random: np.random.Generator) -> tuple[float, float] | None:
-    """(x, y) in any direction; None for nothing."""
+    # (x, y) in a random direction; None for a distance of zero
     if not far_px:
         return None
     direction = random.uniform(0.0, 2 * math.pi)

@@ -1,6 +1,6 @@
-"""What the parts of this benchmark are made of: jobs that any process can do, and reports of what came of them.
+"""The interface of this benchmark's parts: jobs for any process, and reports of their results.
 
-A part is a module with `jobs(plan)`, which lists them, and `report(results)`, which reads what they gave. Jobs are
+A part is a module with `jobs(plan)`, which lists them, and `report(results)`, which evaluates their results. Jobs are
 frozen dataclasses, so that they can be sent to another process.
 """
 
@@ -17,12 +17,12 @@ from benchmarks.rows import Row
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is to be done.
+    """The extent of a benchmark.
 
     Attributes:
         seed: the first of the pairs' seeds.
         quick: an eighth of the pairs.
-        estimators: by name, ours first; the others are there to compare with.
+        estimators: by name, the one under test first; the others are for comparison.
     """
 
     seed: int
@@ -34,21 +34,21 @@ class Plan:
         return self.estimators[0]
 
     def seeds(self, count: int) -> range:
-        """Of so many pairs, fewer in the quick version."""
+        """Return the seeds of `count` pairs, or of fewer in the quick version."""
         return range(self.seed, self.seed + (max(2, count // 8) if self.quick else count))
 
 
 class Job(Protocol):
-    """Something to do in any process."""
+    """A piece of work for any process."""
 
     def run(self) -> Sequence[Any]:
-        """Do it; what comes back goes to the part's report."""
+        """Do the job; return its results for the part's report."""
         ...
 
 
 @dataclass(frozen=True)
 class Report:
-    """What a part found: tables for a person, and lines with a target."""
+    """The findings of a part: tables for a person, and lines with a target."""
 
     tables: list[Table]
     rows: list[Row] = field(default_factory=list)
@@ -58,9 +58,9 @@ class Part(Protocol):
     """A module of this package that measures something."""
 
     def jobs(self, plan: Plan) -> Sequence[Job]:
-        """All there is to do, the longest first."""
+        """Return all jobs, the longest first."""
         ...
 
     def report(self, plan: Plan, results: Sequence[Any]) -> Report:
-        """Of all that the jobs gave, in their order."""
+        """Return the report of the jobs' results, in their order."""
         ...

@@ -1,8 +1,8 @@
-"""The paper's default estimator with the settings it was published with, to compare with; our own code.
+"""The paper's default estimator with its published settings, for comparison; implemented here.
 
-What distinguishes it from `plugins.drift.estimators.features.Brief`, where this is mended: scans are taken as they are,
-corners lie on pixels, all pairs within the RANSAC radius of 5 % of the scan count alike (9 px of 128, so mismatches do
-too), and what is asked of a result is that its inliers lie within that same radius: every result does.
+Differences from `plugins.drift.estimators.features.Brief`, which corrects them: scans are not prepared, corners lie on
+pixels, all pairs within the RANSAC radius of 5 % of the scan count alike (9 px of 128, so mismatches do, too), and a
+result only needs inliers within that same radius, which every result has.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class PublishedBrief:
 
 
 def _described(scan: DriftScan) -> tuple[Array, Descriptors]:
-    """Corners in tip coordinates, (n, 2), and descriptors; what the paper doesn't say is the library's own setting."""
+    # corners in tip coordinates, (n, 2), and descriptors; settings missing in the paper are the library's defaults
     from skimage import feature as untyped
 
     feature: Any = untyped

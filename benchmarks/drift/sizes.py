@@ -1,4 +1,4 @@
-"""Larger and smaller scans, pairs of different resolution, and what an estimate costs."""
+"""Larger and smaller scans, pairs of different resolution, and the cost of an estimate."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def report(plan: Plan, results: Sequence[Outcome]) -> Report:
 
 
 def costs(plan: Plan) -> Iterator[Row]:
-    """Time and memory of our estimator, in this process, with nothing else at the same time."""
+    """Measure time and memory of the default estimator, in this process, with nothing else at the same time."""
     for size, (runs, target_ms) in COSTS.items():
         seeds = range(plan.seed, plan.seed + (1 if plan.quick else runs))
         times = [Trial("", s, "real", seed, (plan.ours,), size).run()[0].cpu_s for s in SURFACES for seed in seeds]

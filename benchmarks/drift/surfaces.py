@@ -1,7 +1,7 @@
-"""Five kinds of surface, on a grid four times finer than the pixels of a scan, as a tip sees them.
+"""Five kinds of surface, on a grid four times finer than the pixels of a scan, as imaged by a tip.
 
-Lengths are in pixels of the standard scan (128 of them are 2 µm). A surface has two random sources: `specimen` is what
-any two places of one sample share (the direction of a lattice), `place` is what lies here.
+Lengths are in pixels of the standard scan (128 of them are 2 µm). A surface has two random sources: `specimen` for the
+properties common to all places of one sample (the direction of a lattice), `place` for this place.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _ROWS = 16  # dilated at a time, so that they stay in the processor's cache
 
 @dataclass(frozen=True)
 class Grid:
-    """A square of fine points, of `half_px` from its middle in each direction at least; positions are relative to it.
+    """A square of fine points, at least `half_px` from its middle in each direction; positions are relative to it.
 
     Attributes:
-        middle_px: (x, y) where it lies, for surfaces that have something special at their origin.
+        middle_px: (x, y) of its middle, for surfaces with something special at their origin.
     """
 
     half_px: float
@@ -45,7 +45,7 @@ class Grid:
         return (np.arange(self.count) - self.count // 2) / OVERSAMPLING
 
     def index(self, xy_px: Array) -> Array:
-        """Where positions, shape (2, …) as (x, y), lie in an array over the grid: shape (2, …) as (row, column)."""
+        """Return indices (2, …) as (row, column) in an array over the grid of positions, shape (2, …) as (x, y)."""
         return xy_px[::-1] * OVERSAMPLING + self.count // 2
 
 
@@ -62,7 +62,7 @@ def stamper(
     texture: float = 0.01,
     texture_px: float = 6.0,
 ) -> Array:
-    """Bumps on tracks 102 px apart, 32 px wide, 3 to 11 bits of 17.8 px long; one ends near the origin."""
+    """Return bumps on tracks 102 px apart, 32 px wide, 3 to 11 bits of 17.8 px long; one ends near the origin."""
     x, y = grid.axis_px[None, :] + grid.middle_px[0], grid.axis_px[:, None] + grid.middle_px[1]
     angle = math.radians(specimen.uniform(-turned_deg, turned_deg))
     along = x * math.cos(angle) + y * math.sin(angle) + place.uniform(-15.0, 15.0)
@@ -84,12 +84,16 @@ def stamper(
 
 
 def rough(grid: Grid, specimen: Random, place: Random, *, longest_px: float = ROUGH_PX, hurst: float = 0.8) -> Array:
-    """Self-affine ground of Hurst exponent 0.8 up to 40 px."""
+    """Return self-affine ground of Hurst exponent 0.8 up to 40 px."""
     return _self_affine(grid, place, longest_px=longest_px, hurst=hurst)
 
 
 def rough_power(f2: Array) -> Array:
-    """Spectral density of the image of `rough` by a sharp tip, up to a factor, at squared frequencies in 1/px²."""
+    """Return the spectral density, up to a factor, of a sharp tip's image of `rough`.
+
+    Args:
+        f2: squared frequencies, 1/px².
+    """
     return self_affine_amplitude(f2, longest_px=ROUGH_PX) ** 2 * np.exp(-f2 * (2 * math.pi * BAND_PX) ** 2)
 
 
@@ -104,7 +108,7 @@ def particles(
     ground: float = 0.15,
     ground_px: float = 10.0,
 ) -> Array:
-    """Spheres of 2 to 9 px radius, one on 400 square px, on almost flat ground."""
+    """Return spheres of 2 to 9 px radius, one per 400 square px, on almost flat ground."""
     height = ground * _self_affine(grid, place, longest_px=ground_px)
     count = place.poisson((2 * grid.half_px) ** 2 / area_px2)
     radii = np.clip(radius_px * np.exp(spread * place.standard_normal(count)), radius_px * 0.44, radius_px * 2.0)
@@ -126,10 +130,10 @@ def lattice(
     texture: float = 0.0,
     stretch: float = 1.0,
 ) -> Array:
-    """Atoms 8 px apart in a hexagonal lattice, about seven vacancies and adatoms on 128 x 128 px.
+    """Return atoms 8 px apart in a hexagonal lattice, with about seven vacancies and adatoms per 128 x 128 px.
 
-    There is one in each seventh of that area: where a view has none, nobody can tell one atom from the next. The
-    lattice is stretched along one axis of the grid.
+    Each seventh of that area has one: a view without a defect would have no determinable displacement. The lattice is
+    stretched along one axis of the grid.
     """
     angle = specimen.uniform(0.0, math.pi / 3)
     x, y = grid.axis_px[None, :], grid.axis_px[:, None]
@@ -169,7 +173,7 @@ def steps(
     kinks: float = 0.08,
     texture: float = 0.0,
 ) -> Array:
-    """Terraces about 60 px wide between meandering steps, levelled as a whole."""
+    """Return terraces about 60 px wide between meandering steps, levelled as a whole."""
     angle = math.radians(specimen.uniform(0.0, 360.0))
     x, y = grid.axis_px[None, :], grid.axis_px[:, None]
     plane = (x * math.cos(angle) + y * math.sin(angle)) / terrace
@@ -190,7 +194,7 @@ SURFACES: dict[str, Callable[..., Array]] = {
 
 
 def imaged(height: Array, second_tip_px: tuple[float, float] | None = None, blunt: float = 1.0) -> Array:
-    """What a tip makes of a surface of unit rms: dilated by a parabola, and of limited band.
+    """Return a tip's image of a surface of unit rms: dilated by a parabola, and of limited band.
 
     Args:
         blunt: radius of the tip, over the usual one.
@@ -209,7 +213,7 @@ def imaged(height: Array, second_tip_px: tuple[float, float] | None = None, blun
 
 
 def _dilated(height: Array, tip: Array, axis: int) -> Array:
-    """Grey dilation of one axis by an even function."""
+    # grey dilation of one axis by an even function
     reach = len(tip) // 2
     padded = np.ascontiguousarray(np.pad(np.moveaxis(height, axis, 0), ((reach, reach), (0, 0)), mode="edge"))
     highest = padded[reach:-reach].copy()
@@ -230,7 +234,7 @@ def _smooth_step(t: Array) -> Array:
 
 
 def _around(grid: Grid, center: Array, reach_px: float) -> Iterator[tuple[tuple[slice, slice], Array]]:
-    """The window of the grid within reach of a point, if there is one, and the squared distances in it."""
+    # the window of the grid within reach of a point, if there is one, and the squared distances in it
     axis = grid.axis_px
     (x0, x1), (y0, y1) = (np.searchsorted(axis, (c - reach_px, c + reach_px)) for c in center)
     if x0 < x1 and y0 < y1:
@@ -241,12 +245,12 @@ def _around(grid: Grid, center: Array, reach_px: float) -> Iterator[tuple[tuple[
 
 
 def self_affine_amplitude(f2: Array, *, longest_px: float, hurst: float = 0.8) -> Array:
-    """As f^-(hurst + 1), constant below 1 / longest_px; by the squared frequency in 1/px²."""
+    """Return an amplitude as f^-(hurst + 1), constant below 1 / longest_px; by the squared frequency in 1/px²."""
     return np.asarray(np.maximum(f2, longest_px**-2) ** (-(hurst + 1) / 2))
 
 
 def contaminated(height: Array, grid: Grid, place: Random, *, blobs: float) -> Array:
-    """With `blobs` drops of 2 to 6 px on 128 x 128 px, each up to three times the rms height."""
+    """Add `blobs` drops of 2 to 6 px per 128 x 128 px, each up to three times the rms height."""
     height, unit = height.copy(), height.std()
     count = place.poisson(blobs * (2 * grid.half_px / 128) ** 2)
     for center in place.uniform(-grid.half_px, grid.half_px, (count, 2)):
@@ -257,17 +261,17 @@ def contaminated(height: Array, grid: Grid, place: Random, *, blobs: float) -> A
 
 
 def _self_affine(grid: Grid, random: Random, *, longest_px: float, hurst: float = 0.8) -> Array:
-    """A Gaussian field of unit rms."""
+    # a Gaussian field of unit rms
     return _field(grid, random, lambda f2: self_affine_amplitude(f2, longest_px=longest_px, hurst=hurst))
 
 
 def _smooth(grid: Grid, random: Random, length_px: float) -> Array:
-    """A Gaussian field of unit rms and correlation length."""
+    # a Gaussian field of unit rms and correlation length
     return _field(grid, random, lambda f2: np.exp(-f2 * (math.pi * length_px) ** 2 / 2))
 
 
 def _field(grid: Grid, random: Random, amplitude: Callable[[Array], Array]) -> Array:
-    """A periodic Gaussian field of unit rms with a spectral amplitude, a function of the squared frequency in 1/px²."""
+    # periodic and Gaussian, of unit rms; the amplitude is a function of the squared frequency in 1/px²
     count = fft.next_fast_len(grid.count, real=True)
     fx, fy = fft.rfftfreq(count, 1 / OVERSAMPLING), fft.fftfreq(count, 1 / OVERSAMPLING)
     shape = amplitude(fx[None, :] ** 2 + fy[:, None] ** 2)

@@ -1,7 +1,7 @@
-"""How well drift is followed through simulated nights: misplacement of the scans, and what errors add up to.
+"""Drift tracking through simulated nights: misplacement of the scans, and accumulated errors.
 
-All is told relative to the first scan. "Late" is from the ninth scan on, two hours after the start. The oracle knows
-the true drift of all scans so far and predicts with the same filters: what is left is what nobody can foresee.
+All errors are relative to the first scan. "Late" is from the ninth scan on, two hours after the start. The oracle knows
+the true drift of all scans so far and predicts with the same filters: its error is unpredictable drift.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ FIRST_ORDER, ONE_WAY, LONG = "oracle, paper's scheme", "bank, upwards only", "ba
 
 @dataclass(frozen=True)
 class Followed:
-    """What came of one night; all in m, (scans, 2) flattened.
+    """The result of one night; all in m, (scans, 2) flattened.
 
     Attributes:
-        misplaced: predicted less true position of each scan.
-        mistaken: believed less true position after it.
-        unmatched, lost: how many scans were so.
-        half: of the families; None: a sample and a microscope like all others.
+        misplaced: predicted minus true position of each scan.
+        mistaken: estimated minus true position after each scan.
+        unmatched, lost: number of such scans.
+        half: of the families; None: a standard sample and microscope.
         lost_at_end: the sample was never found again.
     """
 
@@ -149,7 +149,7 @@ def _unseen_table(nights: Sequence[Followed]) -> Table:
 
 
 def _unseen_rows(nights: Sequence[Followed]) -> Iterator[Row]:
-    """Late misplacement over that of the oracle."""
+    # late misplacement over the oracle's
     ratios = []
     for surface in SURFACES:
         own, oracle = (
@@ -193,6 +193,6 @@ def _jump_m(starts: Sequence[Followed]) -> float:
 
 
 def _rms_m(parts: Iterable[NDArray[np.float64]]) -> float:
-    """Of the distances in arrays (n, 2)."""
+    # of the distances in arrays (n, 2)
     found = np.concatenate(list(parts))
     return math.sqrt(float(np.mean(np.sum(found**2, axis=1)))) if len(found) else math.nan

@@ -1,4 +1,4 @@
-"""One pair, some estimators, and how far each is from the truth."""
+"""One pair, registered by some estimators, and the error of each."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ ELLIPSE_95 = 5.991  # of chi square with two degrees of freedom
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one estimator made of one pair.
+    """The result of one estimator with one pair.
 
     Attributes:
-        cell: what the pair stands for, as the part names it.
-        error_px: (x, y) estimate less truth at the middle of the overlap; NaN without an estimate or a truth.
+        cell: the pair's group, as the part names it.
+        error_px: (x, y) estimate minus truth at the middle of the overlap; NaN without an estimate or a truth.
         chi2: of the error and the covariance, both at the centre that the estimator chose.
         bound_px, white_bound_px: roots of the traces of Cb and C; NaN where the noise is not known.
         cpu_s: of this process.
-        half: of the families; None: a pair like all others of its surface and condition.
-        quality: what the estimator says of it.
+        half: of the families; None: a standard pair of its surface and condition.
+        quality: the estimator's figures of merit.
     """
 
     cell: str
@@ -58,7 +58,7 @@ class Outcome:
 
     @property
     def failed(self) -> bool:
-        """No estimate, or one that is off by a pixel or more."""
+        """No estimate, or an error of a pixel or more."""
         return not self.off_px <= FAILED_PX
 
     @property
@@ -82,7 +82,7 @@ class Trial:
     half: Half | None = None
 
     def made(self) -> Pair | Cut:
-        """The pair."""
+        """Return the pair."""
         if self.half is not None and self.surface == cuts.SURFACE:
             return cuts.cut(self.condition, self.seed, self.half, self.prior_sd_px)
         return pair(
@@ -123,7 +123,7 @@ class Trial:
 
 
 def _errors(made: Pair | Cut, found: Registration) -> tuple[tuple[float, float], float]:
-    """Error at the middle of the overlap in pixels, and chi square at the centre of the estimate."""
+    # error at the middle of the overlap in pixels, and chi² at the centre of the estimate
     if made.truth is None or not np.isfinite(found.displacement_m).all():
         return (math.nan, math.nan), math.nan
     moved_m = found.displacement_m + found.linear @ (made.truth.center_m - found.center_m)
@@ -141,12 +141,12 @@ class Cell:
     """The figures of some outcomes.
 
     Attributes:
-        rms_px, p95_px: of those that did not fail.
+        rms_px, p95_px: of outcomes that did not fail.
         bound_px: root mean square of Cb over the same pairs.
         failed, accepted, wrong: shares of all.
-        bias_px: mean error, (x, y), of those that did not fail.
-        covered: share of the accepted whose 95 % ellipse has the truth in it.
-        right_accepted: share of those that did not fail.
+        bias_px: mean error, (x, y), of outcomes that did not fail.
+        covered: share of the accepted with the truth in their 95 % ellipse.
+        right_accepted: share of accepted outcomes among the ones that did not fail.
         beyond_three: accepted ones with the truth outside of three times that ellipse.
         ms: median, of the processor's time.
     """
@@ -196,7 +196,7 @@ def _mean(values: Array) -> float:
 
 
 def _of(values: Sequence[float], figure: Callable[[Array], float] = _mean) -> float:
-    """A figure of some values, NaN of none."""
+    # NaN without values
     return figure(np.array(values, dtype=np.float64)) if values else math.nan
 
 
@@ -205,5 +205,5 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def geometric_mean(values: Iterable[float]) -> float:
-    """NaN if any is."""
+    """Return the geometric mean; NaN if any value is."""
     return float(np.exp(np.mean(np.log(np.array(list(values))))))

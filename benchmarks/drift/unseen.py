@@ -1,4 +1,4 @@
-"""How estimates do on families of pairs, on the half that they were tuned on and on the one that no tuning has seen."""
+"""Accuracy on families of pairs, on the half used for tuning and on the half that no tuning has seen."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ GAP = 1.25  # of the unseen half over the fitted one, beyond which something was
 
 
 def surfaces() -> tuple[str, ...]:
-    """The families; images of real microscopes only where there are any."""
+    """Return the families; images of real microscopes only where there are any."""
     return (*SURFACES, *((cuts.SURFACE,) if cuts.there_are_images() else ()))
 
 
 def trials(half: Half, seeds: Mapping[str, Sequence[int]], estimators: tuple[str, ...]) -> list[Trial]:
-    """The pairs of one half, by cell."""
+    """Return the pairs of one half, by cell."""
     found = []
     for cell, numbers in seeds.items():
         name, _, prior = cell.partition("+")
@@ -47,7 +47,7 @@ def trials(half: Half, seeds: Mapping[str, Sequence[int]], estimators: tuple[str
 
 
 def _zoom(half: Half, seed: int) -> tuple[Sampling, Sampling]:
-    """An overview, and a zoom with pixels of its own."""
+    # an overview, and a zoom with pixels of its own
     random = source(half, seed, 31)
     pixels = int(random.choice((64, 96, 128)))
     return Sampling.square(128), Sampling.square(pixels, random.uniform(*ZOOM_PX) / (pixels - 1))
@@ -72,7 +72,7 @@ Cells = Mapping[tuple[Half, str, str], Cell]
 
 
 def _table(cells: Cells) -> Table:
-    """One line a condition and surface: the fitted half / the unseen one."""
+    # one line per condition and surface: the fitted half / the unseen one
     table = Table(title="families: fitted / unseen", title_justify="left", box=None, pad_edge=False)
     for head in ("", "surface", "n", "RMS px", "ratio to Cb", "failed", "accepted", "right accepted", "wrong", "95 %"):
         table.add_column(head, justify="left" if head in ("", "surface") else "right", no_wrap=True)
@@ -95,7 +95,7 @@ def _both(cells: Sequence[Cell], name: str, form: str) -> str:
 
 
 def _rows(cells: Cells) -> Iterator[Row]:
-    """Targets, on the unseen half."""
+    # targets, on the unseen half
 
     def of(cell: str, half: Half = "unseen") -> dict[str, Cell]:
         return {surface: cells[half, cell, surface] for surface in surfaces()}

@@ -1,4 +1,4 @@
-"""Jobs, done by several processes."""
+"""Runs jobs in several processes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHUNK = 8
 
 
 def done(jobs: Sequence[Job], processes: int) -> dict[Job, Sequence[Any]]:
-    """What came of each job, so many of them at a time, with a progress bar."""
+    """Return the results of each job, run in `processes` processes with a progress bar."""
     results: dict[Job, Sequence[Any]] = {}
     columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
     with (

@@ -1,4 +1,4 @@
-"""Random calls of emulated controllers: nothing that a client sends may end one, or make it write anywhere else."""
+"""Random calls of emulated controllers: no call may end one, or make it write outside its folder."""
 
 from __future__ import annotations
 

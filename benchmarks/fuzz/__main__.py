@@ -17,7 +17,7 @@ from benchmarks.fuzz.frame import Fuzzer, fuzz
 
 
 def emulators() -> Iterator[tuple[type[Fuzzer[Any]], Emulator]]:
-    """Yield each emulator, with what calls it: from the modules of this folder that have the name of an emulator."""
+    """Yield each emulator with its fuzzer, from the modules of this folder with the name of an emulator."""
     for name in emulator_names():
         if find_spec(f"benchmarks.fuzz.{name}") is not None:
             yield from import_module(f"benchmarks.fuzz.{name}").cases()

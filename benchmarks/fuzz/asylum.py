@@ -1,4 +1,4 @@
-"""Random calls of the emulated Asylum: its functions and values with odd arguments, and requests that are none."""
+"""Random calls of the emulated Asylum: its functions and values with odd arguments, and malformed requests."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
 
     def _named(self) -> tuple[str, list[Any]]:
         kind = self.chance.random()
-        if kind < 0.4:  # whatever is put is used by what is done next
+        if kind < 0.4:  # a later call uses the value
             names = ";".join(self.chance.choices(tuple(NUMBERS), k=self.chance.choice((1, 1, 2))))
             return "PV", [names, self._value("v")]
         if kind < 0.5:
@@ -105,5 +105,5 @@ class AsylumFuzzer(Fuzzer[AsylumEmulator]):
 
 
 def cases() -> Iterator[tuple[type[AsylumFuzzer], AsylumEmulator]]:
-    """Yield the emulators to be called."""
+    """Yield the emulators to call."""
     yield AsylumFuzzer, AsylumEmulator()

@@ -1,4 +1,4 @@
-"""The frame of the fuzzers: an emulator runs in a thread, gets random calls, and must answer afterwards as before."""
+"""The frame of the fuzzers: an emulator in a thread gets random calls, and must still answer correctly afterwards."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Emulated = TypeVar("Emulated", bound=Emulator)
 
 
 class Unfit(AssertionError):
-    """An emulator ended, no longer answers, failed at a request, or wrote where it should not."""
+    """An emulator ended, no longer answers, failed at a request, or wrote outside its folder."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run of a fuzzer came to.
+    """The counts of a fuzzer's run.
 
     Attributes:
         answered: calls with a result; refused: with an error of the vendor's; silent: without an answer.
@@ -43,8 +43,8 @@ class Fuzzer(ABC, Generic[Emulated]):
     """One vendor's random calls. Write the abstract methods; all are called from one thread.
 
     Args:
-        emulator: to be called, on any free port.
-        chance: all that is random comes from it.
+        emulator: to call, on any free port.
+        chance: the source of all random numbers.
     """
 
     def __init__(self, emulator: Emulated, chance: random.Random) -> None:
@@ -60,26 +60,31 @@ class Fuzzer(ABC, Generic[Emulated]):
         """Make one call, of any kind.
 
         Returns:
-            What was called, to be read by a person; and whether it was answered with a result, refused with an error,
-            or (None) not answered, which is right for some.
+            The call as a text; and whether it was answered with a result, refused with an error, or (None) not
+                answered,
+            which is right for some.
         """
 
     @abstractmethod
     def check(self) -> None:
-        """Put an ordinary question, on a connection of its own. Raises Unfit, OSError: it is not answered as ever."""
+        """Make an ordinary call, on a connection of its own.
+
+        Raises:
+            Unfit, OSError: the answer is wrong or missing.
+        """
 
     @abstractmethod
     def close(self) -> None:
-        """Let go of all connections."""
+        """Close all connections."""
 
     def integer(self, *usual: int) -> int:
-        """One of the usual values as a rule, else one at a border."""
+        """Return mostly one of the usual values, else one at a border."""
         if usual and self.chance.random() < 0.8:
             return self.chance.choice(usual)
         return self.chance.choice((0, 1, 2, 3, 6, 7, 24, 127, 128, 255, 500, 65535, 2**31 - 1, -1, -2, -(2**31)))
 
     def number(self, *usual: float) -> float:
-        """One of the usual values as a rule, else one that is not."""
+        """Return mostly one of the usual values, else an unusual one."""
         if usual and self.chance.random() < 0.7:
             return self.chance.choice(usual)
         nan, huge, small = float("nan"), 3e38, 1e-38
@@ -87,7 +92,7 @@ class Fuzzer(ABC, Generic[Emulated]):
         return self.chance.choice(odd) * self.chance.choice((1.0, 1.0, self.chance.random()))
 
     def text(self, *usual: str) -> str:
-        """One of the usual values as a rule, else one that no file can be called, and the like."""
+        """Return mostly one of the usual values, else for example an impossible file name."""
         if usual and self.chance.random() < 0.6:
             return self.chance.choice(usual)
         odd = (
@@ -108,7 +113,7 @@ class Fuzzer(ABC, Generic[Emulated]):
 
 
 def fuzz(kind: type[Fuzzer[Any]], emulator: Emulator, folder: Path, count: int, seed: int = 1) -> Outcome:
-    """Run so many calls.
+    """Run `count` calls.
 
     Args:
         folder: an empty one, in which the emulator has a folder of its own.
@@ -148,7 +153,7 @@ def fuzz(kind: type[Fuzzer[Any]], emulator: Emulator, folder: Path, count: int, 
 
 
 class _Mishaps(logging.Handler):
-    """Keeps the errors that an emulator logs, which only those are that nobody foresaw."""
+    """Keeps the errors that an emulator logs: unexpected ones, since expected errors are answers."""
 
     def __init__(self) -> None:
         super().__init__(logging.ERROR)

@@ -1,6 +1,6 @@
-"""Random calls of the emulated GXSM, through its bridge or its shared memory, and bytes that are no calls.
+"""Random calls of the emulated GXSM, through its bridge or its shared memory, and malformed bytes.
 
-Calls that can be made go by the translator's own links: what is replied to them must not break those either.
+Well-formed calls use the translator's own links, which must survive every reply.
 """
 
 from __future__ import annotations
@@ -58,10 +58,10 @@ _PICKLES: Final = (
 
 
 class _Wire(Protocol):
-    """Whatever else can be sent there than calls."""
+    """A way to send malformed input."""
 
     def send_odd(self) -> str:
-        """Send something, on no link's behalf. Returns what, to be read by a person."""
+        """Send malformed input, outside any link; return a description."""
 
 
 class GxsmFuzzer(Fuzzer[GxsmEmulator]):
@@ -99,7 +99,7 @@ class GxsmFuzzer(Fuzzer[GxsmEmulator]):
     def named(self) -> tuple[str, tuple[Any, ...]]:
         """Return a call."""
         kind = self.chance.random()
-        if kind < 0.4:  # whatever is set is used by what is done next
+        if kind < 0.4:  # a later call uses the setting
             ref = self.chance.choice(self._refs)
             return "set", (ref, self._set_to(ref))
         if kind < 0.5:
@@ -157,7 +157,7 @@ class GxsmFuzzer(Fuzzer[GxsmEmulator]):
 
 
 class _Bridge:
-    """Lines that are no calls, and calls whose answers nobody waits for."""
+    """Malformed lines, and calls whose answers are not read."""
 
     def __init__(self, fuzzer: GxsmFuzzer, address: str) -> None:
         self._fuzzer, self._chance = fuzzer, fuzzer.chance
@@ -198,7 +198,7 @@ class _Bridge:
 
 
 class _Memory:
-    """Requests that no program of Gxsm4's would write into its memory, or that nobody waits for."""
+    """Requests that no program of Gxsm4 would write into its memory, or whose answers are not read."""
 
     def __init__(self, fuzzer: GxsmFuzzer, address: str) -> None:
         self._fuzzer, self._chance = fuzzer, fuzzer.chance
@@ -238,7 +238,7 @@ class _Memory:
 
 
 def cases() -> Iterator[tuple[type[GxsmFuzzer], GxsmEmulator]]:
-    """Yield the emulators to be called."""
+    """Yield the emulators to call."""
     yield GxsmFuzzer, GxsmEmulator(version=3)
     yield GxsmFuzzer, GxsmEmulator(version=4, card="RPSPMC")
     if sys.platform.startswith("linux"):

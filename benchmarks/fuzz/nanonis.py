@@ -1,4 +1,4 @@
-"""Random calls of the emulated Nanonis: every function, with arguments that are right, odd, or no arguments at all."""
+"""Random calls of the emulated Nanonis: every function, with arguments that are right, odd, or malformed."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class NanonisFuzzer(Fuzzer[NanonisEmulator]):
         return f"{name} {values}", body
 
     def _values(self, codes: list[str]) -> list[Any]:
-        """For each code one; lists that share a length mostly have it."""
+        # one for each code; lists that should have equal lengths mostly have
         values: list[Any] = []
         count = 0
         for code in codes:
@@ -94,7 +94,7 @@ class NanonisFuzzer(Fuzzer[NanonisEmulator]):
         return [self._value("S" if code == "A" else code[1]) for _ in range(items)]
 
     def _calm(self) -> None:
-        """Stop what would go on for ever."""
+        # stops calls that would go on for ever
         for name, codes, values in (("Scan.Action", "HI", (1, 0)), ("Scan.BufferSet", ["[i]", "i", "i"], ([], 16, 16))):
             body = b"".join(_packed(code, value) for code, value in zip(codes, values, strict=True))
             self._ask(name, body)
@@ -125,7 +125,7 @@ def _exactly(connection: socket.socket, count: int) -> bytes:
 
 
 def _succeeded(body: bytes) -> bool:
-    """Only an error has a text at its end."""
+    # only an error has a text at its end
     return body.endswith(bytes(8))
 
 
@@ -150,5 +150,5 @@ def _packed(code: str, value: Any) -> bytes:
 
 
 def cases() -> Iterator[tuple[type[NanonisFuzzer], NanonisEmulator]]:
-    """Yield the emulators to be called."""
+    """Yield the emulators to call."""
     yield NanonisFuzzer, NanonisEmulator()

@@ -1,4 +1,4 @@
-"""Random calls of the emulated Nanosurf Studio: values and commands with odd arguments, and scripts that are none."""
+"""Random calls of the emulated Nanosurf Studio: values and commands with odd arguments, and malformed scripts."""
 
 from __future__ import annotations
 
@@ -108,5 +108,5 @@ def _exactly(connection: socket.socket, size: int) -> bytes:
 
 
 def cases() -> Iterator[tuple[type[NanosurfFuzzer], NanosurfEmulator]]:
-    """Yield the emulators to be called."""
+    """Yield the emulators to call."""
     yield NanosurfFuzzer, NanosurfEmulator()

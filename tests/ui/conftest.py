@@ -1,4 +1,4 @@
-"""A real browser: Debian's chromium, driven by Playwright. Where there is none these tests are skipped."""
+"""A real browser: Debian's chromium, driven by Playwright. Without it these tests are skipped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))  # `benchmarks` has a stage t
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With all other tests only the smoke test runs; all of these take minutes, and run with `make test-ui`."""
+    """Run only the smoke test together with other tests: all of these take minutes, and run with `make test-ui`."""
     here = Path(__file__).parent
     if not any((config.invocation_params.dir / arg.partition("::")[0]).is_relative_to(here) for arg in config.args):
         later = [item for item in items if item.path.is_relative_to(here) and item.path.name != "test_smoke.py"]
@@ -28,7 +28,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="module")
 def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    """An experiment that runs: one for all tests of a module. (After the browser: without one nothing is started.)"""
+    """A running experiment, one for all tests of a module.
+
+    It starts after the browser: without a browser no experiment is started.
+    """
     one = Night(tmp_path_factory.mktemp("night"))
     yield one
     one.close()
@@ -36,7 +39,7 @@ def night(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ni
 
 @pytest.fixture
 def opened(browser: Any, request: pytest.FixtureRequest) -> Iterator[Opened]:
-    """`opened(night.url, person="Ada")`: the page in a window of its own; what went wrong in it fails the test."""
+    """`opened(night.url, person="Ada")`: the page in a window of its own; an error in the page fails the test."""
     contexts = []
     wrong: list[str] = []
 

@@ -1,4 +1,4 @@
-"""With a certificate and a password, as from another computer: what is seen and what is done goes over https."""
+"""Viewing and steering over https with a certificate and a password, as from another computer."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ def night(browser: Any, tmp_path: Path) -> Iterator[Night]:
     one.close()
 
 
-def test_a_person_with_the_own_password_takes_over_and_is_gone_after_signing_out(night: Night, browser: Any) -> None:
+def test_a_person_with_a_password_takes_over_and_can_not_after_signing_out(night: Night, browser: Any) -> None:
     assert night.url.startswith("https://")
-    context = browser.new_context(ignore_https_errors=True)  # nobody has signed this certificate
+    context = browser.new_context(ignore_https_errors=True)  # a self-signed certificate
     try:
         page = context.new_page()
         page.goto(night.url)

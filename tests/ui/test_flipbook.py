@@ -35,7 +35,7 @@ CENTROID = """(name) => {
 
 @pytest.fixture(scope="module")
 def drifted(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The record of scans of one place of a sample, which wanders by a tenth of a micrometre from one to the next."""
+    """The record of scans of one place of a sample, which wanders by a tenth of a micrometre from scan to scan."""
     folder = tmp_path_factory.mktemp("drifted")
     (folder / "run.json").write_text(json.dumps({"name": "drifted", "ended": "the experiment has ended"}))
     store = RecordStore(folder, RecordSettings({"experiment": "drifted", "frame": "sample"}, frame=Frame.SAMPLE))

@@ -1,4 +1,4 @@
-"""However much is published, the page shows the newest, and takes no more memory for it."""
+"""At any rate of messages the page shows the newest, and its memory does not grow."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def page(browser: Any, stage: Stage) -> Iterator[Any]:
 
 
 def heap_bytes(page: Any) -> float:
-    """Of the page's JavaScript, without what is garbage."""
+    """Return the size of the page's JavaScript heap, without garbage."""
     session = page.context.new_cdp_session(page)
     session.send("HeapProfiler.collectGarbage")
     return float(session.send("Runtime.getHeapUsage")["usedSize"])
@@ -42,7 +42,7 @@ def test_a_scan_is_on_the_page_soon(stage: Stage, page: Any) -> None:
     assert late_ms[len(late_ms) // 2] < 150.0
 
 
-def test_at_full_speed_the_newest_is_shown_and_the_rest_left_out(stage: Stage, page: Any) -> None:
+def test_at_full_speed_the_newest_scan_is_shown_and_others_are_skipped(stage: Stage, page: Any) -> None:
     values = picture(1024)
     page.evaluate(
         """() => {
@@ -60,7 +60,7 @@ def test_at_full_speed_the_newest_is_shown_and_the_rest_left_out(stage: Stage, p
 
 
 def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -> None:
-    """As many messages as 8 hours bring at one line, state and word every 4 s, in seconds; twice, to compare."""
+    """As many messages as in 8 hours with one line, state and log line every 4 s, within seconds; twice, to compare."""
     sizes = []
     for half in range(2):
         for i in range(3600):
@@ -75,7 +75,7 @@ def test_a_night_of_messages_does_not_grow_the_memory(stage: Stage, page: Any) -
     assert sizes[1][1] - sizes[0][1] < 24 * MB
 
 
-def test_a_browser_that_stands_still_holds_up_nobody(stage: Stage, browser: Any, page: Any) -> None:
+def test_a_stalled_browser_does_not_delay_others(stage: Stage, browser: Any, page: Any) -> None:
     frozen = open_page(browser, stage.url)
     frozen.evaluate("setTimeout(() => { const end = Date.now() + 6000; while (Date.now() < end); }, 0)")
     before, end_s = stage.memory_bytes(), time.monotonic() + 5.0

@@ -1,4 +1,4 @@
-"""The dashboard may be killed, the scheduler too, and the experiment ends: the page says so each time."""
+"""The page shows a killed dashboard, a killed scheduler, and the end of the experiment."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def test_a_killed_dashboard_is_back_at_the_same_address_and_so_is_the_page(
     page.wait_for_selector(f"{lane} .process-alive ~ .process-starting ~ .process-alive", state="attached")
 
 
-def test_data_that_are_old_are_said_to_be(night: Night, opened: Opened) -> None:
+def test_old_data_are_marked(night: Night, opened: Opened) -> None:
     page = opened(night.url)
     page.wait_for_selector("#trouble", state="hidden")
-    # the one who would start it anew, too: together they are a computer that stands still
+    # the supervisor, too: together they are a frozen computer
     frozen = (night.process.pid, pid_of(night, "scheduler"))
     for pid in frozen:
         os.kill(pid, signal.SIGSTOP)
@@ -51,7 +51,7 @@ def test_data_that_are_old_are_said_to_be(night: Night, opened: Opened) -> None:
     page.wait_for_selector("#trouble", state="hidden", timeout=40_000)
 
 
-def test_a_page_that_has_joined_a_run_says_that_it_was_cut_off(opened: Opened, tmp_path: Path) -> None:
+def test_a_page_that_joined_a_run_shows_a_lost_scheduler(opened: Opened, tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
     file.write_text(EXPERIMENT.partition("[dashboard]")[0].format(speed=60.0, lines=2.0), encoding="utf-8")
     with ExitStack() as started:
@@ -75,7 +75,7 @@ def test_a_page_that_has_joined_a_run_says_that_it_was_cut_off(opened: Opened, t
         page.wait_for_selector(f"#trouble:has-text('It was cut off; `afspm run --resume {folder}`')", timeout=40_000)
 
 
-def test_the_end_is_asked_for_twice_and_then_told(night: Night, opened: Opened, keep: object) -> None:
+def test_the_end_needs_confirmation_and_is_shown(night: Night, opened: Opened, keep: object) -> None:
     page = opened(night.url, person="Ada")
     page.click("button:has-text('End the experiment')")
     page.click(".question button:has-text('End it')")

@@ -1,4 +1,4 @@
-"""The page outlives the experiment: the night can be looked through, and notes can be written, when it is over."""
+"""After the experiment the page stays: the night can be looked through, and notes can be written."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PLACES = "new Set([...document.querySelectorAll('.map [data-time]')].map((shape)
 
 @pytest.fixture(scope="module")
 def ended(browser: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Night]:
-    """A night of a few scans that a person has looked at, and that has ended; the page stays."""
+    """A night of a few scans that a person has viewed, and that has ended; the page stays."""
     night = Night(tmp_path_factory.mktemp("ended"), speed=600.0, more=MORE, options=("--stay",))
     try:
         context = browser.new_context()
@@ -77,7 +77,7 @@ def record(night: Night) -> Run:
 
 
 def look_at(page: Any, night: Night, number: int) -> int:
-    """Go to the moment when a scan was finished; its time."""
+    """Go to the moment at which a scan was finished; return its time."""
     with record(night) as run:
         time_ns = run.numbered(number).time_ns
     page.wait_for_function("window.afspm?.scrubber")
@@ -104,7 +104,7 @@ def test_a_moment_of_the_night_is_shown_as_it_was(
     keep(page, "recorded-night")
 
 
-def test_it_is_played(ended: Night, opened: Opened) -> None:
+def test_a_recorded_night_is_played(ended: Night, opened: Opened) -> None:
     page = opened(ended.url)
     look_at(page, ended, 1)
     page.click("#scrubber [data-part=play]")
@@ -144,7 +144,7 @@ def test_notes_of_the_night_and_of_the_morning_are_kept(ended: Night, opened: Op
     assert "&lt;b&gt;tip&lt;/b&gt; changed here" in report.text()
 
 
-def test_nothing_can_be_steered(ended: Night, opened: Opened) -> None:
+def test_a_recorded_night_can_not_be_steered(ended: Night, opened: Opened) -> None:
     page = opened(ended.url, person="Eve")
     page.wait_for_function("window.afspm?.scrubber")
     assert not page.locator("button:has-text('Take over'):visible").count()
@@ -152,7 +152,7 @@ def test_nothing_can_be_steered(ended: Night, opened: Opened) -> None:
     assert not page.locator("button:has-text('Scan here'):visible").count()
 
 
-def test_on_a_phone_it_fits(ended: Night, opened: Opened, keep: Callable[[Any, str], None]) -> None:
+def test_a_recorded_night_fits_a_phone(ended: Night, opened: Opened, keep: Callable[[Any, str], None]) -> None:
     page = opened(ended.url, width=390, height=844)
     look_at(page, ended, 2)
     assert page.evaluate("document.documentElement.scrollWidth") <= 390

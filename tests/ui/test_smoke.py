@@ -1,4 +1,4 @@
-"""The part of these tests that runs with all others: a scan is seen, and a person takes over and hands back."""
+"""The part of these tests that runs with all others: a scan is shown, and a person takes over and hands back."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each button does what it says, in the name of the person, as the scheduler's own messages tell."""
+"""Each button has its effect, in the name of the person, as the scheduler's own messages show."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ADA = "dashboard:Ada"
 
 @pytest.fixture
 def page(night: Night, opened: Opened) -> Iterator[Any]:
-    """The page of somebody who has signed in, in AUTOMATED mode."""
+    """The page of a person who has signed in, in AUTOMATED mode."""
     page = opened(night.url, person="Ada")
     page.wait_for_selector("button:has-text('Take over')")
     yield page
@@ -36,13 +36,13 @@ def take_over(page: Any, night: Night) -> None:
 
 
 def seen(night: Night) -> int:
-    """How many journal entries there are, to look only for those after."""
+    """Return the number of journal entries, to look only for later ones."""
     night.follower.pump(0.0)
     return len(night.follower.overview.entries)
 
 
 def said(page: Any, text: str) -> None:
-    """Wait until the page says so."""
+    """Wait until the page contains a text."""
     page.wait_for_selector(f".outcomes >> text={text}")
 
 
@@ -120,7 +120,7 @@ def test_parameters_are_read_and_set_and_refusals_give_their_reason(night: Night
     keep(page, "refused")
 
 
-def test_the_microscope_refuses_what_it_has_not(night: Night, page: Any) -> None:
+def test_the_microscope_refuses_a_missing_ability(night: Night, page: Any) -> None:
     take_over(page, night)
     after = seen(night)
     fill(page, "scan-size-x", "0 m")
@@ -130,7 +130,7 @@ def test_the_microscope_refuses_what_it_has_not(night: Night, page: Any) -> None
     assert night.entry(ADA, "scan-size-x", after=after).refused
 
 
-def test_what_the_file_names_is_adjusted_while_a_component_measures(night: Night, page: Any, keep: Any) -> None:
+def test_adjustable_parameters_are_set_while_a_component_measures(night: Night, page: Any, keep: Any) -> None:
     field(page, "zctrl-setpoint").wait_for()
     assert page.locator(".parameters input").count() == 2
     number, unit = read(page, "zctrl-setpoint").split()
@@ -221,7 +221,7 @@ def test_the_size_and_pixels_of_a_scan_are_edited_before_it_is_taken(night: Nigh
     assert taken.shape == (24, 24)
 
 
-def test_a_browser_that_is_closed_over_a_question_leaves_no_error(night: Night, page: Any, opened: Opened) -> None:
+def test_a_browser_closed_during_a_dialog_leaves_no_error(night: Night, page: Any, opened: Opened) -> None:
     other = opened(night.url, person="Max")
     other.wait_for_selector("button[aria-label='Restart series']")
     other.click("button[aria-label='Restart series']")
@@ -266,7 +266,7 @@ def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
     said(page, "scan-speed is now 4 µm/s")
 
 
-def test_stopping_in_automated_says_that_it_takes_over(night: Night, page: Any) -> None:
+def test_stopping_in_automated_announces_the_takeover(night: Night, page: Any) -> None:
     press(page, "Stop the scan")
     page.wait_for_selector(".question:has-text('sets the mode to MANUAL')")
     page.keyboard.press("Escape")
@@ -274,7 +274,7 @@ def test_stopping_in_automated_says_that_it_takes_over(night: Night, page: Any) 
     assert night.control().mode is ControlMode.AUTOMATED
 
 
-def test_a_component_is_started_anew(night: Night, page: Any) -> None:
+def test_a_component_is_restarted(night: Night, page: Any) -> None:
     before = night.until(lambda: night.follower.overview.processes.get("series")).starts
     page.click("button[aria-label='Restart series']")
     page.click(".question button:has-text('Restart')")
@@ -291,7 +291,7 @@ def test_a_component_is_started_anew(night: Night, page: Any) -> None:
     assert night.entry(ADA, "series").response == ControlResponse.SUCCESS
 
 
-def test_all_of_it_can_be_done_by_keyboard(night: Night, page: Any) -> None:
+def test_everything_can_be_done_by_keyboard(night: Night, page: Any) -> None:
     page.locator("button:has-text('Take over')").focus()
     page.keyboard.press("Enter")
     night.until(lambda: night.control().mode is ControlMode.MANUAL)
@@ -307,7 +307,7 @@ def test_all_of_it_can_be_done_by_keyboard(night: Night, page: Any) -> None:
     assert night.control().mode is ControlMode.MANUAL
 
 
-def test_two_persons_are_told_apart(night: Night, page: Any, opened: Opened) -> None:
+def test_two_persons_act_under_their_own_names(night: Night, page: Any, opened: Opened) -> None:
     after = seen(night)
     other = opened(night.url, person="Žofie Ö")
     choose(other, "problem", "drop-on-the-table")

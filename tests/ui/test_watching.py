@@ -1,4 +1,4 @@
-"""What is shown is what was published."""
+"""The page shows the published data."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ TURNED = Region((0.4e-6, -0.3e-6), (0.8e-6, 0.5e-6), 0.4)
 
 @pytest.fixture(scope="module")
 def scan(night: Night) -> Iterator[Scan]:
-    """A scan of many pixels, turned, longer than wide: nothing in it is the same when mirrored."""
+    """A rotated scan of many pixels, longer than wide: every mirror image of it differs."""
     with afspm.connect(night.folder, "tester") as scope:
         yield scope.scan(TURNED, shape=(48, 72), timeout_s=60.0).first
 
 
 def shown(page: Any, scan: Scan) -> Any:
-    """The canvas, once it shows the scan."""
+    """Return the canvas, once it shows the scan."""
     page.wait_for_function(f"document.querySelector('.picture').dataset.time === '{scan.time_ns}'")
     return page.locator(".picture")
 
 
 def drawn(page: Any) -> str:
-    """Wait for a picture; its time."""
+    """Wait for a picture; return its time."""
     page.wait_for_function("document.querySelector('.picture').dataset.number > 0")
     return str(page.get_attribute(".picture", "data-time"))
 
@@ -56,7 +56,7 @@ def test_the_value_under_the_pointer_is_the_one_published(
     assert read_value(page, column, row) == scan.values[row, column]
 
 
-def test_the_position_under_the_pointer_is_that_of_the_pixel(night: Night, opened: Opened, scan: Scan) -> None:
+def test_the_position_under_the_pointer_is_the_position_of_the_pixel(night: Night, opened: Opened, scan: Scan) -> None:
     page = opened(night.url)
     shown(page, scan)
     read_value(page, 70, 3)
@@ -87,7 +87,9 @@ def test_each_pixel_has_the_colour_of_its_value(night: Night, opened: Opened, sc
         assert np.abs(np.array(found) - wanted[row, column]).max() <= 1, (column, row)
 
 
-def test_it_is_said_to_be_simulated_and_what_is_scanned(night: Night, opened: Opened, scan: Scan, keep: Any) -> None:
+def test_the_page_is_marked_simulated_and_shows_the_facts_of_a_scan(
+    night: Night, opened: Opened, scan: Scan, keep: Any
+) -> None:
     page = opened(night.url)
     shown(page, scan)
     assert page.locator(".simulated").inner_text() == "SIMULATED: this is not a real microscope"
@@ -112,7 +114,7 @@ def test_the_pointer_may_be_the_keyboard(night: Night, opened: Opened, scan: Sca
     assert page.evaluate("afspm.image.view.zoom") == 1
 
 
-def test_zoom_keeps_what_is_under_the_pointer(night: Night, opened: Opened, scan: Scan) -> None:
+def test_zoom_keeps_the_place_under_the_pointer(night: Night, opened: Opened, scan: Scan) -> None:
     page = opened(night.url)
     shown(page, scan)
     before = read_value(page, 60, 40)
@@ -209,7 +211,7 @@ def test_the_log_is_filtered(night: Night, opened: Opened) -> None:
 @pytest.mark.parametrize(
     ("width", "height", "theme"), [(390, 844, "light"), (390, 844, "dark"), (1024, 768, "light"), (2000, 1100, "dark")]
 )
-def test_it_fits_any_screen(
+def test_the_page_fits_any_screen(
     night: Night, opened: Opened, scan: Scan, keep: Any, width: int, height: int, theme: str
 ) -> None:
     page = opened(night.url, width=width, height=height, theme=theme)
@@ -311,7 +313,7 @@ def test_both_axes_of_the_picture_have_one_unit(night: Night, opened: Opened, sc
     page.wait_for_function("window.texts?.includes('y / µm') && window.texts.includes('x / µm')")
 
 
-def test_whoever_has_not_signed_in_can_steer_nothing(night: Night, opened: Opened) -> None:
+def test_a_viewer_without_a_name_can_steer_nothing(night: Night, opened: Opened) -> None:
     page = opened(night.url)
     page.wait_for_selector("[role=rowheader]")
     assert page.locator("section.steer").count() == 0

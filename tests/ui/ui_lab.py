@@ -1,4 +1,4 @@
-"""What the tests in a browser share: an experiment that runs with a dashboard, and a browser that looks at it."""
+"""Shared parts of the tests in a browser: an experiment with a dashboard, and a browser."""
 
 from __future__ import annotations
 
@@ -78,13 +78,13 @@ class Night(AfspmProcess):
             self.url = self.wait_for_url("dashboard")
             published = [one.name for one in wire.declared() if one.source in (Role.TRANSLATOR, Role.SCHEDULER)]
             self.follower = Follower(self.folder, "terminal", tuple(published))
-        except BaseException:
+        except BaseException:  # also Ctrl-C must not leave the experiment running
             super().close()
             raise
         self.follower.catch_up()
 
     def until(self, condition: Callable[[], object]) -> Any:
-        """Follow what the scheduler publishes until `condition()`; what it then is."""
+        """Receive the scheduler's messages until `condition()`; return its value."""
         end_s = time.monotonic() + DEADLINE_S
         while not (found := condition()):
             assert time.monotonic() < end_s, f"{condition} never came true"
@@ -93,13 +93,13 @@ class Night(AfspmProcess):
         return found
 
     def control(self) -> ControlState:
-        """As the scheduler published it last."""
+        """The control state last published by the scheduler."""
         control = self.follower.overview.control
         assert control is not None
         return control
 
     def entry(self, who: str, what: str, *, after: int = 0) -> JournalEntry:
-        """The newest entry of the journal of this name whose words contain `what`, from the `after`-th entry on."""
+        """Return the newest journal entry of this name whose text contains `what`, from the `after`-th entry on."""
 
         def newest() -> JournalEntry | None:
             entries = list(self.follower.overview.entries)[after:]
@@ -109,7 +109,7 @@ class Night(AfspmProcess):
         return entry
 
     def close(self) -> None:
-        """End it, however it is."""
+        """End the experiment, also a broken one."""
         self.follower.close()
         self.process.terminate()
         with suppress(subprocess.TimeoutExpired):

@@ -1,4 +1,4 @@
-"""The drift benchmark's generator of pairs serves the tests too: `benchmarks` is imported from the repository."""
+"""Makes the repository's `benchmarks` importable: its generator of pairs serves the tests, too."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A drift compensated core to talk to, over the real wire format, with a worker that the test plays."""
+"""A drift compensated scheduler core over the real wire format, with a worker that the test plays."""
 
 from __future__ import annotations
 
@@ -98,7 +98,11 @@ def forecast(
     angle_rad: float = 0.0,
     rate_sd_m_s: float = 0.0,
 ) -> dict[str, Any]:
-    """A forecast of a sample that has moved by `drift_m` at a time, and moves on; turned, if wanted, about (0, 0)."""
+    """Return a forecast of a sample displaced by `drift_m` at a time, with its velocity.
+
+    Args:
+        angle_rad: rotation of the sample about (0, 0).
+    """
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
     linear = np.array([[cos, -sin], [sin, cos]])
     step = np.zeros((3, 3))
@@ -118,7 +122,7 @@ def registered(
     outcome: RegistrationOutcome | None = None,
     failures: tuple[str, ...] = (),
 ) -> Registered:
-    """The answer of a worker that knows this forecast."""
+    """Return the report of a worker that has this forecast."""
     outcome = outcome or (RegistrationOutcome.REFUSED if lost else RegistrationOutcome.REGISTERED)
     middle_s = (job.start_s + job.end_s) / 2
     there = forecast_from_dict(plain).at(middle_s)
@@ -142,7 +146,7 @@ def registered(
 
 
 def as_saved(state: SavedState) -> SavedState:
-    """The state as it comes out of its file."""
+    """Return the state as it is read back from its file."""
     return restored(SavedState, json.loads(json.dumps(snapshot(state, KIND, VERSION))), KIND, VERSION)
 
 
@@ -153,7 +157,7 @@ def _asks_for_a_place(effect: Effect) -> bool:
 
 
 def position_message(change: PositionChange) -> ProbePositionMessage:
-    """Half a position, as a peer may ask for it."""
+    """Return one coordinate of a position, as a peer may request it."""
     message = ProbePositionMessage(units="m")
     if change.x_m is not None:
         message.point.x = change.x_m
@@ -163,10 +167,10 @@ def position_message(change: PositionChange) -> ProbePositionMessage:
 
 
 class Lab:
-    """A core, what it has done, and short ways to make things happen. Real and experiment time pass alike.
+    """A core with its effects, and short ways to give it inputs. Real and experiment time pass alike.
 
     Args:
-        drift: None: the defaults, but that a night begins with one scan.
+        drift: None: the defaults, except that a night begins with one scan.
     """
 
     def __init__(
@@ -212,7 +216,7 @@ class Lab:
         return frame.state
 
     def mapping_now(self) -> Mapping:
-        """The mapping that holds now."""
+        """Return the mapping in force now."""
         mapping = self.drift.forecast.mapping_at(self._drift, self.now_s)
         assert mapping is not None
         return mapping
@@ -229,7 +233,7 @@ class Lab:
         return done + self._answer_places()
 
     def _answer_places(self) -> list[Effect]:
-        """The microscope answers where the scan and the probe are, when it is asked before a request is sent."""
+        # before a request the core asks the microscope for the places of scan and probe
         done: list[Effect] = []
         while (forward := next(filter(_asks_for_a_place, self.effects), None)) is not None:
             assert isinstance(forward, Forward)
@@ -250,18 +254,18 @@ class Lab:
             self.places.update(zip(PROBE_CHANGES, thing.xy_m, strict=True))
 
     def follow(self) -> list[Effect]:
-        """What is due at once, as whoever hosts the core would see to it."""
+        """Process everything that is due at once, as the scheduler's shell would."""
         done: list[Effect] = []
         while self.drift.following:
             done += self.done(self.core.step(Tick(), self.now_s, self.now_ns))
         return done
 
     def knows(self, plain: dict[str, Any]) -> None:
-        """The worker has this forecast."""
+        """Give the worker this forecast."""
         self.says(Forecasted(plain))
 
     def says(self, report: WorkerReport) -> list[Effect]:
-        """The worker reports something."""
+        """Let the worker report."""
         done = self.done(self.core.step(FrameReported(report), self.now_s, self.now_ns))
         return done + self.follow()
 
@@ -284,13 +288,13 @@ class Lab:
     # --- the microscope ---
 
     def forwards(self) -> list[Forward]:
-        """What was sent to the translator since this was called last."""
+        """Return the requests sent to the translator since the last call."""
         found = [effect for effect in self.effects if isinstance(effect, Forward)]
         self.effects = [effect for effect in self.effects if not isinstance(effect, Forward)]
         return found
 
     def sent(self) -> Forward:
-        """The one request that was sent."""
+        """Return the only request that was sent."""
         (one,) = self.forwards()
         return one
 
@@ -304,7 +308,7 @@ class Lab:
         return self.step(TranslatorReply(forward.number, response))
 
     def publish(self, thing: Any, time_s: float | None = None) -> list[Effect]:
-        """The translator publishes something."""
+        """Let the translator publish."""
         self.now_s += 1e-3
         self._has_in_force(thing)
         name, payload = wire.encode(thing)
@@ -315,7 +319,7 @@ class Lab:
         return self.publish(ScopeStatus(state))
 
     def in_force(self, region: Region = HERE, probe: tuple[float, float] = (0.0, 0.0)) -> None:
-        """What a translator publishes at its start."""
+        """Publish the messages of a translator's start."""
         self.publish(ScanParameters(region, SHAPE))
         self.publish(ProbePosition(probe))
         self.scope_is(ScopeState.FREE)
@@ -324,7 +328,7 @@ class Lab:
     def scan(
         self, region: Region = HERE, *, duration_s: float = 256.0, channels: tuple[str, ...] = ("Height",)
     ) -> None:
-        """A whole scan."""
+        """Publish a whole scan."""
         self.scope_is(ScopeState.SCANNING)
         self.now_s += duration_s
         end_ns = self.now_ns
@@ -336,7 +340,7 @@ class Lab:
     # --- what came of it ---
 
     def published(self, prefix: str = "") -> list[Any]:
-        """What was published since the effects were cleared, decoded."""
+        """Return the packets published since the effects were cleared, decoded."""
         packets = [e.packet for e in self.effects if isinstance(e, Publish) and e.packet.envelope.startswith(prefix)]
         return [wire.decode(wire.message_of(packet.envelope), packet.payload) for packet in packets]
 
@@ -347,5 +351,5 @@ class Lab:
         return [effect.response for effect in self.effects if isinstance(effect, Reply)]
 
     def saved(self) -> SavedState:
-        """What was saved last."""
+        """Return the last saved state."""
         return [effect.state for effect in self.effects if isinstance(effect, SaveState)][-1]

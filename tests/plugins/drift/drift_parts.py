@@ -1,4 +1,4 @@
-"""Estimators of users' own, for the worker."""
+"""Estimators as a user may write them, for the worker."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.plugins.drift.registration import DriftScan, Prior, Registration
 
 
 class Brightest:
-    """Finds the brightest pixel again."""
+    """Locates the brightest pixel in both scans."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         a, b = (np.array(np.unravel_index(np.argmax(one.values), one.values.shape))[::-1] for one in (reference, scan))
@@ -21,14 +21,14 @@ class Brightest:
 
 
 class Dies:
-    """Takes the process with it."""
+    """Ends its process."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         os._exit(7)
 
 
 class Hangs:
-    """Never comes back."""
+    """Never returns."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         threading.Event().wait()
@@ -36,7 +36,7 @@ class Hangs:
 
 
 class Forks(Brightest):
-    """Leaves a process behind that holds all pipes of the worker, and hangs."""
+    """Leaves a child process behind that holds all pipes of the worker, and hangs."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         if os.fork() == 0:
@@ -47,7 +47,7 @@ class Forks(Brightest):
 
 
 class Talks(Brightest):
-    """Prints, as people do."""
+    """Prints, as a user's code may."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         print("a word to standard output")  # noqa: T201

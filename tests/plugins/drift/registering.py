@@ -24,14 +24,14 @@ class Waves:
         self._height_m = 1e-9 * length_m / length_m.max()
 
     def at(self, x_m: Array, y_m: Array) -> Array:
-        """At the pixels of a scan, whose phases are sums of those along its first column and its first row."""
+        """Return heights at the pixels of a scan: phases are sums of those along its first column and first row."""
         column = self._k.T @ [x_m[:, 0], y_m[:, 0]] + self._phase[:, None]
         row = self._k.T @ [x_m[0] - x_m[0, 0], y_m[0] - y_m[0, 0]]
         height = self._height_m[:, None]
         return (height * np.cos(column)).T @ np.cos(row) - (height * np.sin(column)).T @ np.sin(row)
 
     def at_points(self, xy_m: Array) -> Array:
-        """At points (..., 2), wherever they lie."""
+        """Return heights at any points (..., 2)."""
         phase = xy_m @ self._k + self._phase
         height: Array = np.cos(phase) @ self._height_m
         return height
@@ -47,7 +47,7 @@ def scanned(
     noise: float = 0.02,
     seed: int = 0,
 ) -> DriftScan:
-    """What a tip sees in `region`: a feature at `x` is found at `drift_m + R x`, R a turn about the origin."""
+    """Return a scan of `region`: a feature at `x` is found at `drift_m + R x`, R a rotation about the origin."""
     x, y = region.pixels_m(shape)
     x, y = x - drift_m[0], y - drift_m[1]
     cos, sin = np.cos(turned_rad), np.sin(turned_rad)

@@ -1,4 +1,4 @@
-"""The probability that a match is wrong: what raises it, what is said of it, and how it is fitted."""
+"""The probability that a match is wrong: its dependence on the evidence, its text, and its fit."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def test_worse_evidence_of_any_kind_makes_a_match_less_likely(worse: dict[str, f
     assert replace(GOOD, **worse).wrong > GOOD.wrong
 
 
-def test_a_refusal_names_what_speaks_most_against_the_match_and_how_likely_it_is_wrong() -> None:
+def test_a_refusal_names_the_strongest_objection_and_the_probability_of_a_wrong_match() -> None:
     assert GOOD.refusal(0.1) == ""
     repeated = replace(GOOD, above_repeats=1.5)
     assert repeated.refusal(0.1).startswith("the surface repeats itself: a site like the others (1.5 standard")
     assert f"wrong with a probability of {repeated.wrong:.0%}" in repeated.refusal(0.1)
 
 
-def test_the_fit_tells_probabilities_that_are_right() -> None:
-    """Of matches of which only the agreement of their parts says whether they are wrong."""
+def test_the_fit_gives_calibrated_probabilities() -> None:
+    """Matches that are right or wrong depending only on the agreement of their parts."""
     random = np.random.default_rng(2)
     outcomes, told = [], []
     for seed in range(3000):
@@ -59,7 +59,7 @@ def test_the_fit_tells_probabilities_that_are_right() -> None:
     assert abs(module["WEIGHTS"]["gap"]) < 0.2
 
 
-def test_ellipses_are_as_large_as_errors_are_and_grow_with_the_doubt_that_tells() -> None:
+def test_ellipses_match_the_errors_and_grow_with_a_significant_doubt() -> None:
     random = np.random.default_rng(3)
     outcomes = []
     for seed in range(8000):
@@ -85,7 +85,7 @@ def test_no_doubt_makes_an_ellipse_smaller() -> None:
     assert all(spread[name] >= 0.0 for name in fit.DOUBTS)
 
 
-def test_a_fit_that_was_stopped_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_fit_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[int] = []
     monkeypatch.setattr(fit, "KEPT", tmp_path)
     monkeypatch.setattr(fit, "trials", lambda half, seeds, names: [_Job(seed, ran) for seed in seeds.get("real", [])])

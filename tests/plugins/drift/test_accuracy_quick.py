@@ -17,7 +17,7 @@ MOST_OF_STAMPER = 3.0
 
 @pytest.mark.parametrize("condition", ["white30", "real"])
 @pytest.mark.parametrize("surface", SURFACES)
-def test_errors_are_near_the_bound_and_what_is_right_is_accepted(surface: str, condition: str) -> None:
+def test_errors_are_near_the_bound_and_right_matches_accepted(surface: str, condition: str) -> None:
     trials = [Trial("", surface, condition, seed, (DEFAULT,)) for seed in range(4)]
     found = Cell.of(outcome for trial in trials for outcome in trial.run())
     assert found.accepted == 1.0
@@ -27,7 +27,7 @@ def test_errors_are_near_the_bound_and_what_is_right_is_accepted(surface: str, c
 
 
 @pytest.mark.parametrize("surface", SURFACES)
-def test_scans_with_nothing_in_common_are_refused(surface: str) -> None:
+def test_unrelated_scans_are_refused(surface: str) -> None:
     register = unguarded().register
     for seed in range(2):
         made = pair(surface, "null", seed, prior_sd_px=1.0)

@@ -1,4 +1,4 @@
-"""The benchmark's pairs are what they say, and its bounds are those of the noise that is in them."""
+"""The benchmark's pairs match their truth, and its bounds match their noise."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ QUIET: dict[str, Any] = {
 
 
 def found_at(scan: DriftScan, xy_m: Array) -> Array:
-    """Heights at positions (2, …) in tip coordinates, by the scan's own pixels."""
+    """Return heights at positions (2, …) in tip coordinates, interpolated from the scan's pixels."""
     ny, nx = scan.values.shape
     x_m, y_m = scan.region.pixels_m((ny, nx))
     column = (xy_m[0] - x_m[0, 0]) / scan.pixel_m[0]
@@ -70,7 +70,7 @@ def test_without_noise_a_scan_moved_by_the_truth_is_the_other(
 
 
 @pytest.mark.parametrize("surface", SURFACES)
-def test_the_overlap_is_what_the_condition_says(surface: str) -> None:
+def test_the_overlap_matches_the_condition(surface: str) -> None:
     for condition, how in CONDITIONS.items():
         truth = pair(surface, condition, seed=11, size=40).truth
         if how.elsewhere:
@@ -99,8 +99,8 @@ def test_a_prior_is_wrong_by_its_standard_deviation() -> None:
     assert np.std(off) == pytest.approx(1.5, rel=0.15)
 
 
-def test_no_view_of_a_lattice_is_without_a_defect() -> None:
-    """Without one, its sites are all alike, and a displacement between them has no truth that could be found."""
+def test_every_view_of_a_lattice_has_a_defect() -> None:
+    """Without a defect all sites are alike, and the displacement between two views has no determinable truth."""
     grid = Grid(64.0)
     every_atom_px = 10  # a square of that side has at least one in it
     for seed in range(12):
@@ -111,7 +111,7 @@ def test_no_view_of_a_lattice_is_without_a_defect() -> None:
             assert view.min() < 0.8 * atom or view.max() > 1.2 * atom
 
 
-def test_noise_has_the_size_it_is_said_to_have() -> None:
+def test_noise_has_its_declared_size() -> None:
     random, flat = np.random.default_rng(1), np.zeros((256, 256))
     how = replace(CONDITIONS["hard"], **{**QUIET, "white": 0.25})
     assert measured(flat, how, random).std() == pytest.approx(0.25, rel=0.02)
@@ -126,7 +126,7 @@ def test_noise_has_the_size_it_is_said_to_have() -> None:
 
 @pytest.mark.parametrize("surface", SURFACES)
 def test_maximum_likelihood_reaches_the_bound_of_white_noise(surface: str) -> None:
-    """One noisy image against the exact surface: half of C, had both images the whole overlap."""
+    """One noisy image against the exact surface: half of C, if both images had the whole overlap."""
     made = pair(surface, "white10", seed=5, size=80)
     frame, random = made.frames[1], np.random.default_rng(7)
     sample = frame.sample_px(frame.offsets_px())
@@ -144,8 +144,8 @@ def test_maximum_likelihood_reaches_the_bound_of_white_noise(surface: str) -> No
     assert 0.9 * whole_px2 < np.trace(bounds(made).white) < 2.0 * whole_px2  # fewer pixels, less known
 
 
-def test_row_noise_is_as_the_bound_takes_it() -> None:
-    """The errors of the best linear estimate scatter as its information says."""
+def test_row_noise_matches_the_bound() -> None:
+    """The errors of the best linear estimate scatter as predicted by its information."""
     how = replace(CONDITIONS["real"], scars=0.0)
     made = pair("particles", "real", seed=5)
     frame, random = made.frames[0], np.random.default_rng(3)
@@ -160,13 +160,13 @@ def test_row_noise_is_as_the_bound_takes_it() -> None:
     assert chi2.mean() == pytest.approx(2.0, abs=4 * 2 / np.sqrt(150))
 
 
-def test_what_is_unknown_besides_makes_the_bound_larger() -> None:
+def test_nuisance_parameters_enlarge_the_bound() -> None:
     for surface in SURFACES:
         best = bounds(pair(surface, "hard", seed=2))
         assert np.trace(best.white) < np.trace(best.rows) < np.trace(best.full)
 
 
-def test_the_best_estimate_of_an_unknown_ground_is_as_much_worse_as_the_bound_says() -> None:
+def test_the_best_estimate_on_an_unknown_ground_matches_its_bound() -> None:
     """The processor of Hannan and Thomson, on a periodic ground that is seen twice."""
     how, size, random = CONDITIONS["white3"], 64, np.random.default_rng(8)
     k = 2 * np.pi * np.fft.fftfreq(size)
@@ -185,8 +185,8 @@ def test_the_best_estimate_of_an_unknown_ground_is_as_much_worse_as_the_bound_sa
     assert unknown_rough(how, size) > 1.08
 
 
-def test_the_published_estimator_is_as_inexact_and_as_trusting_as_it_was_measured() -> None:
-    """0.13 px on rough ground; and scans that have nothing in common are accepted."""
+def test_the_published_estimator_has_its_measured_error_and_accepts_unrelated_scans() -> None:
+    """0.13 px on rough ground; and unrelated scans are accepted."""
     pytest.importorskip("skimage")
     trials = [Trial("", "rough", "real", seed, (PUBLISHED,)) for seed in range(8)]
     found = Cell.of(outcome for trial in trials for outcome in trial.run())
@@ -196,7 +196,7 @@ def test_the_published_estimator_is_as_inexact_and_as_trusting_as_it_was_measure
     assert elsewhere.accepted
 
 
-def test_every_pair_of_a_family_has_parameters_of_its_own_and_no_half_has_those_of_the_other() -> None:
+def test_pairs_of_a_family_have_different_parameters_and_the_halves_share_none() -> None:
     drawn = [pair("lattice", "hard", seed, half=half).condition for half in families.HALVES for seed in range(3)]
     assert len({(how.white, how.exponent, how.blunt) for how in drawn}) == 6
 
@@ -206,7 +206,7 @@ def test_no_sample_of_a_real_image_is_in_both_halves() -> None:
     assert not fitted & unseen
 
 
-def test_where_a_line_creeps_its_start_is_seen_elsewhere_and_its_end_is_not() -> None:
+def test_creep_displaces_the_start_of_a_line_and_not_its_end() -> None:
     frame = pairs.Frame((128, 128), (1.0, 1.0), np.zeros(2), np.eye(2), creep_px=1.0, creep_length_px=6.0)
     there = np.array([[-63.5, 63.5], [0.0, 0.0]])
     assert frame.sample_px(there)[0] == pytest.approx([-62.5, 63.5], abs=1e-6)

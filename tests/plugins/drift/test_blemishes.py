@@ -1,4 +1,4 @@
-"""Scars and spikes that one of two scans has alone, and lines of a turned scan: what the fit is spared."""
+"""Scars and spikes in only one of two scans, and lines of a rotated scan: they don't reach the fit."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHIFT_PX = 3
 
 
 def rough(seed: int = 4) -> Array:
-    """Ground on which a scar is no higher than what lies beside it."""
+    """Return ground on which a scar is no higher than its surroundings."""
     from scipy.ndimage import gaussian_filter
 
     made = gaussian_filter(np.random.default_rng(seed).standard_normal((80, 80)), 3.5)
@@ -26,7 +26,7 @@ def rough(seed: int = 4) -> Array:
 
 
 def seen_twice(noise: float = 0.03) -> tuple[Array, Array, Array]:
-    """The second view of a surface lies `SHIFT_PX` to the right of the first; and theta."""
+    """Return two views of a surface, the second `SHIFT_PX` to the right of the first, and theta."""
     whole, random = rough(), np.random.default_rng(1)
     first, second = (
         view + noise * random.standard_normal(view.shape) for view in (whole[:64, SHIFT_PX:67], whole[:64, :64])
@@ -65,7 +65,7 @@ def test_a_scar_of_one_scan_is_made_up_there_and_not_in_the_other(thick: int) ->
     assert abs(mended.first.values - clean)[inside].mean() < 0.8 * abs(first - clean)[inside].mean()
 
 
-def test_what_is_made_up_tells_nothing_of_the_displacement() -> None:
+def test_made_up_pixels_carry_no_information_about_the_displacement() -> None:
     first, second, theta = seen_twice()
     made_up = np.zeros(first.shape, dtype=bool)
     made_up[30:33] = True
@@ -76,7 +76,7 @@ def test_what_is_made_up_tells_nothing_of_the_displacement() -> None:
     assert (~known).any(axis=1).sum() == 3
 
 
-def test_scans_without_scars_are_left_as_they_are() -> None:
+def test_scans_without_scars_stay_unchanged() -> None:
     first, second, theta = seen_twice()
     mended = without_scars_of_one(Scene(everywhere(first), everywhere(second)), theta)
     assert mended.first.values is first
@@ -95,8 +95,8 @@ def test_a_spike_of_one_scan_is_mended_and_a_feature_of_both_is_left(wide: int) 
     assert mended[20] == pytest.approx(clean[20])
 
 
-def test_crossing_lines_are_taken_away_with_the_rows() -> None:
-    """Offsets, tilts and bends of the rows of both scans go; features stay."""
+def test_crossing_lines_are_removed_with_the_rows() -> None:
+    """Offsets, tilts and bends of the rows of both scans are removed; features stay."""
     random, turn = np.random.default_rng(2), np.radians(30.0)
     x, y = np.meshgrid(np.arange(60.0) - 29.5, np.arange(60.0) - 29.5)
     own = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
@@ -110,14 +110,14 @@ def test_crossing_lines_are_taken_away_with_the_rows() -> None:
     assert lines.seen(features[:, None], everything).std() > 0.4 * features.std()
 
 
-def test_doubt_beyond_what_was_fitted_grows_no_further() -> None:
+def test_doubt_is_limited_to_the_range_of_the_fit() -> None:
     certain, small = Doubt(1.0, 1.0, 0.01, 0.1), Doubt(1e4, 1e3, 3.0, 1.0)
     assert certain.spread == pytest.approx(SPREAD["all"])
     assert small.spread == pytest.approx(SPREAD["most"])
 
 
 def test_lines_of_a_zoom_creep_for_their_own_pixels() -> None:
-    """A tenth as wide they creep a tenth as far, for a tenth of the way; turned ones are not modelled."""
+    """A tenth as wide they creep a tenth as far, for a tenth of the way; rotated ones are not modelled."""
     zoom, overview = Spline(np.zeros((20, 20)), None), Spline(np.zeros((120, 120)), None)
     box = OverlapBox.of_overlap((120, 120), (20, 20), np.zeros(2))
     assert box is not None

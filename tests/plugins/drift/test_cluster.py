@@ -1,4 +1,4 @@
-"""Tasks and studies on a Dask cluster, which is started once for all of these."""
+"""Tasks and studies on a Dask cluster, started once for all of these tests."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def cluster() -> Iterator[str]:
         yield made.scheduler_address
 
 
-def test_it_loses_no_task_with_a_worker(cluster: str, tmp_path: Path) -> None:
+def test_a_cluster_loses_no_task_with_a_dead_worker(cluster: str, tmp_path: Path) -> None:
     tasks = [(n, tmp_path) for n in range(6)]
     done = by_index(list(on_cluster(doubled_by_the_next, tasks, address=cluster)))
     failed = list(on_cluster(doubled, [(-1,)], address=cluster))
@@ -40,12 +40,12 @@ def test_it_loses_no_task_with_a_worker(cluster: str, tmp_path: Path) -> None:
     assert failed == [TaskOutcome(0, error="below zero")]
 
 
-def test_the_same_study_says_the_same(cluster: str) -> None:
+def test_a_study_on_a_cluster_gives_the_same_result(cluster: str) -> None:
     here = told(*SMALL, "-n", "2", "-j", "1")
     assert told(*SMALL, "-n", "2", "--cluster", cluster) == here
 
 
-def test_one_that_is_not_there_is_told() -> None:
+def test_a_missing_cluster_is_reported() -> None:
     pytest.importorskip(**NEEDED)
     with pytest.raises(ConfigError, match="no cluster"):
         list(on_cluster(doubled, [(1,)], address="nonsense://nowhere"))

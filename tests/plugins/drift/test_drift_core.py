@@ -1,4 +1,4 @@
-"""Scans wait until they are registered, whatever the worker does; and what is done about what they tell."""
+"""Scans wait for their registration, also if the worker fails or hangs; and the responses to its reports."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ def test_all_channels_of_a_scan_wait_for_it_and_get_the_same_mapping(lab: Lab) -
 
 
 @pytest.mark.parametrize("channels", [("ADC", "Topo", "Topo Retrace"), ("Topo", "Topo Retrace", "ADC", "ADC Retrace")])
-def test_channels_that_come_in_files_of_their_own_are_of_one_scan(lab: Lab, channels: tuple[str, ...]) -> None:
-    """As GXSM writes them."""
+def test_channels_in_separate_files_belong_to_one_scan(lab: Lab, channels: tuple[str, ...]) -> None:
+    """GXSM writes each channel into its own file."""
     lab.take_control()
     lab.scope_is(ScopeState.SCANNING)
     lab.now_s += 256.0
@@ -91,7 +91,7 @@ def test_heights_without_values_are_not_registered(lab: Lab) -> None:
 
 
 def test_the_middle_of_a_scan_is_between_its_beginning_and_its_own_end(lab: Lab) -> None:
-    """However late its file comes."""
+    """A late file does not move the middle."""
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s
     end_s = began_s + 200.0
@@ -101,7 +101,7 @@ def test_the_middle_of_a_scan_is_between_its_beginning_and_its_own_end(lab: Lab)
     assert (job.start_s, job.end_s) == pytest.approx((began_s, end_s), abs=1e-6)
 
 
-def test_what_comes_after_a_scan_waits_in_order(lab: Lab) -> None:
+def test_packets_after_a_waiting_scan_wait_in_order(lab: Lab) -> None:
     lab.scan()
     lab.scan()
     assert len(lab.worker.jobs) == 1  # one after the other
@@ -119,7 +119,7 @@ def test_requests_do_not_wait_for_a_scan(lab: Lab) -> None:
     assert lab.replies()[-1].code == ControlResponse.SUCCESS
 
 
-def test_a_scan_without_the_channel_goes_out_as_predicted_at_its_end(lab: Lab) -> None:
+def test_a_scan_without_the_channel_is_published_as_predicted_at_its_end(lab: Lab) -> None:
     lab.knows(forecast(DRIFT))
     lab.scan(channels=("Amplitude", "Phase"))
     assert centers(lab) == [pytest.approx(BACK, abs=1e-16)] * 2
@@ -127,14 +127,14 @@ def test_a_scan_without_the_channel_goes_out_as_predicted_at_its_end(lab: Lab) -
     assert "can't be used for drift" in logged(lab, "WARNING")[0]
 
 
-def test_the_channel_may_be_said() -> None:
+def test_the_channel_may_be_set() -> None:
     lab = Lab(DriftCompensationSettings(channel="Amplitude"))
     lab.in_force()
     lab.scan(channels=("Height", "Amplitude"))
     assert lab.worker.jobs[0].scan.channel == "Amplitude"
 
 
-def test_a_scan_that_takes_too_long_goes_out_as_predicted_and_the_worker_is_started_anew(lab: Lab) -> None:
+def test_a_scan_that_takes_too_long_is_published_as_predicted_and_the_worker_restarted(lab: Lab) -> None:
     lab.knows(forecast(DRIFT))
     lab.scan()
     for _ in range(2):  # that the scheduler was started is written down first
@@ -155,7 +155,7 @@ def test_before_its_deadline_nothing_is_given_up(lab: Lab) -> None:
     assert not centers(lab)
 
 
-def test_a_worker_that_ends_over_a_scan_is_started_again_and_tries_it_once_more(lab: Lab) -> None:
+def test_a_worker_that_ends_during_a_scan_is_restarted_and_retries_it_once(lab: Lab) -> None:
     lab.scan()
     lab.says(WorkerGone("killed"))
     assert lab.worker.starts == 2
@@ -165,7 +165,7 @@ def test_a_worker_that_ends_over_a_scan_is_started_again_and_tries_it_once_more(
     assert len(centers(lab)) == 1
 
 
-def test_a_worker_that_ends_whenever_it_is_started_is_left_alone_and_nothing_waits_for_it(lab: Lab) -> None:
+def test_a_worker_that_always_ends_is_not_restarted_and_no_scan_waits_for_it(lab: Lab) -> None:
     for _ in range(MOST_ENDS):
         lab.says(WorkerGone("no such estimator"))
     assert lab.worker.starts == MOST_ENDS
@@ -174,7 +174,7 @@ def test_a_worker_that_ends_whenever_it_is_started_is_left_alone_and_nothing_wai
     assert len(centers(lab)) == 1
 
 
-def test_a_scan_that_can_not_be_registered_goes_out_as_predicted(lab: Lab) -> None:
+def test_an_unregistered_scan_is_published_as_predicted(lab: Lab) -> None:
     lab.knows(forecast(DRIFT))
     lab.scan()
     lab.says(NotRegistered(lab.worker.jobs[0].key, "ZeroDivisionError: oh"))
@@ -182,7 +182,7 @@ def test_a_scan_that_can_not_be_registered_goes_out_as_predicted(lab: Lab) -> No
     assert "oh" in logged(lab, "ERROR")[0]
 
 
-def test_a_scan_that_comes_again_has_the_same_mapping_and_is_not_registered_again(lab: Lab) -> None:
+def test_a_repeated_scan_has_the_same_mapping_and_is_not_registered_again(lab: Lab) -> None:
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
     published = lab.published("Scan2d")[0]
@@ -198,7 +198,7 @@ def test_a_scan_that_comes_again_has_the_same_mapping_and_is_not_registered_agai
     assert not again.worker.jobs
 
 
-def test_it_is_saved_before_it_is_published(lab: Lab) -> None:
+def test_a_mapping_is_saved_before_its_scan_is_published(lab: Lab) -> None:
     lab.scan()
     lab.effects.clear()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
@@ -238,7 +238,7 @@ def test_a_restarted_scheduler_announces_itself_after_the_scans_that_wait(lab: L
     assert [e.split("_")[0] for e in again.envelopes()][-3:] == ["Scan2d", "ScopeStateMsg", "ControlState"]
 
 
-def test_what_was_measured_is_published_before_the_end(lab: Lab) -> None:
+def test_a_waiting_scan_is_published_before_the_end(lab: Lab) -> None:
     lab.scan()
     lab.ask(ControlRequest.END_EXPERIMENT)
     kinds = [type(effect).__name__ for effect in lab.effects]
@@ -246,7 +246,7 @@ def test_what_was_measured_is_published_before_the_end(lab: Lab) -> None:
     assert kinds.index("Kill") > max(i for i, kind in enumerate(kinds) if kind == "Publish")
 
 
-def test_a_mapping_is_told_with_all_that_is_known_of_it(lab: Lab) -> None:
+def test_a_mapping_is_published_with_uncertainty_rate_and_references(lab: Lab) -> None:
     lab.scan()
     (job,) = lab.worker.jobs
     lab.says(registered(job, forecast(DRIFT, (1e-12, 2e-12)), rescan="too far"))
@@ -271,7 +271,9 @@ def set_direction(lab: Lab, direction: str) -> None:
 
 
 @pytest.mark.parametrize(("direction", "upwards"), [("up", True), ("down", False), ("sideways", None)])
-def test_the_direction_of_a_scan_is_that_in_force_when_it_began(lab: Lab, direction: str, upwards: bool | None) -> None:
+def test_the_direction_of_a_scan_is_the_one_in_force_at_its_start(
+    lab: Lab, direction: str, upwards: bool | None
+) -> None:
     set_direction(lab, direction)
     lab.scope_is(ScopeState.SCANNING)
     set_direction(lab, "down" if upwards else "up")
@@ -280,8 +282,8 @@ def test_the_direction_of_a_scan_is_that_in_force_when_it_began(lab: Lab, direct
     assert lab.worker.jobs[0].upwards is upwards
 
 
-def test_that_it_scans_is_told_again_and_the_scan_began_when_it_did(lab: Lab) -> None:
-    """To a scheduler that was started anew, say."""
+def test_a_repeated_scanning_state_does_not_move_the_start_of_a_scan(lab: Lab) -> None:
+    """For example to a restarted scheduler."""
     set_direction(lab, "up")
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s
@@ -294,7 +296,7 @@ def test_that_it_scans_is_told_again_and_the_scan_began_when_it_did(lab: Lab) ->
     assert job.upwards is True
 
 
-def test_of_a_scan_that_was_paused_nobody_knows_when_which_row_was_taken(lab: Lab) -> None:
+def test_a_paused_scan_has_no_known_direction(lab: Lab) -> None:
     set_direction(lab, "up")
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s
@@ -307,7 +309,7 @@ def test_of_a_scan_that_was_paused_nobody_knows_when_which_row_was_taken(lab: La
     assert (job.start_s, job.upwards) == (pytest.approx(began_s, abs=1e-6), None)
 
 
-def test_a_microscope_that_scans_on_begins_the_next_scan_when_it_says_so(lab: Lab) -> None:
+def test_a_continuous_scan_begins_with_its_scanning_state(lab: Lab) -> None:
     lab.scope_is(ScopeState.SCANNING)
     lab.now_s += 100.0
     lab.publish(Scan(HERE, "Height", "m", np.ones(SHAPE), lab.now_ns, "a.nc"))
@@ -330,7 +332,7 @@ def problems(lab: Lab) -> tuple[int, ...]:
     return lab.core.control_state.problems
 
 
-def test_a_scan_too_far_off_is_wanted_again_where_it_was_asked_for(lab: Lab) -> None:
+def test_a_scan_too_far_off_is_requested_again_at_its_requested_region(lab: Lab) -> None:
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), rescan="too far off"))
     assert rescans(lab) == [(1, "too far off")]
@@ -342,7 +344,7 @@ def test_a_scan_too_far_off_is_wanted_again_where_it_was_asked_for(lab: Lab) -> 
     assert not problems(lab)
 
 
-def test_lost_is_flagged_and_a_search_wanted_and_found_is_cleared(lab: Lab) -> None:
+def test_a_lost_sample_is_flagged_and_searched_and_a_found_one_cleared(lab: Lab) -> None:
     lab.take_control()
     lab.scan()
     lab.effects.clear()
@@ -356,7 +358,7 @@ def test_lost_is_flagged_and_a_search_wanted_and_found_is_cleared(lab: Lab) -> N
     assert not problems(lab)
 
 
-def test_who_searches_puts_its_region_back_before_the_flag_goes(lab: Lab) -> None:
+def test_a_searching_component_restores_its_region_before_the_flag_is_cleared(lab: Lab) -> None:
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True))
     lab.ask(ControlRequest.REQUEST_CTRL, int(Problem.THERMAL_DRIFT), name="rescanner")
@@ -368,7 +370,7 @@ def test_who_searches_puts_its_region_back_before_the_flag_goes(lab: Lab) -> Non
     assert not problems(lab)
 
 
-def test_who_searches_is_not_asked_again_with_the_region_that_it_has_widened(lab: Lab) -> None:
+def test_a_searching_component_gets_no_request_for_its_own_widened_region(lab: Lab) -> None:
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT), lost=True))
     lab.ask(ControlRequest.REQUEST_CTRL, int(Problem.THERMAL_DRIFT), name="rescanner")
@@ -382,7 +384,7 @@ def fail(lab: Lab, why: str = "clocks were set back") -> None:
     lab.says(NotRegistered(lab.worker.jobs[-1].key, why))
 
 
-def test_three_scans_in_a_row_that_nobody_could_register_are_a_sample_that_is_lost(lab: Lab) -> None:
+def test_three_unregistered_scans_in_a_row_mean_a_lost_sample(lab: Lab) -> None:
     lab.take_control()
     for _ in range(2):
         fail(lab)
@@ -397,7 +399,7 @@ def test_three_scans_in_a_row_that_nobody_could_register_are_a_sample_that_is_lo
     assert rescans(lab) == [(3, "3 scans in a row could not be registered: clocks were set back")]
 
 
-def test_scans_without_the_channel_tell_as_little() -> None:
+def test_scans_without_the_channel_count_as_unregistered() -> None:
     lab = Lab(DriftCompensationSettings(channel="Heigth"))
     lab.in_force()
     for _ in range(3):
@@ -407,7 +409,7 @@ def test_scans_without_the_channel_tell_as_little() -> None:
     assert "Heigth" in rescans(lab)[0][1]
 
 
-def test_how_many_there_were_is_known_after_a_kill(lab: Lab) -> None:
+def test_the_count_of_unregistered_scans_survives_a_kill(lab: Lab) -> None:
     for _ in range(2):
         fail(lab)
     again = Lab(state=lab.saved(), now_s=lab.now_s)
@@ -415,7 +417,7 @@ def test_how_many_there_were_is_known_after_a_kill(lab: Lab) -> None:
     assert problems(again) == (Problem.THERMAL_DRIFT,)
 
 
-def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
+def test_without_correction_failed_registrations_flag_nothing() -> None:
     lab = Lab(DriftCompensationSettings(correct=False))
     lab.in_force()
     for _ in range(4):
@@ -426,7 +428,7 @@ def test_where_nothing_is_corrected_scans_need_not_be_registered() -> None:
 
 
 def test_a_person_is_called_though_correction_has_not_begun_yet() -> None:
-    """When it begins, nobody would correct anything."""
+    """When correction begins, no worker would do it."""
     lab = Lab(DriftCompensationSettings(correct_after=1000.0))
     lab.in_force()
     for _ in range(MOST_ENDS):
@@ -434,7 +436,7 @@ def test_a_person_is_called_though_correction_has_not_begun_yet() -> None:
     assert problems(lab) == (Problem.DEVICE_MALFUNCTION,)
 
 
-def test_what_a_person_scans_is_followed_and_not_scanned_again(lab: Lab) -> None:
+def test_a_scan_by_a_person_is_followed_and_not_requested_again(lab: Lab) -> None:
     lab.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL), name="dashboard:Ada")
     lab.scan()
     lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), rescan="it is 400 nm off"))
@@ -447,7 +449,7 @@ def test_what_a_person_scans_is_followed_and_not_scanned_again(lab: Lab) -> None
     assert lab.published("DriftMapping")
 
 
-def test_a_sample_that_a_person_has_found_again_is_not_lost_any_more(lab: Lab) -> None:
+def test_a_sample_found_by_a_person_is_no_longer_lost(lab: Lab) -> None:
     lab.scan()
     lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), lost=True))
     assert problems(lab) == (Problem.THERMAL_DRIFT,)
@@ -457,7 +459,7 @@ def test_a_sample_that_a_person_has_found_again_is_not_lost_any_more(lab: Lab) -
     assert not problems(lab)
 
 
-def test_a_microscope_that_is_lost_for_a_moment_does_not_begin_its_scan_anew(lab: Lab) -> None:
+def test_a_microscope_lost_for_a_moment_continues_its_scan(lab: Lab) -> None:
     lab.scope_is(ScopeState.SCANNING)
     began_s = lab.now_s
     lab.now_s += 128.0
@@ -470,7 +472,7 @@ def test_a_microscope_that_is_lost_for_a_moment_does_not_begin_its_scan_anew(lab
     assert job.start_s == pytest.approx(began_s, abs=0.01)
 
 
-def test_a_person_is_called_where_nothing_will_be_registered_any_more_and_who_removes_that_has_it_tried_again(
+def test_a_dead_worker_calls_a_person_and_is_restarted_once_the_problem_is_cleared(
     lab: Lab,
 ) -> None:
     for _ in range(MOST_ENDS):
@@ -487,7 +489,7 @@ def test_a_person_is_called_where_nothing_will_be_registered_any_more_and_who_re
     assert centers(lab)[-1] == pytest.approx(BACK, abs=1e-16)
 
 
-def test_registering_that_takes_long_is_told_before_it_takes_too_long(lab: Lab) -> None:
+def test_a_slow_registration_is_logged_before_it_takes_too_long(lab: Lab) -> None:
     for _ in range(2):
         lab.scan()
         lab.now_s += 12.0
@@ -497,14 +499,14 @@ def test_registering_that_takes_long_is_told_before_it_takes_too_long(lab: Lab) 
     assert "longest_registration = 30 s" in told
 
 
-def test_a_flag_of_somebody_else_is_not_touched(lab: Lab) -> None:
+def test_the_flag_of_another_client_is_not_touched(lab: Lab) -> None:
     lab.ask(ControlRequest.ADD_EXP_PRBLM, int(Problem.THERMAL_DRIFT), name="somebody")
     lab.scan()
     lab.says(registered(lab.worker.jobs[0], forecast(DRIFT)))
     assert problems(lab) == (Problem.THERMAL_DRIFT,)
 
 
-def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
+def test_at_the_start_the_first_scan_is_requested_in_the_other_direction() -> None:
     lab = Lab(DriftCompensationSettings())
     lab.in_force()
     set_direction(lab, "up")
@@ -523,7 +525,7 @@ def test_at_the_start_the_first_scan_is_wanted_in_the_other_direction() -> None:
     assert not again.published("DriftRescan")  # once in an experiment
 
 
-def test_a_microscope_that_tells_no_direction_is_not_waited_for() -> None:
+def test_a_microscope_without_a_direction_is_not_waited_for() -> None:
     lab = Lab(DriftCompensationSettings())
     lab.in_force()
     lab.scan()
@@ -532,7 +534,7 @@ def test_a_microscope_that_tells_no_direction_is_not_waited_for() -> None:
     assert any(names.SCAN_DIRECTION in text for text in logged(lab, "INFO"))
 
 
-def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None:
+def test_without_correction_drift_is_published_without_a_response() -> None:
     lab = Lab(DriftCompensationSettings(correct=False))
     lab.in_force()
     lab.scan()
@@ -546,8 +548,8 @@ def test_without_correction_drift_is_told_and_nothing_is_done_about_it() -> None
 # --- a controller that compensates by itself ---
 
 
-def test_what_the_controller_compensates_is_what_is_reckoned_with_from_the_start_on() -> None:
-    """Not what was left of the night before; and after its restart what it was told before."""
+def test_the_controller_is_set_to_the_compensation_in_force_at_the_start() -> None:
+    """At first nothing, whichever rate an earlier night has left; after a restart the rate before it."""
     drift = DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y"))
     lab = Lab(drift, answer_start=False)
     told = []
@@ -559,7 +561,7 @@ def test_what_the_controller_compensates_is_what_is_reckoned_with_from_the_start
     assert told == [Parameter("x-rate-x", "0", "m/s"), Parameter("x-rate-y", "0", "m/s")]
 
 
-def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -> None:
+def test_a_known_rate_is_handed_over_and_reported_to_the_worker_with_its_time() -> None:
     lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
     lab.in_force()
     lab.scan()
@@ -582,7 +584,7 @@ def test_a_rate_that_is_known_is_handed_over_and_the_worker_hears_since_when() -
     assert lab.sent().request.subject == Parameter("x-rate-x", "1.5e-10", "m/s")
 
 
-def test_a_controller_that_does_not_take_the_rate_is_told_of() -> None:
+def test_a_controller_that_refuses_the_rate_is_logged() -> None:
     lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
     lab.in_force()
     lab.scan()
@@ -593,7 +595,7 @@ def test_a_controller_that_does_not_take_the_rate_is_told_of() -> None:
     assert [velocity for _, velocity in lab.worker.velocities] == [(0.0, -2e-10)], "the other is as it was"
 
 
-def test_under_a_person_s_hands_the_rate_is_left_as_it_is() -> None:
+def test_the_rate_stays_while_a_person_is_in_control() -> None:
     lab = Lab(DriftCompensationSettings(compensate=Compensate("x-rate-x", "x-rate-y")))
     lab.in_force()
     lab.ask(ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL), name="dashboard:Ada")
@@ -602,20 +604,20 @@ def test_under_a_person_s_hands_the_rate_is_left_as_it_is() -> None:
     assert not lab.forwards()
 
 
-def test_a_packet_that_is_no_scan_is_passed_on_as_it_is(lab: Lab) -> None:
+def test_packets_other_than_scans_pass_unchanged(lab: Lab) -> None:
     lab.step(PacketIn(Packet("Scan2d", b"\x0a\x00", lab.now_ns), wire.header("Scan2d", b"\x0a\x00")))
     assert not lab.worker.jobs
     lab.publish(ScopeStatus(ScopeState.FREE))
     assert "ScopeStateMsg" in lab.envelopes()
 
 
-def test_the_plain_scheduler_s_answers_are_the_same(lab: Lab) -> None:
-    """A drop-in: what is not about places is decided by the same core."""
+def test_answers_equal_those_of_the_plain_scheduler(lab: Lab) -> None:
+    """A drop-in: requests without places are decided by the same core."""
     lab.step(RequestIn(99, "stranger", Request(int(ControlRequest.ACTION), names.START_SCAN, b"", "stranger/1/1")))
     assert lab.replies()[-1].code == ControlResponse.NOT_IN_CONTROL
 
 
-def test_what_is_corrected_later_needs_no_scan_down() -> None:
+def test_correction_that_begins_later_needs_no_scan_in_the_other_direction() -> None:
     lab = Lab(DriftCompensationSettings(correct_after=1000.0))
     lab.in_force()
     set_direction(lab, "up")
@@ -633,13 +635,13 @@ SEEN, BADLY = RegistrationOutcome.REGISTERED, RegistrationOutcome.REFUSED
 
 
 def taken(lab: Lab, outcome: RegistrationOutcome, *failures: str) -> None:
-    """A scan, registered with this outcome."""
+    """Publish a scan, registered with this outcome."""
     lab.scan()
     lab.says(registered(lab.worker.jobs[-1], forecast(DRIFT), outcome=outcome, failures=failures))
 
 
-def test_a_scan_that_could_not_be_registered_has_a_mapping_too(lab: Lab) -> None:
-    """Else no table, and no count, would show it."""
+def test_an_unregistered_scan_has_a_mapping(lab: Lab) -> None:
+    """Without it neither the table nor the counts would show the scan."""
     lab.knows(forecast(DRIFT, rate_sd_m_s=1e-12))
     lab.scan()
     (job,) = lab.worker.jobs
@@ -652,7 +654,7 @@ def test_a_scan_that_could_not_be_registered_has_a_mapping_too(lab: Lab) -> None
     assert "registered 0 of 1 scan, 1 failed" in logged(lab, "ERROR")[0]
 
 
-def test_of_a_scan_before_anything_is_known_no_uncertainty_is_published(lab: Lab) -> None:
+def test_a_scan_before_any_registration_has_no_uncertainty(lab: Lab) -> None:
     lab.scan()
     lab.says(NotRegistered(lab.worker.jobs[0].key, "oh"))
     (told,) = lab.published("DriftMapping")
@@ -668,7 +670,7 @@ def test_each_error_of_the_estimator_is_logged_with_its_pair_and_counted(lab: La
     assert "is registered coarsely" in logged(lab, "WARNING")[0]
 
 
-def test_the_count_outlives_a_restart_and_is_logged_at_the_end(lab: Lab) -> None:
+def test_the_tally_survives_a_restart_and_is_logged_at_the_end(lab: Lab) -> None:
     for outcome in (SEEN, BADLY, RegistrationOutcome.NEW):
         taken(lab, outcome)
     assert "registered 1 of 2 scans, 1 not recognised" in logged(lab, "WARNING")[0]

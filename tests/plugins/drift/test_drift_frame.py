@@ -1,4 +1,4 @@
-"""Components speak of the sample: each request and packet is mapped, whole, both ways."""
+"""Components use sample coordinates: each request and packet is mapped, as a whole place, both ways."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ THERE = Region((1e-6, 2e-6), (1e-6, 0.5e-6), math.radians(30.0))
 
 @pytest.fixture
 def lab() -> Lab:
-    """The sample has moved by DRIFT, and somebody is in control."""
+    """The sample has moved by DRIFT, and a component is in control."""
     made = Lab()
     made.in_force()
     made.take_control()
@@ -43,7 +43,7 @@ def lab() -> Lab:
 
 
 def set_region(lab: Lab, region: Region | RegionChange | None, shape: tuple[int, int] | None = None) -> ScanParameters:
-    """What the microscope is asked for, and does."""
+    """Request a region and let the microscope set it; return the request that reached the microscope."""
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape))
     forward = lab.sent()
     assert forward.request.kind == ControlRequest.SET_SCAN_PARAMS
@@ -60,14 +60,14 @@ def moved(region: Region, by_m: tuple[float, float]) -> Region:
     return region.moved_to((region.center_m[0] + by_m[0], region.center_m[1] + by_m[1]))
 
 
-def test_a_region_is_sent_to_where_the_sample_is(lab: Lab) -> None:
+def test_a_region_is_sent_to_its_place_on_the_sample(lab: Lab) -> None:
     sent = set_region(lab, THERE, (64, 32))
     assert isinstance(sent.region, Region)
     same(sent.region, moved(THERE, DRIFT))
     assert sent.shape == (64, 32)
 
 
-def test_a_turned_sample_turns_the_region(lab: Lab) -> None:
+def test_a_rotated_sample_rotates_the_region(lab: Lab) -> None:
     lab.knows(forecast(angle_rad=-TURN))
     sent = set_region(lab, THERE)
     assert isinstance(sent.region, Region)
@@ -81,7 +81,9 @@ def test_a_turned_sample_turns_the_region(lab: Lab) -> None:
     "change",
     [RegionChange(left_m=0.3e-6), RegionChange(width_m=0.4e-6, height_m=0.2e-6), RegionChange(angle_rad=0.5)],
 )
-def test_a_part_of_a_region_is_put_onto_what_components_know_and_mapped_whole(lab: Lab, change: RegionChange) -> None:
+def test_a_part_of_a_region_is_combined_with_the_region_in_sample_coordinates_and_mapped_whole(
+    lab: Lab, change: RegionChange
+) -> None:
     lab.knows(forecast(DRIFT, angle_rad=-TURN))
     set_region(lab, THERE)
     lab.knows(forecast((-7e-9, 3e-9), angle_rad=-TURN))
@@ -90,7 +92,7 @@ def test_a_part_of_a_region_is_put_onto_what_components_know_and_mapped_whole(la
     same(sent.region, lab.mapping_now().to_tip(change.onto(THERE)))
 
 
-def test_a_part_of_a_region_that_is_not_known_is_refused_with_a_hint() -> None:
+def test_a_part_of_an_unknown_region_is_refused_with_a_hint() -> None:
     lab = Lab()
     lab.take_control()
     lab.effects.clear()
@@ -106,8 +108,8 @@ def test_pixels_alone_move_nothing(lab: Lab) -> None:
     assert wire.decode("ScanParameters2d", lab.sent().request.payload) == ScanParameters(None, (16, 16))
 
 
-def test_what_was_asked_for_is_given_back_to_the_last_bit(lab: Lab) -> None:
-    """In the unit in which it was asked for, too, though the controller rounds."""
+def test_a_requested_region_is_published_back_to_the_last_bit(lab: Lab) -> None:
+    """Also in the unit of the request, though the controller rounds."""
     from afspm.wire.generated.scan_pb2 import ScanParameters2d
 
     message = ScanParameters2d()
@@ -130,7 +132,7 @@ def test_what_was_asked_for_is_given_back_to_the_last_bit(lab: Lab) -> None:
     assert ScanParameters2d.FromString(bytes(packet.payload)).spatial == message.spatial
 
 
-def test_what_is_told_before_the_answer_is_known_as_well(lab: Lab) -> None:
+def test_a_region_published_before_its_answer_is_recognised(lab: Lab) -> None:
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(THERE))
     lab.effects.clear()
     lab.publish(ScanParameters(moved(THERE, DRIFT), SHAPE))
@@ -138,7 +140,7 @@ def test_what_is_told_before_the_answer_is_known_as_well(lab: Lab) -> None:
     assert told.region == THERE
 
 
-def test_a_region_set_at_the_panel_is_told_in_sample_coordinates_and_kept_there(lab: Lab) -> None:
+def test_a_region_set_at_the_panel_is_published_in_sample_coordinates_and_kept_there(lab: Lab) -> None:
     lab.publish(ScanParameters(THERE, SHAPE))
     (told,) = lab.published("ScanParameters2d")
     same(told.region, moved(THERE, (-DRIFT[0], -DRIFT[1])))
@@ -149,7 +151,9 @@ def test_a_region_set_at_the_panel_is_told_in_sample_coordinates_and_kept_there(
 
 
 @pytest.mark.parametrize("drift_m", [DRIFT, (0.0, 0.0)])
-def test_the_probe_is_sent_to_where_the_sample_is_and_told_back(lab: Lab, drift_m: tuple[float, float]) -> None:
+def test_the_probe_is_sent_to_the_place_on_the_sample_and_published_back(
+    lab: Lab, drift_m: tuple[float, float]
+) -> None:
     lab.knows(forecast(drift_m))
     lab.ask(ControlRequest.SET_PROBE_POS, ProbePosition((0.1e-6, 0.3e-6)))
     forward = lab.sent()
@@ -161,7 +165,7 @@ def test_the_probe_is_sent_to_where_the_sample_is_and_told_back(lab: Lab, drift_
     assert lab.published("ProbePosition") == [ProbePosition((0.1e-6, 0.3e-6))]
 
 
-def test_half_a_position_is_mapped_whole_on_a_turned_sample(lab: Lab) -> None:
+def test_one_coordinate_is_mapped_as_a_whole_position_on_a_rotated_sample(lab: Lab) -> None:
     lab.knows(forecast(angle_rad=-math.pi / 2))
     lab.ask(ControlRequest.SET_PROBE_POS, ProbePosition((1e-6, 2e-6)))
     lab.answer(lab.sent())
@@ -170,7 +174,7 @@ def test_half_a_position_is_mapped_whole_on_a_turned_sample(lab: Lab) -> None:
     assert at.xy_m == pytest.approx((-2e-6, 3e-6), abs=1e-18)
 
 
-def test_half_a_position_where_the_other_half_is_not_known_is_refused() -> None:
+def test_one_coordinate_of_an_unknown_position_is_refused() -> None:
     lab = Lab()
     lab.take_control()
     lab.effects.clear()
@@ -215,7 +219,7 @@ def test_a_parameter_of_the_region_is_set_as_a_part_of_the_whole(
         (names.SCAN_ANGLE, 30.0, "deg", 30.0),
     ],
 )
-def test_a_parameter_of_the_region_is_told_in_sample_coordinates(
+def test_a_parameter_of_the_region_is_read_in_sample_coordinates(
     lab: Lab, name: str, tip_value: float, unit: str, expected: float
 ) -> None:
     from afspm.basics.units import convert
@@ -230,7 +234,7 @@ def test_a_parameter_of_the_region_is_told_in_sample_coordinates(
     assert float(answer.value or "") == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_size_of_nothing_that_the_microscope_tells_is_told_as_it_is(lab: Lab) -> None:
+def test_a_size_of_zero_from_the_microscope_is_passed_on(lab: Lab) -> None:
     set_region(lab, THERE)
     lab.effects.clear()
     lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_SIZE_X))
@@ -239,7 +243,7 @@ def test_a_size_of_nothing_that_the_microscope_tells_is_told_as_it_is(lab: Lab) 
     assert wire.decode_parameter(lab.replies()[0].payload) == told
 
 
-def test_the_probe_s_parameters_are_told_in_sample_coordinates(lab: Lab) -> None:
+def test_the_probe_s_parameters_are_read_in_sample_coordinates(lab: Lab) -> None:
     lab.publish(ProbePosition((5e-7, 5e-7)))
     lab.effects.clear()
     lab.ask(ControlRequest.PARAM, Parameter(names.PROBE_POS_Y))
@@ -249,7 +253,7 @@ def test_the_probe_s_parameters_are_told_in_sample_coordinates(lab: Lab) -> None
 
 
 @pytest.mark.parametrize("asked", [Parameter("tip-bias-voltage", "1", "V"), Parameter(names.SCAN_SPEED, "1", "um/s")])
-def test_what_has_no_place_goes_as_it_is(lab: Lab, asked: Parameter) -> None:
+def test_requests_without_a_place_pass_unchanged(lab: Lab, asked: Parameter) -> None:
     lab.ask(ControlRequest.PARAM, asked)
     assert lab.sent().request.payload == wire.encode(asked)[1]
 
@@ -257,7 +261,7 @@ def test_what_has_no_place_goes_as_it_is(lab: Lab, asked: Parameter) -> None:
 # --- where the sample is by then ---
 
 
-def test_a_region_is_sent_to_where_the_sample_will_be_in_the_middle_of_the_scan(lab: Lab) -> None:
+def test_a_region_is_sent_to_the_predicted_place_for_the_middle_of_the_scan(lab: Lab) -> None:
     lab.scan(duration_s=200.0)
     lab.knows(forecast(rate_m_s=(1e-9, 0.0), at_s=lab.now_s))
     sent = set_region(lab, HERE)
@@ -265,7 +269,7 @@ def test_a_region_is_sent_to_where_the_sample_will_be_in_the_middle_of_the_scan(
     assert sent.region.center_m[0] == pytest.approx(100e-9, rel=1e-4)
 
 
-def test_before_a_scan_the_microscope_is_moved_after_the_sample_and_then_asked(lab: Lab) -> None:
+def test_before_a_scan_the_microscope_is_moved_after_the_sample_and_then_started(lab: Lab) -> None:
     set_region(lab, HERE)
     lab.knows(forecast((30e-9, 0.0)))
     lab.effects.clear()
@@ -286,7 +290,7 @@ def test_before_a_scan_the_microscope_is_moved_after_the_sample_and_then_asked(l
     assert [reply.code for reply in lab.replies()] == [ControlResponse.SUCCESS]
 
 
-def test_a_microscope_that_tells_nothing_of_a_move_is_asked_all_the_same(lab: Lab) -> None:
+def test_a_microscope_that_publishes_no_move_is_started_all_the_same(lab: Lab) -> None:
     from afspm.scheduler.events import Tick
 
     lab.knows(forecast((30e-9, 0.0)))
@@ -311,7 +315,7 @@ def test_a_move_that_fails_is_the_answer_to_the_action(lab: Lab) -> None:
     assert not lab.forwards()
 
 
-def test_who_loses_control_while_the_microscope_moves_is_told_so_and_nothing_is_scanned(lab: Lab) -> None:
+def test_losing_control_during_the_move_is_answered_and_nothing_is_scanned(lab: Lab) -> None:
     lab.knows(forecast((30e-9, 0.0)))
     lab.effects.clear()
     lab.ask(ControlRequest.ACTION, names.START_SCAN)
@@ -323,7 +327,7 @@ def test_who_loses_control_while_the_microscope_moves_is_told_so_and_nothing_is_
     assert names.START_SCAN not in [forward.request.subject for forward in lab.forwards()]
 
 
-def test_an_action_that_is_asked_for_again_while_the_microscope_moves_is_done_once(lab: Lab) -> None:
+def test_an_action_repeated_during_the_move_is_done_once(lab: Lab) -> None:
     lab.knows(forecast((30e-9, 0.0)))
     lab.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
     lab.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
@@ -344,7 +348,7 @@ def test_a_hundredth_of_a_pixel_is_not_worth_a_move(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("action", [names.START_SPEC, names.PULSE, names.CRASH])
-def test_before_something_is_done_at_the_probe_it_is_moved_after_the_sample(lab: Lab, action: str) -> None:
+def test_before_an_action_at_the_probe_the_probe_is_moved_after_the_sample(lab: Lab, action: str) -> None:
     lab.ask(ControlRequest.SET_PROBE_POS, ProbePosition((1e-7, 0.0)))
     lab.answer(lab.sent())
     lab.knows(forecast((1e-9, 2e-9)))
@@ -376,17 +380,17 @@ def limited(**limits: Limit) -> Lab:
     return lab
 
 
-def test_limits_hold_for_what_goes_to_the_microscope_and_the_refusal_names_both_places() -> None:
+def test_limits_hold_in_tip_coordinates_and_the_refusal_names_both_places() -> None:
     lab = limited()
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(HERE))
     (reply,) = lab.replies()
     assert reply.code == ControlResponse.PARAM_ERROR
-    assert "(1.5e-06, 0) m at the tip" in reply.reason
-    assert "(0, 0) m on the sample" in reply.reason
+    assert "(1.5, 0) µm at the tip" in reply.reason
+    assert "(0, 0) nm on the sample" in reply.reason
     assert not lab.forwards()
 
 
-def test_a_scan_that_has_drifted_out_of_its_limits_is_refused_when_it_is_to_begin() -> None:
+def test_a_scan_that_has_drifted_out_of_its_limits_is_refused_at_its_start() -> None:
     lab = limited()
     lab.ask(ControlRequest.ACTION, names.START_SCAN)
     (reply,) = lab.replies()
@@ -395,7 +399,7 @@ def test_a_scan_that_has_drifted_out_of_its_limits_is_refused_when_it_is_to_begi
     assert not lab.forwards()
 
 
-def test_who_may_not_turn_a_scan_may_still_move_it() -> None:
+def test_a_client_that_may_not_rotate_a_scan_may_move_it() -> None:
     lab = limited(scan_angle=Limit(only=("other",)))
     lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_TOP_LEFT_X, "-2.5", "um"))
     lab.answer(lab.sent())
@@ -407,7 +411,7 @@ def test_who_may_not_turn_a_scan_may_still_move_it() -> None:
 # --- once ---
 
 
-def test_a_request_that_is_repeated_reaches_the_microscope_with_the_same_bytes(lab: Lab) -> None:
+def test_a_repeated_request_reaches_the_microscope_with_the_same_bytes(lab: Lab) -> None:
     lab.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(THERE), id_="series/life/same")
     first = lab.sent()
     lab.answer(first, ControlResponse.NO_RESPONSE)
@@ -424,7 +428,7 @@ def test_a_request_that_is_repeated_reaches_the_microscope_with_the_same_bytes(l
     assert again.published("ScanParameters2d")[0].region == THERE
 
 
-def test_what_is_in_force_is_known_in_both_coordinates_after_a_restart(lab: Lab) -> None:
+def test_places_in_force_are_known_in_both_coordinates_after_a_restart(lab: Lab) -> None:
     set_region(lab, THERE, SHAPE)
     lab.take_control("series")
     lab.ask(ControlRequest.RELEASE_CTRL)
@@ -457,7 +461,7 @@ def test_without_correction_nothing_is_mapped(drift: DriftCompensationSettings) 
     assert lab.sent().request.subject == names.START_SCAN
 
 
-def test_correction_that_begins_later_goes_back_to_where_the_sample_was() -> None:
+def test_a_scan_after_correction_begins_is_moved_after_the_sample() -> None:
     lab = Lab(DriftCompensationSettings(correct_after=1000.0))
     lab.in_force()
     lab.take_control()
@@ -468,8 +472,8 @@ def test_correction_that_begins_later_goes_back_to_where_the_sample_was() -> Non
     same(told.region, moved(HERE, DRIFT))
 
 
-def test_an_action_that_was_sent_before_a_kill_is_asked_for_again_without_a_move(lab: Lab) -> None:
-    """It may have been done: the microscope is busy with it then, and would refuse to be moved."""
+def test_an_action_sent_before_a_kill_is_repeated_without_a_move(lab: Lab) -> None:
+    """The action may have begun: the busy microscope would refuse a move."""
     set_region(lab, HERE)
     lab.ask(ControlRequest.ACTION, names.START_SCAN, id_="series/life/go")
     assert lab.sent().request.id == "series/life/go"
@@ -487,7 +491,7 @@ def region_of(lab: Lab) -> Region:
     return told.region
 
 
-def test_parts_sent_without_waiting_are_put_onto_one_another(lab: Lab) -> None:
+def test_parts_sent_without_waiting_are_combined(lab: Lab) -> None:
     lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_SIZE_X, "1", "um"))
     lab.ask(ControlRequest.PARAM, Parameter(names.SCAN_TOP_LEFT_X, "0.5", "um"))
     wider = lab.sent()
@@ -514,7 +518,7 @@ def test_place_is_read_again_after_the_move_before_an_action() -> None:
     lab.knows(forecast((1.4e-6, 0.0)))
     lab.ask(ControlRequest.ACTION, names.START_SCAN)
     lab.answer(lab.sent())
-    lab.places[names.SCAN_TOP_LEFT_X] = 2e-6  # somebody is at the panel
+    lab.places[names.SCAN_TOP_LEFT_X] = 2e-6  # a person uses the controller's panel
     lab.scope_is(ScopeState.FREE)
     assert lab.forwards() == []
     assert "outside the region" in lab.replies()[-1].reason

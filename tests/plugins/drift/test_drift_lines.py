@@ -15,7 +15,7 @@ def lines_at(region: Region) -> ScanLines:
     return ScanLines(region, (8, 4), "Height", "m", 2, np.arange(12.0).reshape(3, 4), began_ns=5)
 
 
-def test_lines_lie_where_the_component_said_that_its_scan_is_to_be() -> None:
+def test_lines_lie_at_the_requested_region() -> None:
     lab = Lab()
     lab.in_force()
     lab.take_control()
@@ -30,7 +30,7 @@ def test_lines_lie_where_the_component_said_that_its_scan_is_to_be() -> None:
     assert (told.first_row, told.shape, told.began_ns) == (2, (8, 4), 5)
 
 
-def test_lines_of_a_scan_that_nobody_asked_for_lie_where_the_sample_is() -> None:
+def test_lines_of_an_unrequested_scan_lie_at_its_place_on_the_sample() -> None:
     lab = Lab()
     lab.in_force()
     lab.knows(forecast(DRIFT))
@@ -39,7 +39,7 @@ def test_lines_of_a_scan_that_nobody_asked_for_lie_where_the_sample_is() -> None
     np.testing.assert_allclose(told.region.center_m, np.subtract(THERE.center_m, DRIFT), atol=1e-15)
 
 
-def test_lines_are_told_as_they_are_while_nothing_is_known_of_the_drift() -> None:
+def test_lines_pass_unchanged_while_no_drift_is_known() -> None:
     lab = Lab()
     lab.in_force()
     lab.publish(lines_at(THERE))

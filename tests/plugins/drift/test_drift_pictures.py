@@ -1,4 +1,4 @@
-"""The figures of a drifting night, from what was told and what was saved."""
+"""The figures of a drifting night, from the published mappings and the saved files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 
 @pytest.fixture(autouse=True)
 def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a figure looks like is not asked here."""
+    """Draw coarsely: the look of a figure is not tested here."""
     monkeypatch.setattr("afspm.plugins.drift.figures.style.DPI", 30)
     monkeypatch.setattr("afspm.plugins.drift.figures.style.LAYOUT", None)
 
@@ -45,7 +45,7 @@ def test_the_scan_during_which_correction_was_switched_on_belongs_to_no_part() -
 
 @cache
 def scanned() -> list[tuple[bytes, Region, float]]:
-    """Nine scans, from the fourth on in a frame that follows the sample: as saved, where, and when."""
+    """Return nine scans, from the fourth on in a frame that follows the sample: as saved, where, and when."""
     world = World.from_settings(SETTINGS, seed=1, start_s=0.0)
     found = []
     for k in range(9):
@@ -59,7 +59,7 @@ def scanned() -> list[tuple[bytes, Region, float]]:
 
 
 def saved(folder: Path) -> list[tuple[Path, Region, float]]:
-    """The files of the scans, and what is true of them."""
+    """The files of the scans, and their truth."""
     (folder / "scans").mkdir()
     found = []
     for k, (content, region, middle_s) in enumerate(scanned()):
@@ -72,7 +72,7 @@ def saved(folder: Path) -> list[tuple[Path, Region, float]]:
 
 
 def mapping(path: Path, region: Region, middle_s: float, *, correcting: bool) -> object:
-    """What the scheduler would tell that follows it without an error."""
+    """Return the mapping of a scheduler that follows the sample without error."""
     velocity = np.array(SETTINGS["drift"]["velocity_m_per_s"][:2])
     drift = velocity * (middle_s - PIXELS / 2)
     message = wire.message_type("DriftMapping")(
@@ -127,7 +127,7 @@ def test_a_restart_loses_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(60)
-def test_what_was_compared_before_a_restart_is_not_left_to_the_end(
+def test_comparisons_before_a_restart_are_repeated_before_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lab = night(tmp_path)
@@ -145,7 +145,7 @@ def test_what_was_compared_before_a_restart_is_not_left_to_the_end(
 
 
 @pytest.mark.timeout(60)
-def test_not_all_scans_of_a_night_are_in_the_memory_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scans_of_a_night_are_never_all_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = night(tmp_path)
     drawn = []
     monkeypatch.setattr("afspm.plugins.drift.figures.album.write", lambda run, *_, **__: drawn.append(run) or [])
@@ -158,7 +158,7 @@ def test_not_all_scans_of_a_night_are_in_the_memory_at_once(tmp_path: Path, monk
 
 
 @pytest.mark.timeout(60)
-def test_scans_that_can_not_be_read_are_left_out_with_a_word(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_unreadable_scans_are_left_out_and_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lab = night(tmp_path)
     for gone in (2, 7):
         (tmp_path / "scans" / f"scan-{gone}.nc").unlink()
@@ -190,21 +190,21 @@ def test_a_table_that_can_not_be_written_for_a_while_ends_nothing(
     assert (tmp_path / "drift_estimates_on.png").exists()
 
 
-def test_a_channel_that_is_not_there_is_told_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_missing_channel_is_logged_at_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     lab = night(tmp_path)
-    lab.at(450.0, lambda: caplog.clear() if "'Z'" in caplog.text else pytest.fail("nothing was said"))
+    lab.at(450.0, lambda: caplog.clear() if "'Z'" in caplog.text else pytest.fail("nothing was logged"))
     lab.at(1500.0, lab.kill)
     assert run(DriftPictures(channel="Z"), lab, tmp_path / "state", run_dir=str(tmp_path)) == ExitCode.ENDED
     assert "no pictures: only 0 of 9 scans can be read" in caplog.text
 
 
 def true_m(folder: Path, *at: tuple[float, tuple[float, float]]) -> object:
-    """What was true of scans at times and places."""
+    """Return the true drift at times and places."""
     places = [(mid_s, Region(center_m, (1e-6, 1e-6))) for mid_s, center_m in at]
     return true_drift(folder, [DriftScan(np.zeros((4, 4)), region, mid_s, mid_s) for mid_s, region in places])
 
 
-def test_the_truth_is_that_of_the_simulated_world(tmp_path: Path) -> None:
+def test_the_truth_matches_the_simulated_world(tmp_path: Path) -> None:
     assert true_m(tmp_path, (0.0, (0.0, 0.0))) is None
     saved(tmp_path)
     a, b, c = (1e-6, 0.0), (0.0, 2e-6), (0.0, 0.0)
@@ -216,7 +216,7 @@ def test_the_truth_is_that_of_the_simulated_world(tmp_path: Path) -> None:
     np.testing.assert_allclose(true_m(tmp_path, (0.0, a), (25.0, b), (100.0, c)), left, atol=1e-15)
 
 
-def test_the_truth_of_a_sample_that_turns_depends_on_the_place(tmp_path: Path) -> None:
+def test_the_truth_of_a_rotating_sample_depends_on_the_place(tmp_path: Path) -> None:
     turning = {**SETTINGS, "drift": {"rotation_rad_per_s": 1e-5, "expansion_per_s": 2e-5, "about_m": (1e-6, 0.0)}}
     start = {"n": 1, "time_s": 0.0, "event": "start", "settings": turning, "seed": 1}
     (tmp_path / "truth.jsonl").write_text(json.dumps(start) + "\n", encoding="utf-8")
@@ -226,7 +226,7 @@ def test_the_truth_of_a_sample_that_turns_depends_on_the_place(tmp_path: Path) -
     np.testing.assert_allclose(true, [(0.0, 0.0), moved_m, (0.0, 0.0)], atol=1e-15)
 
 
-def test_a_truth_that_is_none_is_refused(tmp_path: Path) -> None:
+def test_a_malformed_truth_is_refused(tmp_path: Path) -> None:
     (tmp_path / "truth.jsonl").write_text("{}\n", encoding="utf-8")
     with pytest.raises(FileError, match="what was simulated"):
         true_m(tmp_path, (0.0, (0.0, 0.0)))

@@ -1,4 +1,4 @@
-"""The table of drift: what a row says, and that none is there twice."""
+"""The table of drift: the content of a row, and no duplicate rows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from afspm.model import RegistrationOutcome
-from afspm.plugins.drift.drift_table import COLUMNS, DriftTable, drift_row
+from afspm.plugins.drift.drift_pictures import COLUMNS, DriftTable, drift_row
 from afspm.plugins.drift.record import DriftRecord
 from afspm.wire.generated.drift_pb2 import DriftMapping
 
@@ -31,7 +31,7 @@ def mapping(number: int, *, matched: bool = True) -> DriftMapping:
     return message
 
 
-def test_a_row_says_offset_rate_and_whether_it_was_matched() -> None:
+def test_a_row_has_offset_rate_and_whether_it_was_matched() -> None:
     row = dict(zip(COLUMNS, drift_row(mapping(1)), strict=True))
     assert (row["datetime"], row["filename"]) == ("2025-06-15T15:06:41.000000Z", "1.nc")
     assert [float(row[name]) for name in ("offset_x", "offset_y")] == pytest.approx([-3e-9, 2e-9])
@@ -40,7 +40,7 @@ def test_a_row_says_offset_rate_and_whether_it_was_matched() -> None:
     assert [row[name] for name in ("matched", "lost", "correcting")] == ["yes", "no", "yes"]
 
 
-def test_nothing_is_zero_and_not_minus_zero() -> None:
+def test_no_drift_is_written_as_zero_and_not_minus_zero() -> None:
     message = mapping(0)
     message.matrix[:] = [1.0, 0.0, -0.0, 0.0, 1.0, 0.0]
     message.rate[:] = [-0.0, 0.0]

@@ -1,4 +1,4 @@
-"""The worker: what it knows survives a kill, and what a user's own estimator does stays in there."""
+"""The worker: its state survives a kill, and a user's own estimator can't harm the scheduler."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def job(number: int, x: int, y: int, asked: Region | None = None) -> ScanJob:
 
 
 def drift_scan(number: int, x: int, y: int) -> tuple[str, DriftScan]:
-    """The key and the scan, for `Estimation.register`."""
+    """Return the key and the scan, for `Estimation.register`."""
     end_s = number * 100.0 + 50.0
     return f"{number}.nc 0", DriftScan(picture(x, y), HERE, number * 100.0, end_s, None, f"{number}.nc")
 
@@ -68,7 +68,7 @@ def estimation(store: WorkerStateFile, rule: RescanRule | None = None) -> Estima
 # --- what it does ---
 
 
-def test_a_scan_is_answered_again_and_not_taken_twice(tmp_path: Path) -> None:
+def test_a_repeated_scan_is_answered_from_memory_and_not_taken_twice(tmp_path: Path) -> None:
     store = WorkerStateFile(tmp_path / "drift.npz")
     first = estimation(store)
     first.register(*drift_scan(0, 30, 30))
@@ -98,15 +98,15 @@ def test_before_the_first_scan_nothing_is_known(tmp_path: Path) -> None:
         (RescanRule("never"), False),
     ],
 )
-def test_a_scan_too_far_from_where_it_was_asked_for_is_wanted_again(rule: RescanRule, again: bool) -> None:
+def test_a_scan_too_far_from_its_requested_region_needs_a_rescan(rule: RescanRule, again: bool) -> None:
     asked = Region((0.0, 0.0), HERE.size_m, frame=Frame.SAMPLE)
     made = estimation(WorkerStateFile(None), rule)
     assert not made.register(*drift_scan(0, 20, 20), asked).rescan  # nothing was known before
     assert bool(made.register(*drift_scan(1, 35, 28), asked).rescan) is again
-    assert not made.register(*drift_scan(2, 60, 60), None).rescan  # nobody asked for it
+    assert not made.register(*drift_scan(2, 60, 60), None).rescan  # no requested region
 
 
-def test_a_tracker_that_can_not_follow_a_compensation_says_so() -> None:
+def test_a_tracker_that_can_not_follow_a_compensation_raises() -> None:
     with pytest.raises(ConfigError, match="compensates"):
         estimation(WorkerStateFile(None)).compensated(0.0, (1e-9, 0.0))
 
@@ -114,7 +114,7 @@ def test_a_tracker_that_can_not_follow_a_compensation_says_so() -> None:
 # --- on disk ---
 
 
-def test_what_is_stored_comes_back_to_the_last_bit(tmp_path: Path) -> None:
+def test_stored_state_is_restored_to_the_last_bit(tmp_path: Path) -> None:
     state = {"a": [1, {"b": np.array([[0.1, np.nan], [-0.0, 1e300]])}], "c": "ü", "d": None, "e": np.float64(0.1)}
     WorkerStateFile(tmp_path / "deep" / "drift.npz").save(state)
     found = WorkerStateFile(tmp_path / "deep" / "drift.npz").load()
@@ -123,14 +123,14 @@ def test_what_is_stored_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     assert (found["a"][0], found["c"], found["d"], found["e"]) == (1, "ü", None, 0.1)
 
 
-def test_nothing_stored_is_no_error_and_damage_is_one(tmp_path: Path) -> None:
+def test_missing_state_is_no_error_and_damaged_state_is_one(tmp_path: Path) -> None:
     assert WorkerStateFile(tmp_path / "drift.npz").load() is None
     (tmp_path / "drift.npz").write_bytes(b"PK\x03\x04 half")
     with pytest.raises(FileError, match="can't be read"):
         WorkerStateFile(tmp_path / "drift.npz").load()
 
 
-def test_what_is_stored_is_no_code(tmp_path: Path) -> None:
+def test_stored_state_contains_no_code(tmp_path: Path) -> None:
     np.savez(tmp_path / "drift.npz", json=np.array([{"x": 1}], dtype=object), allow_pickle=True)
     with pytest.raises(FileError):
         WorkerStateFile(tmp_path / "drift.npz").load()
@@ -140,7 +140,7 @@ def test_what_is_stored_is_no_code(tmp_path: Path) -> None:
 
 
 class Heard:
-    """What a worker's process has said, waited for."""
+    """Waits for reports of a worker's process."""
 
     def __init__(self, registrar: DriftWorkerProcess) -> None:
         self.registrar = registrar
@@ -189,7 +189,7 @@ def test_a_user_s_own_estimator_registers_scans(work: Callable[..., Heard]) -> N
     assert answer.mapping.translation_m == pytest.approx([-3e-9, 2e-9], abs=1e-18)
 
 
-def test_a_worker_that_is_killed_knows_everything_when_it_is_started_again(work: Callable[..., Heard]) -> None:
+def test_a_killed_worker_has_its_whole_state_after_a_restart(work: Callable[..., Heard]) -> None:
     heard = work()
     heard.registrar.take(job(0, 30, 30))
     heard.registrar.take(job(1, 33, 28))
@@ -204,7 +204,7 @@ def test_a_worker_that_is_killed_knows_everything_when_it_is_started_again(work:
     assert Forecasted(answer.forecast) in heard.all
 
 
-def test_an_estimator_that_takes_the_process_with_it_is_told_of(work: Callable[..., Heard]) -> None:
+def test_an_estimator_that_ends_the_process_is_reported(work: Callable[..., Heard]) -> None:
     heard = work("Dies")
     heard.registrar.take(job(0, 30, 30))
     heard.registrar.take(job(1, 33, 28))
@@ -212,7 +212,7 @@ def test_an_estimator_that_takes_the_process_with_it_is_told_of(work: Callable[.
     assert gone == WorkerGone("exit code 7")
 
 
-def test_a_worker_that_hangs_is_killed_by_being_started_anew(work: Callable[..., Heard]) -> None:
+def test_a_hanging_worker_is_killed_by_a_restart(work: Callable[..., Heard]) -> None:
     heard = work("Hangs")
     heard.registrar.take(job(0, 30, 30))
     heard.next(Registered)
@@ -226,13 +226,13 @@ def test_a_worker_that_hangs_is_killed_by_being_started_anew(work: Callable[...,
     assert not [one for one in heard.all if isinstance(one, WorkerGone)]  # on purpose
 
 
-def test_settings_that_can_not_work_are_the_reason(work: Callable[..., Heard]) -> None:
+def test_impossible_settings_are_the_reported_reason(work: Callable[..., Heard]) -> None:
     gone = work("NoSuch").next(WorkerGone)
     assert isinstance(gone, WorkerGone)
     assert "NoSuch" in gone.reason
 
 
-def test_a_state_of_another_tracker_is_refused_with_what_to_do(work: Callable[..., Heard], tmp_path: Path) -> None:
+def test_a_state_of_another_tracker_is_refused_with_advice(work: Callable[..., Heard], tmp_path: Path) -> None:
     WorkerStateFile(tmp_path / "drift.npz").save({"tracker": {"kind": "bank", "version": 1}, "answers": []})
     gone = work().next(WorkerGone)
     assert isinstance(gone, WorkerGone)
@@ -240,7 +240,7 @@ def test_a_state_of_another_tracker_is_refused_with_what_to_do(work: Callable[..
     assert "remove the file" in gone.reason
 
 
-def test_where_nothing_can_be_saved_scans_are_registered_all_the_same(
+def test_scans_are_registered_even_if_nothing_can_be_saved(
     work: Callable[..., Heard], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     heard = work()
@@ -253,7 +253,7 @@ def test_where_nothing_can_be_saved_scans_are_registered_all_the_same(
     assert "drift.npz" in told
 
 
-def test_a_scan_out_of_its_turn_is_refused_and_the_next_is_not(work: Callable[..., Heard]) -> None:
+def test_a_scan_out_of_order_is_refused_and_the_next_is_not(work: Callable[..., Heard]) -> None:
     heard = work()
     heard.registrar.take(job(5, 30, 30))
     heard.registrar.take(job(2, 30, 30))
@@ -277,7 +277,7 @@ def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatc
 
 
 def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: Path) -> None:
-    """Else it would write the state that the worker of the next scheduler reads."""
+    """Otherwise it would write the state that the worker of the next scheduler reads."""
     program = """
         import logging, sys, time
         from afspm.plugins.drift.scheduler.messages import StartWorker

@@ -1,4 +1,4 @@
-"""Estimators by name, users' own, and that none of them can do harm."""
+"""Estimators by name, a user's own, and protection from their errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FOUND = Registration(
 
 
 class Told:
-    """An estimator that says what it was told to."""
+    """An estimator with a given result."""
 
     def __init__(self, answer: Any = FOUND, gain: float = 1.0) -> None:
         if gain < 0.0:
@@ -48,7 +48,7 @@ def said(answer: Any) -> Registration:
     return estimator(Told(answer)).register(a_scan(), a_scan())
 
 
-def test_what_is_right_passes_untouched() -> None:
+def test_a_right_result_passes_unchanged() -> None:
     assert said(FOUND) is FOUND
     refused = Registration.refused("nothing in common")
     assert said(refused) is refused
@@ -79,14 +79,14 @@ def test_what_is_right_passes_untouched() -> None:
         (replace(FOUND, displacement_m=np.array([-1.1e-6, 0.0])), "do not overlap"),
     ],
 )
-def test_what_an_estimator_gets_wrong_is_refused_with_the_reason(answer: Any, reason: str) -> None:
+def test_a_malformed_result_fails_with_the_reason(answer: Any, reason: str) -> None:
     found = said(answer)
     assert not found.accepted
     assert "Told" in found.reason
     assert reason in found.reason
 
 
-def test_a_sample_that_was_turned_and_moved_by_most_of_a_frame_may_be() -> None:
+def test_a_rotation_and_a_displacement_by_most_of_a_frame_are_possible() -> None:
     turned = replace(FOUND, linear=np.array([[0.0, -1.0], [1.0, 0.0]]) - np.eye(2), displacement_m=np.array([9e-7, 0]))
     assert said(turned) is turned
 
@@ -97,7 +97,7 @@ def test_an_estimator_can_not_change_the_scans_it_is_given() -> None:
     assert (reference.values == 1.0).all()
 
 
-def test_a_users_own_is_named_by_its_class_and_gets_its_settings() -> None:
+def test_a_user_s_own_estimator_is_named_by_its_class_and_gets_its_settings() -> None:
     made = estimator({"class": f"{__name__}.Told", "gain": 3.0})
     assert isinstance(made, Guarded)
     assert isinstance(made.inner, Told)
@@ -121,13 +121,13 @@ def test_a_users_own_is_named_by_its_class_and_gets_its_settings() -> None:
         (object(), "is not an estimator"),
     ],
 )
-def test_what_is_not_there_is_refused_with_what_is(spec: Any, says: str) -> None:
+def test_an_unknown_name_is_refused_with_the_known_ones(spec: Any, says: str) -> None:
     with pytest.raises(ConfigError) as refused:
         estimator(spec)
     assert says in str(refused.value)
 
 
-def test_a_missing_library_is_told_with_the_extra_that_brings_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_reported_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     real = metadata.version
 
     def version(name: str) -> str:
@@ -143,7 +143,7 @@ def test_a_missing_library_is_told_with_the_extra_that_brings_it(monkeypatch: py
     )
 
 
-def test_how_sure_the_default_must_be_may_be_given_as_in_the_experiment_file() -> None:
+def test_the_default_accepts_its_threshold_as_in_the_experiment_file() -> None:
     random = np.random.default_rng(3)
     values = random.normal(size=(64, 64)).cumsum(0).cumsum(1)
     first, second = (
@@ -158,6 +158,6 @@ def test_how_sure_the_default_must_be_may_be_given_as_in_the_experiment_file() -
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, -0.5, True])
-def test_a_probability_that_is_none_is_refused(value: float) -> None:
+def test_an_impossible_probability_is_refused(value: float) -> None:
     with pytest.raises(ConfigError, match="wrong_at_most"):
         estimator({"class": "least-squares", "wrong_at_most": value})

@@ -1,4 +1,4 @@
-"""An error of an estimator says nothing about the scans: it is reported, bridged, and held against nothing."""
+"""An error of an estimator means nothing about the scans: it is reported, bridged, and no scan is blamed."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ PRIOR = Prior(np.array([3.0, -2.0]) * PIXEL_M, np.eye(2) * (2.0 * PIXEL_M) ** 2)
 
 
 class Broken:
-    """Raises over every pair."""
+    """Raises for every pair."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         raise ZeroDivisionError("oh")
 
 
 def pair() -> tuple[DriftScan, DriftScan]:
-    """Two scans of one rough surface, displaced by `SHIFT_PX`."""
+    """Return two scans of one rough surface, displaced by `SHIFT_PX`."""
     random = np.random.default_rng(1)
     surface = gaussian_filter(random.standard_normal((96, 96)), 2.5)
     region, (x, y) = Region((0.0, 0.0), (63 * PIXEL_M, 63 * PIXEL_M)), SHIFT_PX
@@ -59,7 +59,7 @@ def test_an_error_is_logged_where_no_caller_takes_it(caplog: pytest.LogCaptureFi
     assert "second.nc with first.nc: ZeroDivisionError: oh" in record.getMessage()
 
 
-def test_unguarded_an_error_shows() -> None:
+def test_an_unguarded_estimator_raises() -> None:
     with pytest.raises(ZeroDivisionError):
         unguarded(Broken()).register(*pair())
 
@@ -78,7 +78,7 @@ def test_without_an_expectation_nothing_is_bridged() -> None:
     assert estimator(Broken(), lambda failure: None).register(*pair()).outcome is RegistrationOutcome.FAILED
 
 
-def test_a_failed_pair_tells_no_velocity() -> None:
+def test_a_failed_pair_gives_no_velocity() -> None:
     """A coarse estimate has no shear, which is not a shear of zero."""
     first, second = pair()
     down = DriftScan(second.values, second.region, second.start_s, second.end_s, False, second.key)
@@ -86,7 +86,7 @@ def test_a_failed_pair_tells_no_velocity() -> None:
 
 
 class Failing(World):
-    """Has errors over some pairs, by the keys of their scans."""
+    """Raises for some pairs, by the keys of their scans."""
 
     references: frozenset[str] = frozenset()
     scans: frozenset[str] = frozenset()
@@ -115,7 +115,7 @@ def test_errors_of_the_estimator_do_not_mean_that_the_sample_is_lost(kind: str) 
 
 
 def test_errors_of_the_estimator_are_not_held_against_a_reference() -> None:
-    """After three of them the overview was dropped, and later zooms had nothing to be compared with."""
+    """After three errors the overview was dropped, and later zooms had no reference."""
     world = Failing(steady((2e-12, 0.0)))
     following = tracker("bank", world)
     follow(following, 3)

@@ -1,4 +1,4 @@
-"""Estimators by features and by correlation: right where there is something to find, refused where there is not."""
+"""Estimators by features and by correlation: right for common features, refused without them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def check(found: Registration, drift_m: tuple[float, float], within_px: float = 
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_drift_between_two_scans_is_found(kind: str) -> None:
+def test_each_estimator_finds_the_drift_between_two_scans(kind: str) -> None:
     surface = Waves(1)
     first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, DRIFT_M, seed=1)
     found = estimator(kind).register(first, second)
@@ -49,7 +49,7 @@ def test_the_drift_between_two_scans_is_found(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_frame_that_follows_the_drift_shows_the_same_and_the_displacement_is_that_of_the_tip(kind: str) -> None:
+def test_the_displacement_is_in_tip_coordinates_for_a_frame_that_follows_the_drift(kind: str) -> None:
     surface, drift_m = Waves(2), (90 * PIXEL_M, 40.4 * PIXEL_M)
     after = REGION.moved_to((REGION.center_m[0] + drift_m[0], REGION.center_m[1] + drift_m[1]))
     found = estimator(kind).register(scanned(surface, REGION, SHAPE), scanned(surface, after, SHAPE, drift_m, seed=1))
@@ -75,7 +75,7 @@ def test_resolutions_may_differ(kind: str, which: int) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_frames_may_be_turned_against_each_other(kind: str) -> None:
+def test_frames_may_be_rotated_against_each_other(kind: str) -> None:
     surface = Waves(5)
     turned = replace(REGION, angle_rad=0.3)
     found = estimator(kind).register(
@@ -85,7 +85,7 @@ def test_frames_may_be_turned_against_each_other(kind: str) -> None:
 
 
 @pytest.mark.parametrize("transform", ["euclidean", "similarity", "affine"])
-def test_a_sample_that_turns_is_followed(transform: str) -> None:
+def test_a_rotation_of_the_sample_is_found(transform: str) -> None:
     surface, turn = Waves(6), math.radians(2.0)
     region = replace(REGION, center_m=(0.2e-6, -0.1e-6))
     first, second = scanned(surface, region, SHAPE), scanned(surface, region, SHAPE, DRIFT_M, turned_rad=turn, seed=1)
@@ -97,7 +97,7 @@ def test_a_sample_that_turns_is_followed(transform: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_was_not_scanned_leaves_no_border_that_would_be_a_feature(kind: str) -> None:
+def test_unmeasured_rows_leave_no_border_that_counts_as_a_feature(kind: str) -> None:
     surface = Waves(7)
     first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, DRIFT_M, seed=1)
     for scan, rows in ((first, slice(75, None)), (second, slice(72, None))):
@@ -119,7 +119,7 @@ def test_different_places_are_refused(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("what", ["nothing", "constant", "rows", "noise"])
-def test_scans_that_hold_nothing_are_refused(kind: str, what: str) -> None:
+def test_scans_without_information_are_refused(kind: str, what: str) -> None:
     good = scanned(Waves(8), REGION, SHAPE)
     values = {
         "nothing": np.full(SHAPE, np.nan),
@@ -135,7 +135,7 @@ def test_scans_that_hold_nothing_are_refused(kind: str, what: str) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_expected_decides_where_it_is_looked(kind: str) -> None:
+def test_the_prior_selects_the_searched_area(kind: str) -> None:
     surface = Waves(9)
     first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, DRIFT_M, seed=1)
     near = Prior(np.array(DRIFT_M) + PIXEL_M, np.eye(2) * PIXEL_M**2)
@@ -144,7 +144,7 @@ def test_what_is_expected_decides_where_it_is_looked(kind: str) -> None:
     assert not estimator(kind).register(first, second, wrong).accepted
 
 
-def test_a_surface_that_repeats_itself_is_ambiguous() -> None:
+def test_a_periodic_surface_is_ambiguous() -> None:
     x, y = REGION.pixels_m(SHAPE)
     k = 2 * np.pi / (8 * PIXEL_M)
     lattice = [
@@ -156,7 +156,7 @@ def test_a_surface_that_repeats_itself_is_ambiguous() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS[:3])
-def test_matches_are_told_where_the_tip_saw_them(kind: str) -> None:
+def test_matches_are_given_in_tip_coordinates(kind: str) -> None:
     surface = Waves(1)
     first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, DRIFT_M, seed=1)
     found = estimator(kind).register(first, second)
@@ -187,7 +187,7 @@ def test_no_more_keypoints_are_kept_than_allowed(kind: str) -> None:
         ({"class": "correlation", "height": float("nan")}, "height"),
     ],
 )
-def test_settings_that_make_no_sense_are_refused(settings: dict[str, Any], says: str) -> None:
+def test_meaningless_settings_are_refused(settings: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError) as refused:
         estimator(settings)
     assert says in str(refused.value)
@@ -216,7 +216,7 @@ def test_matching_piece_by_piece_finds_what_one_table_would(pair: tuple[np.ndarr
         assert [tuple(row) for row in matched(*pair)] == mutual(*pair)
 
 
-def test_only_pairs_that_are_allowed_are_matched() -> None:
+def test_only_allowed_pairs_are_matched() -> None:
     first, second = np.eye(3, dtype=np.float32), np.eye(3, dtype=np.float32)
     allowed = np.array([[True, True, True], [True, False, True], [False, False, False]])
     pairs = matched(first, second, lambda rows: allowed[rows])
@@ -226,7 +226,7 @@ def test_only_pairs_that_are_allowed_are_matched() -> None:
 
 
 def disturbed() -> list[Any]:
-    """Two scans that share little more than half, the second with much noise: few matches are right."""
+    """Return two scans that share little more than half, the second with much noise: few matches are right."""
     surface, drift_m = Waves(5), (50.4 * PIXEL_M, -12.5 * PIXEL_M)
     first, second = scanned(surface, REGION, SHAPE), scanned(surface, REGION, SHAPE, drift_m, seed=1)
     noise = np.random.default_rng(3).normal(scale=0.15 * second.values.std(), size=SHAPE)
@@ -237,8 +237,8 @@ def inliers(pair: list[Any], **settings: Any) -> float:
     return estimator({"class": "brief", "max_keypoints": 200, **settings}).register(*pair).quality.get("inliers", 0.0)
 
 
-def test_the_inlier_limit_is_that_of_the_paper_and_matters() -> None:
-    """Matches that are off by up to so much of the scan's resolution agree; the paper does not tighten that."""
+def test_the_inlier_limit_of_the_paper_matters() -> None:
+    """Matches agree up to this share of the scan's resolution; the paper does not tighten that."""
     pair = disturbed()
     of = [inliers(pair, residual_threshold=limit, tighten=False) for limit in (0.01, 0.05, 0.6)]
     assert of[0] < of[1] < of[2]
@@ -249,7 +249,7 @@ def test_the_inlier_limit_is_that_of_the_paper_and_matters() -> None:
     np.testing.assert_array_equal(np.hypot(*off.T) <= limit_m, found.matches.inlier)
 
 
-def test_more_iterations_find_more_that_agrees() -> None:
+def test_more_iterations_find_more_inliers() -> None:
     pair = disturbed()
     seeds = range(8)
     few = [inliers(pair, iterations=1, seed=seed) for seed in seeds]

@@ -1,4 +1,4 @@
-"""The figures of drift show what they were given, with units."""
+"""The figures of drift show their data, with units."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_estimates_show_the_refused_apart(tmp_path: Path) -> None:
     assert len(crosses.get_xdata()) == np.count_nonzero(~record().matched)
 
 
-def test_bins_are_as_wide_as_freedman_and_diaconis_say() -> None:
+def test_bins_have_the_width_of_freedman_and_diaconis() -> None:
     values = np.random.default_rng(1).normal(size=1000)
     edges = freedman_diaconis(values)
     np.testing.assert_allclose(edges, np.histogram_bin_edges(values, bins="fd"))
@@ -81,14 +81,14 @@ def made_text(made: Figure) -> str:
     return " ".join(text.get_text() for ax in made.axes for text in ax.texts)
 
 
-def test_pairs_say_how_far_and_how_much_later(tmp_path: Path) -> None:
+def test_pairs_are_labelled_with_distance_and_time(tmp_path: Path) -> None:
     two = [ScanPair(scan(0), scan(8), np.array([300e-9, 400e-9]), "off"), ScanPair(scan(1), scan(9), np.zeros(2))]
     made = drawn(draw_pairs(two), tmp_path)
     assert made.axes[1].get_title(loc="left") == "2.00 h later: 500.0 nm"
     assert made.axes[0].get_title(loc="left") == "off"
 
 
-def test_inliers_and_outliers_are_told_apart_and_what_has_no_features_is_refused(tmp_path: Path) -> None:
+def test_inliers_and_outliers_are_drawn_apart_and_a_pair_without_features_is_refused(tmp_path: Path) -> None:
     at = np.random.default_rng(1).uniform(-0.4e-6, 0.4e-6, (30, 2))
     inlier = np.arange(30) < 21
     made = drawn(draw_features(scan(0), scan(1), Matches(at, at, inlier)), tmp_path)
@@ -106,7 +106,7 @@ def test_a_keypoint_lies_on_the_pixel_that_it_was_found_at() -> None:
     np.testing.assert_allclose(corner, [1e6 * left, 1e6 * (low + one.region.size_m[1])])
 
 
-def test_true_errors_are_those_of_place_and_of_knowledge(tmp_path: Path) -> None:
+def test_true_errors_are_misplacement_and_estimation_error(tmp_path: Path) -> None:
     run = record()
     truth = run.drift_m + 7e-6  # from another zero on
     made = drawn(draw_errors(run, truth, switched_on_s=float(run.time_s[8])), tmp_path)
@@ -117,7 +117,7 @@ def test_true_errors_are_those_of_place_and_of_knowledge(tmp_path: Path) -> None
     np.testing.assert_allclose(believed, 0.0, atol=1e-6)
 
 
-def test_lengths_are_told_in_the_unit_that_reads_best() -> None:
+def test_lengths_have_the_unit_that_reads_best() -> None:
     assert style.unit_of(np.array([3e-9, np.nan]))[0] == "nm"
     assert style.unit_of(np.array([0.5e-12]))[0] == "pm"
     assert style.unit_of(np.array([5e-6]), 1e-9)[0] == "µm"
@@ -132,7 +132,7 @@ def test_the_package_of_figures_loads_without_matplotlib() -> None:
     assert subprocess.run([sys.executable, "-c", told], check=False).returncode == 0
 
 
-def test_a_record_of_nothing_refused_has_no_such_mark() -> None:
+def test_a_record_without_refusals_has_no_mark_for_them() -> None:
     run = record()
     all_good = replace(run, matched=np.ones(20, bool))
     assert "refused" not in draw_estimates(all_good).axes[0].get_legend_handles_labels()[1]

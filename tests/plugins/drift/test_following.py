@@ -1,4 +1,4 @@
-"""The default tracker with the default estimator, on simulated images: that all of it fits together."""
+"""The default tracker with the default estimator, on simulated images."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def test_scans_are_followed_to_a_tenth_of_a_pixel_after_a_first_jump_cut_by_an_u
 
 
 def test_the_oracle_knows_the_truth() -> None:
-    """Otherwise nothing measured beside it would mean anything."""
+    """Otherwise all comparisons with it would be meaningless."""
     night = Night("rough", 2, 12)
     for number, (drift_m, update) in enumerate(night.followed(tracker("bank", Oracle(night.drift)))):
-        # The rows that both scans of the first pair show were taken at other times, and nobody knows the rate yet.
+        # The rows that both scans of the first pair show were taken at other times, and the rate is unknown yet.
         tolerated_m = 1.0 * NM if number < 4 else 0.05 * NM
         assert -update.after.mapping.translation_m - drift_m == pytest.approx(np.zeros(2), abs=tolerated_m)

@@ -1,4 +1,4 @@
-"""The second generator of pairs: its truth is where the features are, and its noise is there."""
+"""The second generator of pairs: features lie at its truth, and its noise is there."""
 
 from __future__ import annotations
 

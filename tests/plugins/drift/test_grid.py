@@ -1,4 +1,4 @@
-"""A grid is every combination that differs, by names from a command line or a file."""
+"""A grid contains every different combination, by names from a command line or a file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_every_combination_comes_once_after_the_defaults() -> None:
     assert len(named) == 4
 
 
-def test_what_belongs_to_another_tracker_makes_no_combination() -> None:
+def test_settings_of_another_tracker_make_no_combination() -> None:
     grid = SettingsGrid.of(["tracker=bank,paper", "paper.queue=3,5,10"])
     named = dict(grid.settings())
     assert list(named) == ["defaults", "tracker=paper paper.queue=3", "tracker=paper paper.queue=5",
@@ -31,18 +31,18 @@ def test_what_belongs_to_another_tracker_makes_no_combination() -> None:
 
 
 @pytest.mark.parametrize("given", [["paper.queue=3,5"], ["tracker=bank", "paper.queue=3"], ["tracker.queue=3"]])
-def test_what_is_told_to_a_part_that_no_night_has_is_refused(given: list[str]) -> None:
+def test_settings_of_a_part_that_no_night_has_are_refused(given: list[str]) -> None:
     with pytest.raises(ConfigError, match="has no effect"):
         dict(SettingsGrid.of(given).settings())
 
 
-def test_a_user_s_own_part_is_told_by_its_whole_name() -> None:
+def test_a_user_s_own_part_gets_settings_by_its_full_name() -> None:
     named = dict(SettingsGrid.of(["estimator=my_lab.Periodicity", "my_lab.Periodicity.lattice_m=1e-9,2e-9"]).settings())
     assert [one.estimator.get("lattice_m") for one in named.values()] == [None, 1e-9, 2e-9]
     assert list(named)[1] == "my_lab.Periodicity.lattice_m=1e-09"
 
 
-def test_a_file_is_read_and_the_command_line_goes_on_top_of_it(tmp_path: Path) -> None:
+def test_the_command_line_overrides_a_file(tmp_path: Path) -> None:
     file = tmp_path / "grid.toml"
     text = 'tracker = ["bank", "paper"]\nhours = 2\n[paper]\nqueue = [3, 5]\nf_min = 0.5\n'
     file.write_text(text, encoding="utf-8-sig")
@@ -53,7 +53,7 @@ def test_a_file_is_read_and_the_command_line_goes_on_top_of_it(tmp_path: Path) -
     assert grid.varied == ("tracker", "paper.queue")
 
 
-def test_settings_that_are_not_there_or_make_no_sense_are_told(tmp_path: Path) -> None:
+def test_unknown_and_meaningless_settings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="pixel"):
         NightSettings.of({"pixel": 3})
     with pytest.raises(InvalidValue, match="does not fit"):

@@ -1,4 +1,4 @@
-"""The default estimator: where features went, in metres, and what it refuses."""
+"""The default estimator: displacement in metres, and refusals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def scanned(
     noise: float = 0.02,
     start_s: float = 0.0,
 ) -> DriftScan:
-    """A scan of a surface that has moved by `drift_m` under the tip, with noise as a share of the relief."""
+    """Return a scan of a surface that has moved by `drift_m` under the tip, with noise as a share of the relief."""
     x, y = region.pixels_m(shape)
     values = surface(x - drift_m[0], y - drift_m[1], seed)
     values += noise * values.std() * np.random.default_rng([seed, 7, int(start_s)]).standard_normal(shape)
@@ -66,14 +66,14 @@ def test_the_centre_of_the_scan_is_taken_into_account() -> None:
     assert_displaced(registered(scanned(moved, drift_m=DRIFT_M, start_s=900.0)), DRIFT_M, 0.2 * NM)
 
 
-def test_pixels_that_are_not_square() -> None:
+def test_pixels_that_are_not_square_are_registered() -> None:
     wide = Region((0.0, 0.0), (1.5 * SIZE_M, SIZE_M))
     reference, scan = scanned(wide, (128, 80)), scanned(wide, (128, 80), DRIFT_M, start_s=900.0)
     assert_displaced(registered(scan, reference), DRIFT_M, 0.3 * NM)
 
 
 @pytest.mark.parametrize("angle_deg", [30.0, 90.0, -135.0])
-def test_frames_that_are_both_turned(angle_deg: float) -> None:
+def test_rotated_frames_are_registered(angle_deg: float) -> None:
     turned = Region((0.0, 0.0), (SIZE_M, SIZE_M), math.radians(angle_deg))
     assert_displaced(registered(scanned(turned, drift_m=DRIFT_M, start_s=9.0), scanned(turned)), DRIFT_M, 0.2 * NM)
 
@@ -90,13 +90,13 @@ def test_frames_that_are_both_turned(angle_deg: float) -> None:
     ],
     ids=["finer", "other pixels", "smaller", "turned", "turned with pixels that are not square"],
 )
-def test_scans_of_different_geometry(region: Region, shape: tuple[int, int], within_m: float) -> None:
+def test_scans_of_different_geometry_are_registered(region: Region, shape: tuple[int, int], within_m: float) -> None:
     scan = scanned(region, shape, DRIFT_M, start_s=900.0)
     assert_displaced(registered(scan), DRIFT_M, within_m)
     assert_displaced(registered(scanned(REGION), scan), -DRIFT_M, within_m)
 
 
-def test_the_centre_and_the_linear_part_say_where_any_feature_is() -> None:
+def test_centre_and_linear_part_give_the_place_of_any_feature() -> None:
     stretch = np.array([[0.004, -0.003], [0.002, 0.001]])
     x, y = REGION.pixels_m((128, 128))
     reference = DriftScan(surface(x, y), REGION, 0.0, 100.0)
@@ -108,7 +108,7 @@ def test_the_centre_and_the_linear_part_say_where_any_feature_is() -> None:
         assert displaced_m == pytest.approx(DRIFT_M + stretch @ at_m, abs=0.2 * NM)
 
 
-def test_a_scan_that_was_stopped_half_way_is_registered_with_what_there_is() -> None:
+def test_a_scan_stopped_half_way_is_registered_by_its_measured_rows() -> None:
     scan = scanned(REGION, drift_m=DRIFT_M, start_s=900.0)
     values = scan.values.copy()
     values[60:] = np.nan
@@ -154,7 +154,7 @@ def _values(kind: str) -> NDArray[np.float64]:
         ("saturated", "saturated"),
     ],
 )
-def test_a_scan_that_holds_nothing_is_refused_with_the_reason(kind: str, reason: str) -> None:
+def test_a_scan_without_information_is_refused_with_the_reason(kind: str, reason: str) -> None:
     import re
 
     scan = DriftScan(_values(kind), REGION, 900.0, 1000.0)
@@ -170,8 +170,8 @@ def test_scans_of_different_places_are_refused(seed: int) -> None:
     assert found.reason
 
 
-def test_of_two_like_features_the_right_one_is_found_by_what_lies_beside_it() -> None:
-    """The reference shows both, 600 nm apart, and the scan one of them: which of them, the empty places tell."""
+def test_two_like_features_are_distinguished_by_their_surroundings() -> None:
+    """The reference shows both, 600 nm apart, and the scan one of them; the empty surroundings identify it."""
     drift_m = np.array([250 * NM, 20 * NM])
 
     def bumps(moved_m: NDArray[np.float64], start_s: float) -> DriftScan:
@@ -189,7 +189,7 @@ def test_of_two_like_features_the_right_one_is_found_by_what_lies_beside_it() ->
     assert_displaced(known, drift_m, 2 * NM)
 
 
-def test_a_scan_lies_on_itself_exactly() -> None:
+def test_a_scan_is_registered_with_itself_exactly() -> None:
     values = np.random.default_rng(3).normal(size=(64, 64)).cumsum(0).cumsum(1)
     scan = DriftScan(values, Region((0, 0), (1e-6, 1e-6)), 0.0, 1.0)
     found = LeastSquares().register(scan, scan)
@@ -197,8 +197,8 @@ def test_a_scan_lies_on_itself_exactly() -> None:
     assert found.displacement_m == pytest.approx([0.0, 0.0], abs=1e-15)
 
 
-def test_a_site_of_a_lattice_is_refused_if_it_is_like_the_others_though_it_was_expected() -> None:
-    """A site away nearly all fits; that the defects don't is seen by what other sites are like."""
+def test_an_expected_lattice_site_like_all_others_is_refused() -> None:
+    """One site off nearly everything fits; the comparison with other sites shows that the defects don't."""
     period_m, cos, sin = 140 * NM, math.cos(0.5), math.sin(0.5)
     x, y = REGION.pixels_m((96, 96))
     defects = np.random.default_rng(5).uniform(-SIZE_M / 2, SIZE_M / 2, (12, 2))

@@ -1,4 +1,4 @@
-"""The default estimator on small overlaps: zooms into an overview, down to the smallest that it looks at."""
+"""The default estimator on small overlaps: zooms into an overview, down to the smallest overlap that it accepts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DRIFT_M = np.array([0.7, -0.4]) * PIXEL_M
 
 
 def smooth(x_m: NDArray[np.float64], y_m: NDArray[np.float64], longest_px: float, seed: int) -> NDArray[np.float64]:
-    """A relief of some long waves: few features, and gradients that are alike everywhere."""
+    """Return a relief of some long waves: few features, and gradients alike everywhere."""
     random = np.random.default_rng(seed)
     height = np.zeros_like(x_m)
     for _ in range(6):

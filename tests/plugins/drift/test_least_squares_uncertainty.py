@@ -1,4 +1,4 @@
-"""The default estimator knows its own error, and uses what is known of the drift velocity."""
+"""The default estimator knows its own error, and uses a known drift velocity."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_more_noise_is_more_uncertainty() -> None:
 
 
 def edge(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The end of one bump: shift and shear of it are nearly the same."""
+    """Return the end of one bump: its shift and its shear are nearly the same."""
     along, across = x_m + 100 * NM, y_m - 120 * NM
     inside = 150 * NM - np.hypot(np.maximum(along, 0.0), across)
     return 1.0 / (1.0 + np.exp(-inside / (10 * NM)))
@@ -113,7 +113,7 @@ def test_drift_shears_along_the_slow_axis_in_the_direction_of_time(upwards: bool
     ],
     ids=["up and down", "directions not known", "turned", "faster", "velocities not known"],
 )
-def test_a_difference_of_velocities_says_nothing_of_scans_taken_differently(
+def test_a_difference_of_velocities_does_not_apply_to_scans_taken_differently(
     reference: DriftScan, scan: DriftScan, known: Prior
 ) -> None:
     mean, sd = shear_by_drift(known, reference, scan)
@@ -122,7 +122,10 @@ def test_a_difference_of_velocities_says_nothing_of_scans_taken_differently(
 
 
 def told(shift: float, shear: float) -> tuple[NDArray[np.float64], ...]:
-    """Of images that tell the sum of a shift along x and ten times a shear to 0.1 px, and all else very well."""
+    """Return information from images that determine a shift along x plus ten times a shear to 0.1 px.
+
+    Everything else is determined well.
+    """
     information = 1e8 * np.eye(COUNT)
     information[np.ix_([0, 3], [0, 3])] = np.outer((10.0, 100.0), (10.0, 100.0))
     theta = np.zeros(COUNT)
@@ -130,7 +133,7 @@ def told(shift: float, shear: float) -> tuple[NDArray[np.float64], ...]:
     return information, information @ theta, 1e-4 * np.eye(COUNT)
 
 
-def test_what_shear_is_plausible_decides_where_shift_and_shear_are_alike() -> None:
+def test_plausible_shear_decides_where_shift_and_shear_are_alike() -> None:
     still, total = averaged(*told(0.5, 0.05), Shear(sds=(1e-5,)))
     assert still[0] == pytest.approx(1.0, abs=0.01), "all of it is a shift"
     assert math.sqrt(total[0, 0]) == pytest.approx(0.1, rel=0.05)
@@ -140,7 +143,7 @@ def test_what_shear_is_plausible_decides_where_shift_and_shear_are_alike() -> No
     assert math.sqrt(unsure[0, 0]) > 0.3, "it may be either"
 
 
-def test_creep_that_the_images_show_is_freed_and_what_they_do_not_show_is_none() -> None:
+def test_visible_creep_is_fitted_and_invisible_creep_is_zero() -> None:
     information = np.diag([1.0, 1.0, *[1e8] * 4, 1e4, *[1.0] * (COUNT - 7)])
     theta = np.zeros(COUNT)
     theta[6] = 0.5
@@ -152,7 +155,7 @@ def test_creep_that_the_images_show_is_freed_and_what_they_do_not_show_is_none()
     assert without[6, 6] < total[6, 6] / 4
 
 
-def test_a_stretch_of_a_row_that_stands_out_is_mended_and_features_are_left() -> None:
+def test_a_stretch_of_a_row_that_stands_out_is_mended_and_features_stay() -> None:
     y, x = np.mgrid[:64, :64].astype(float)
     random = np.random.default_rng(8)
     surface = (
@@ -167,7 +170,7 @@ def test_a_stretch_of_a_row_that_stands_out_is_mended_and_features_are_left() ->
     assert abs(without_scars(scarred) - surface).max() < 0.15
 
 
-def test_what_noise_is_left_in_a_shrunk_image_is_known_from_other_noise() -> None:
+def test_the_noise_left_in_a_shrunk_image_is_known_from_independent_noise() -> None:
     random = np.random.default_rng(3)
     y, x = np.mgrid[:128, :128].astype(float)
     image = np.exp(-(((x - 40) / 3) ** 2)) + np.sin(y / 9) * np.exp(-(((y - 80) / 20) ** 2))
@@ -186,7 +189,7 @@ def test_a_derivative_is_exact_for_short_waves_and_at_borders() -> None:
     assert derivative(np.stack([3.0 * x] * 12), 1) == pytest.approx(3.0)
 
 
-def test_noise_in_the_gradient_is_no_information() -> None:
+def test_noise_in_the_gradient_is_not_counted_as_information() -> None:
     spread, seen = np.diag(np.geomspace(1e4, 1e6, COUNT)), np.full(COUNT, 1.0)
     seen[2] = 0.5  # of the slope's variance in this direction, half is noise
     believed = Believed(np.zeros(COUNT), np.eye(COUNT))

@@ -1,4 +1,4 @@
-"""What a pair of scans says of the time in between, and what is drawn of a run."""
+"""The displacement of a pair of scans over the time in between, and the figures of a run."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def found(displacement_m: tuple[float, float], *, center_m: tuple[float, float] 
     )
 
 
-def test_a_pair_speaks_of_the_rows_that_both_show_and_is_brought_to_the_middle_of_both() -> None:
-    """Sample and rows move up: what lies d above the middle was taken late, and meanwhile the sample went on."""
+def test_a_pair_holds_for_the_shared_rows_and_is_moved_to_the_middle_of_both_scans() -> None:
+    """Sample and rows move up: rows d above the middle are taken late, and meanwhile the sample goes on."""
     scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k + 200.0, upwards=True) for k in range(2)]
     rates = np.array([(1e-10, 0.0), (0.0, 2e-10)])
     run = replace(record()[:2], rate_m_s=rates)
@@ -44,7 +44,7 @@ def test_a_pair_speaks_of_the_rows_that_both_show_and_is_brought_to_the_middle_o
     np.testing.assert_allclose(against_first(run, unknown, [pair]).drift_m[1], pair.displacement_m)
 
 
-def test_the_first_scan_of_a_run_had_the_rate_that_the_second_tells() -> None:
+def test_the_first_scan_of_a_run_has_the_rate_of_the_second() -> None:
     scans = [DriftScan(np.zeros((8, 8)), REGION, 900.0 * k, 900.0 * k + 200.0, upwards=True) for k in range(2)]
     velocity = np.array([1e-10, 2e-10])
     run = replace(record()[:2], rate_m_s=np.array([(0.0, 0.0), velocity]))
@@ -62,7 +62,7 @@ def test_a_refused_pair_stays_in_the_table_with_its_reason() -> None:
     assert np.isnan(refused.drift_m[1]).all()
 
 
-def test_pairs_for_the_eye_are_as_far_apart_as_asked_and_spread_over_the_run() -> None:
+def test_drawn_pairs_have_the_given_time_apart_and_are_spread_over_the_run() -> None:
     run = record(20)
     pairs = spread_pairs(run, 7200.0, 2)
     assert len(pairs) == 2
@@ -72,9 +72,7 @@ def test_pairs_for_the_eye_are_as_far_apart_as_asked_and_spread_over_the_run() -
     assert spread_pairs(run[:1], 7200.0, 2) == []
 
 
-def test_an_album_holds_every_figure_that_there_is_something_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_album_contains_every_figure_with_material(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("matplotlib")
     from afspm.plugins.drift.figures import album, style
     from afspm.plugins.drift.registration import Matches

@@ -1,4 +1,4 @@
-"""What two turned rectangles share, and how alike their resolutions are."""
+"""The shared area of two rotated rectangles, and the ratio of their resolutions."""
 
 from __future__ import annotations
 
@@ -34,26 +34,26 @@ def regions(draw: st.DrawFn, angle: st.SearchStrategy[float] = angles) -> Region
 
 
 @given(regions(), regions())
-def test_it_does_not_matter_which_is_first(a: Region, b: Region) -> None:
+def test_the_order_of_two_regions_does_not_matter(a: Region, b: Region) -> None:
     assert intersection_area_m2(a, b) == pytest.approx(intersection_area_m2(b, a), rel=1e-9, abs=1e-12 * UM**2)
     assert 0.0 <= intersection_ratio(a, b) <= 1.0
 
 
 @given(regions(), regions(), lengths, lengths)
-def test_it_does_not_matter_where_the_origin_is(a: Region, b: Region, x: float, y: float) -> None:
+def test_the_origin_does_not_matter(a: Region, b: Region, x: float, y: float) -> None:
     away = [r.moved_to((r.center_m[0] + x * 1e-3, r.center_m[1] + y * 1e-3)) for r in (a, b)]
     assert intersection_area_m2(*away) == pytest.approx(intersection_area_m2(a, b), rel=1e-6, abs=1e-8 * UM**2)
 
 
 @given(regions(), st.integers(0, 3))
-def test_a_region_shares_all_with_itself_turned_by_whole_turns(region: Region, turns: int) -> None:
+def test_a_region_shares_all_with_itself_rotated_by_full_turns(region: Region, turns: int) -> None:
     again = Region(region.center_m, region.size_m, region.angle_rad + turns * 2 * math.pi)
     assert intersection_ratio(region, again) == pytest.approx(1.0, rel=1e-9)
     np.testing.assert_allclose(intersection_center_m(region, again), region.center_m, atol=1e-9 * UM)
 
 
 @given(regions(st.just(0.0)), regions(st.just(0.0)))
-def test_upright_ones_share_the_product_of_what_their_sides_share(a: Region, b: Region) -> None:
+def test_upright_regions_share_the_product_of_their_shared_sides(a: Region, b: Region) -> None:
     shared = [
         max(0.0, min(c + s / 2, d + t / 2) - max(c - s / 2, d - t / 2))
         for c, s, d, t in zip(a.center_m, a.size_m, b.center_m, b.size_m, strict=True)
@@ -62,14 +62,14 @@ def test_upright_ones_share_the_product_of_what_their_sides_share(a: Region, b: 
 
 
 @given(regions(), regions())
-def test_what_is_shared_lies_in_both(a: Region, b: Region) -> None:
+def test_the_shared_polygon_lies_in_both_regions(a: Region, b: Region) -> None:
     for region in (a, b):
         wider = Region(region.center_m, (region.size_m[0] + 1e-8 * UM, region.size_m[1] + 1e-8 * UM), region.angle_rad)
         assert all(wider.contains((x, y)) for x, y in intersection_m(a, b))
 
 
 @given(regions(), regions())
-def test_its_area_is_that_of_points_thrown_at_it(a: Region, b: Region) -> None:
+def test_the_shared_area_matches_a_monte_carlo_estimate(a: Region, b: Region) -> None:
     points = np.stack([np.ravel(axis) for axis in a.pixels_m((60, 60))], axis=1)
     inside = np.array([b.contains((x, y)) for x, y in points])
     area_m2 = a.size_m[0] * a.size_m[1]
@@ -80,7 +80,7 @@ def test_its_area_is_that_of_points_thrown_at_it(a: Region, b: Region) -> None:
         np.testing.assert_allclose(intersection_center_m(a, b), expected, atol=0.03 * max(a.size_m))
 
 
-def test_an_octagon() -> None:
+def test_two_squares_at_45_degrees_share_an_octagon() -> None:
     square = Region((1 * UM, 2 * UM), (2 * UM, 2 * UM))
     turned = Region((1 * UM, 2 * UM), (2 * UM, 2 * UM), math.pi / 4)
     assert len(intersection_m(square, turned)) == 8
@@ -101,20 +101,20 @@ def test_regions_of_different_frames_are_not_compared() -> None:
 
 
 @given(regions(), lengths, lengths)
-def test_what_moved_along_with_the_sample_is_all_seen_again(region: Region, x: float, y: float) -> None:
+def test_a_region_that_moves_with_the_sample_overlaps_completely(region: Region, x: float, y: float) -> None:
     displacement = np.array([x, y]) * UM
     after = region.moved_to((region.center_m[0] + x * UM, region.center_m[1] + y * UM))
     assert overlap_ratio(region, after, displacement) == pytest.approx(1.0, rel=1e-9)
     np.testing.assert_allclose(overlap_center_m(region, after, displacement), region.center_m, atol=1e-9 * UM)
 
 
-def test_the_middle_of_the_overlap_is_told_where_the_reference_saw_it() -> None:
+def test_the_middle_of_the_overlap_is_in_the_reference_s_coordinates() -> None:
     region = Region((0, 0), (2 * UM, 2 * UM))
     np.testing.assert_allclose(overlap_center_m(region, region, (0.5 * UM, 0.0)), (-0.25 * UM, 0.0), atol=1e-12 * UM)
 
 
 @given(regions(), regions(), st.tuples(*[st.integers(2, 600)] * 2), st.tuples(*[st.integers(2, 600)] * 2))
-def test_resolutions_are_compared_alike_from_both_sides(
+def test_the_ratio_of_resolutions_is_symmetric(
     a: Region, b: Region, shape_a: tuple[int, int], shape_b: tuple[int, int]
 ) -> None:
     assert sr_norm(a, shape_a, b, shape_b) == sr_norm(b, shape_b, a, shape_a)

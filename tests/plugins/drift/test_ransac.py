@@ -34,7 +34,7 @@ def points(seed: int, count: int = 30) -> np.ndarray:
 @pytest.mark.parametrize("name", FORMS)
 @settings(max_examples=30)
 @given(numbers=st.tuples(small, small, small, small), seed=st.integers(0, 1000))
-def test_what_made_the_points_is_found_among_wrong_pairs(
+def test_the_true_transform_is_found_among_wrong_pairs(
     name: str, numbers: tuple[float, float, float, float], seed: int
 ) -> None:
     a, form = points(seed), FORMS[name]
@@ -65,18 +65,18 @@ def test_points_on_a_line_do_not_determine_an_affine_transform() -> None:
     assert fitted(line, line + 0.1, FORMS["affine"], 0.1) is None
 
 
-def test_what_bends_more_than_a_drift_can_is_no_transform() -> None:
+def test_a_transform_that_bends_more_than_drift_is_refused() -> None:
     a = points(3)
     assert fitted(a, a * 1.3, FORMS["similarity"], 0.2) is None
     assert fitted(a, a * 1.1, FORMS["similarity"], 0.2) is not None
 
 
-def test_no_pairs_no_consensus() -> None:
+def test_no_pairs_give_no_consensus() -> None:
     search = Search(FORMS["translation"], 10, 0.1, np.random.default_rng(0))
     assert search.among(np.empty((0, 2)), np.empty((0, 2)), 1.0) is None
 
 
-def test_tightening_gets_rid_of_what_the_wide_radius_let_in() -> None:
+def test_tightening_removes_mismatches_within_the_wide_radius() -> None:
     a = points(4, 60)
     b = a + np.random.default_rng(1).normal(0.0, 0.002, a.shape)
     b[:15, 0] += 0.08
@@ -91,15 +91,15 @@ def test_tightening_gets_rid_of_what_the_wide_radius_let_in() -> None:
 
 
 @given(st.integers(10, 400), st.integers(2, 60))
-def test_more_that_agree_are_less_likely_chance(pairs: int, inliers: int) -> None:
+def test_more_inliers_are_less_likely_by_chance(pairs: int, inliers: int) -> None:
     inliers = min(inliers, pairs // 5)
     few, more = (log10_false_alarms(pairs, k, 1, 1e-3) for k in (inliers, inliers + 1))
     assert more < few
     assert log10_false_alarms(pairs, 1, 1, 1e-3) == math.inf
 
 
-def test_false_alarms_are_as_rare_as_they_are_said_to_be() -> None:
-    """Pairs with nothing in common, in a unit square: their displacements' density is at most 1."""
+def test_false_alarms_have_the_computed_frequency() -> None:
+    """Unrelated pairs, in a unit square: the density of their displacements is at most 1."""
     random, radius, said = np.random.default_rng(7), 0.05, 0
     search = Search(FORMS["translation"], 100, 0.1, random)
     for _ in range(60):
@@ -110,7 +110,7 @@ def test_false_alarms_are_as_rare_as_they_are_said_to_be() -> None:
     assert said <= 12
 
 
-def test_the_jackknife_tells_the_scatter_of_the_result() -> None:
+def test_the_jackknife_matches_the_scatter_of_the_result() -> None:
     form, shifts, variances = FORMS["translation"], [], []
     for seed in range(200):
         random = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""Pairs of scans of a real microscope, the drift between which is known from other channels and exhaustive search."""
+"""Pairs of scans of a real microscope, with the drift known from other channels and exhaustive search."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ PMN = ("PMN28Pt0001", "PMN28Pt0002")
         (*PMN, "DeflectionRetrace", (-5.2, 13.2)),
     ],
 )
-def test_the_drift_is_found(
+def test_the_drift_between_real_scans_is_found(
     registered: Registered, reference: str, scan: str, channel: str, expected_px: tuple[float, float]
 ) -> None:
     found, shift_px = registered(reference, scan, channel)
@@ -67,13 +67,13 @@ def test_the_drift_is_found(
     assert np.hypot(*(shift_px - expected_px)) < 1.0
 
 
-def test_two_steps_are_as_far_as_one(registered: Registered) -> None:
+def test_two_registrations_add_up_to_one(registered: Registered) -> None:
     first, second, both = (registered(a, b)[1] for a, b in ((PZT[0], PZT[1]), (PZT[1], PZT[2]), (PZT[0], PZT[2])))
     assert np.hypot(*(first + second - both)) < 0.3
 
 
-def test_the_way_back_is_the_way_there(registered: Registered) -> None:
-    """Both scans are treated alike; only where the displacement holds differs."""
+def test_swapping_the_scans_reverses_the_displacement(registered: Registered) -> None:
+    """Both scans are treated alike; only the place of the displacement differs."""
     there, back = registered(*PMN)[0], registered(*PMN[::-1])[0]
     at_m = there.center_m + there.displacement_m
     back_m = back.displacement_m + back.linear @ (at_m - back.center_m)
@@ -95,7 +95,7 @@ def test_scans_of_different_samples_are_refused(registered: Registered, referenc
     assert found.reason
 
 
-def test_a_channel_that_holds_too_little_is_refused(registered: Registered) -> None:
+def test_a_channel_with_too_little_information_is_refused(registered: Registered) -> None:
     found, _ = registered(*PMN, "PhaseRetrace")
     assert not found.accepted
     assert found.reason

@@ -1,4 +1,4 @@
-"""The table of a run comes back from its file as it was."""
+"""The table of a run is read back from its file unchanged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from afspm.plugins.drift.record import DriftRecord
 
 
 def record(n: int = 20, seed: int = 1) -> DriftRecord:
-    """Of a scan every 15 minutes, followed to a few nm."""
+    """Return the record of a scan every 15 minutes, followed to a few nm."""
     random = np.random.default_rng(seed)
     drift = np.cumsum(random.normal(10e-9, 5e-9, (n, 2)), axis=0)
     spread = np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-18
@@ -33,7 +33,7 @@ def record(n: int = 20, seed: int = 1) -> DriftRecord:
     )
 
 
-def test_the_rate_during_a_first_scan_is_what_the_next_tells_unless_it_was_known() -> None:
+def test_an_unknown_rate_of_the_first_scan_is_the_rate_of_the_second() -> None:
     known = record(3)
     np.testing.assert_array_equal(known.rate_then_m_s, known.rate_m_s)
     rates = known.rate_m_s.copy()
@@ -43,7 +43,7 @@ def test_the_rate_during_a_first_scan_is_what_the_next_tells_unless_it_was_known
     np.testing.assert_array_equal(begun[:1].rate_then_m_s, [(0.0, 0.0)])
 
 
-def test_a_record_that_was_written_is_read_as_it_was(tmp_path: Path) -> None:
+def test_a_written_record_is_read_back_unchanged(tmp_path: Path) -> None:
     written = record()
     written.write(tmp_path / "drift.csv")
     read = DriftRecord.read(tmp_path / "drift.csv")
@@ -55,7 +55,7 @@ def test_a_record_that_was_written_is_read_as_it_was(tmp_path: Path) -> None:
     assert np.abs(read.time_s - written.time_s).max() < 1e-5
 
 
-def test_what_correction_left_over_is_the_drift_that_was_not_followed() -> None:
+def test_misplacement_is_the_drift_that_was_not_followed() -> None:
     followed = record()
     expected = (followed.drift_m - followed.drift_m[0]) - (followed.center_m - followed.center_m[0])
     np.testing.assert_allclose(followed.misplacement_m, expected)
@@ -63,14 +63,14 @@ def test_what_correction_left_over_is_the_drift_that_was_not_followed() -> None:
     assert len(followed[3:8]) == 5
 
 
-def test_the_drift_of_a_mapping_that_turns_depends_on_where_the_tip_is() -> None:
+def test_the_drift_of_a_rotating_mapping_depends_on_the_tip_position() -> None:
     matrix = np.array([[1.0, -0.01, -5e-9], [0.01, 1.0, 0.0], [0.0, 0.0, 1.0]])
     np.testing.assert_allclose(drift_at(matrix, (0.0, 0.0)), (5e-9, 0.0))
     np.testing.assert_allclose(drift_at(matrix, (0.0, 1e-6)), (15e-9, 0.0), atol=1e-20)
 
 
 @pytest.mark.parametrize("content", ["", "time,x\n1,2\n", "scan,time_s\na,b\n"])
-def test_a_file_that_is_no_table_of_drift_is_told(tmp_path: Path, content: str) -> None:
+def test_a_file_without_a_table_of_drift_is_refused(tmp_path: Path, content: str) -> None:
     path = tmp_path / "other.csv"
     path.write_text(content, encoding="utf-8")
     if content:

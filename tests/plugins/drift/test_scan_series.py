@@ -1,4 +1,4 @@
-"""`afspm drift FILE…`: which scans of files are followed, what is told and what is written."""
+"""`afspm drift FILE…`: the choice of scans, the output, and the files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def content(*channels: str, end_s: float | None = 100.0, pixels: int = 8, name: 
     return FileContent("test", scans, start_ns=None if end_ns is None else end_ns - 10**11, end_ns=end_ns, upwards=True)
 
 
-def test_scans_of_the_topography_come_in_the_order_of_time_with_what_their_files_say() -> None:
+def test_scans_of_the_topography_are_in_order_of_time_with_times_and_directions_of_their_files() -> None:
     found = series([content("Phase", "Height", end_s=1000.0, name="b.nc"), content("Height", "Phase")])
     assert found.channel == "Height"
     assert [one.key for one in found.scans] == ["a.nc", "b.nc"]
@@ -40,7 +40,7 @@ def test_scans_of_the_topography_come_in_the_order_of_time_with_what_their_files
 BROKEN_OFF = "e.nc: it was broken off: 3 of 8 lines are missing"
 
 
-def test_what_cannot_be_followed_is_told_and_the_rest_goes_on() -> None:
+def test_unusable_files_are_reported_and_the_others_followed() -> None:
     others = [content("Height", end_s=None, name="c.nc"), content("Height", pixels=1, name="d.nc")]
     others.append(content("Height", name="e.nc"))
     others[-1].scans[0].values[5:] = np.nan
@@ -49,7 +49,7 @@ def test_what_cannot_be_followed_is_told_and_the_rest_goes_on() -> None:
     assert found.left_out == ("c.nc: it does not say when it was taken", "d.nc: 1 x 1 pixels", BROKEN_OFF)
 
 
-def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
+def test_a_channel_without_two_scans_is_refused_with_the_existing_channels() -> None:
     with pytest.raises(InvalidValue, match=r"'Phase'.*in it: Height, Phase"):
         series([content("Height"), content("Phase")], "Phase")
     with pytest.raises(InvalidValue, match="no scan of a topography"):
@@ -58,7 +58,7 @@ def test_a_channel_without_two_scans_is_refused_with_those_there_are() -> None:
 
 @pytest.fixture
 def run_folder(tmp_path: Path) -> Path:
-    """Six scans of a sample that drifts, as the simulated microscope saves them, and a file that is broken."""
+    """Six scans of a drifting sample, as the simulated microscope saves them, and a broken file."""
     settings = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (*VELOCITY_M_S, 0.0)}}
     world = World.from_settings(settings, seed=1, start_s=0.0)
     folder = tmp_path / "run"
@@ -74,7 +74,7 @@ def run_folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.timeout(60)
-def test_a_run_folder_is_followed_told_and_drawn(run_folder: Path, tmp_path: Path) -> None:
+def test_a_run_folder_is_followed_printed_and_drawn(run_folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     line = ["drift", str(run_folder), "-o", str(output), "-j", "2", "--estimator", "correlation", "--tracker", "paper"]
     done = CliRunner().invoke(app, line, env={"COLUMNS": "100"})
@@ -91,7 +91,7 @@ def test_a_run_folder_is_followed_told_and_drawn(run_folder: Path, tmp_path: Pat
     np.testing.assert_allclose(estimates.drift_m[1:], expected[1:], atol=1e-6 / PIXELS)
 
 
-def test_files_of_which_none_can_be_read_end_with_an_error(tmp_path: Path) -> None:
+def test_only_unreadable_files_end_with_an_error(tmp_path: Path) -> None:
     broken = tmp_path / "a.sxm"
     broken.write_bytes(b"nothing")
     done = CliRunner().invoke(app, ["drift", "--channel", "Z", str(broken), str(tmp_path / "missing.ibw")])

@@ -1,4 +1,4 @@
-"""An up frame followed by a down frame tells the absolute velocity of the drift."""
+"""The absolute velocity of drift from an up frame and a down frame."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ VELOCITY = np.array([0.11, -0.07]) * NM
 
 
 class Lattice:
-    """Sees the exact shear, and a displacement that is off by sites unless it knows better."""
+    """Measures the exact shear, and a displacement that is off by lattice sites without a close prior."""
 
     def __init__(self, velocity_m_s: Array, *, spacing_m: float = np.inf, sd_m: float = 0.1 * NM) -> None:
         self.velocity_m_s = velocity_m_s
@@ -35,7 +35,7 @@ class Lattice:
         self.priors: list[Prior | None] = []
 
     def matrix(self, scan: DriftScan, freed_m_s: Array) -> Array:
-        """From where features are at the middle to where they are found, about the centre."""
+        """Return the map from a feature's place at the middle to its measured place, about the centre."""
         a = delay_per_length_s_m(scan)
         assert a is not None
         return np.asarray(np.linalg.inv(np.eye(2) - a * np.outer(self.velocity_m_s - freed_m_s, slow_axis(scan))))
@@ -65,7 +65,7 @@ def frames(angle_rad: float = 0.0, *, up_first: bool = True) -> tuple[DriftScan,
     return turn[0], turn[1]
 
 
-def test_rows_are_taken_when_the_direction_says() -> None:
+def test_row_times_follow_the_scan_direction() -> None:
     up = scan_at(1000.0, (0.0, 1e-6))
     top = np.array([0.0, 1e-6 + SIZE_M / 2])
     assert row_delay_s(up, top) == pytest.approx(FRAME_S / 2)
@@ -73,7 +73,7 @@ def test_rows_are_taken_when_the_direction_says() -> None:
     assert row_delay_s(replace(up, upwards=None), top) is None
 
 
-def test_the_rows_of_a_turned_scan_follow_its_own_axis() -> None:
+def test_the_rows_of_a_rotated_scan_follow_its_own_axis() -> None:
     scan = scan_at(1000.0)
     turned = replace(scan, region=replace(scan.region, angle_rad=np.pi / 2))
     assert row_delay_s(turned, np.array([-SIZE_M / 2, 0.7e-6])) == pytest.approx(FRAME_S / 2)
@@ -82,7 +82,7 @@ def test_the_rows_of_a_turned_scan_follow_its_own_axis() -> None:
 @pytest.mark.parametrize("up_first", [True, False])
 @pytest.mark.parametrize("angle_rad", [0.0, 0.6, 3.0])
 @pytest.mark.parametrize("pixels_per_frame", [0.5, 2.0, 20.0])
-def test_the_shear_tells_the_velocity(angle_rad: float, pixels_per_frame: float, *, up_first: bool) -> None:
+def test_the_shear_gives_the_velocity(angle_rad: float, pixels_per_frame: float, *, up_first: bool) -> None:
     velocity = VELOCITY / np.linalg.norm(VELOCITY) * pixels_per_frame * SIZE_M / 128 / FRAME_S
     first, second = frames(angle_rad, up_first=up_first)
     sheared = velocity_by_shear(first, second, Lattice(velocity).register(first, second))
@@ -90,7 +90,7 @@ def test_the_shear_tells_the_velocity(angle_rad: float, pixels_per_frame: float,
     assert sheared[0] == pytest.approx(velocity, rel=1e-6)
 
 
-def test_scans_in_one_direction_do_not_tell_it() -> None:
+def test_scans_in_one_direction_give_no_velocity() -> None:
     first, second = frames()
     second = replace(second, upwards=True)
     assert velocity_by_shear(first, second, Lattice(VELOCITY).register(first, second)) is None
@@ -121,7 +121,7 @@ def test_uncertainty_of_the_shear_covers_a_duration_that_counts_the_last_row() -
 
 
 def test_the_shear_resolves_a_lattice() -> None:
-    """A drift of more than half a lattice constant between the frames, so the nearest site is a wrong one."""
+    """The drift between the frames is more than half a lattice constant, so the nearest site is a wrong one."""
     lattice = Lattice(VELOCITY, spacing_m=30 * NM, sd_m=0.02 * NM)
     found = velocity_from_up_down(*frames(), lattice)
     assert lattice.priors[0] is None
@@ -129,7 +129,7 @@ def test_the_shear_resolves_a_lattice() -> None:
     assert found.velocity_m_s == pytest.approx(VELOCITY, rel=1e-3)
 
 
-def test_a_contradiction_is_refused() -> None:
+def test_contradicting_shear_and_displacement_are_refused() -> None:
     class Mistaken(Lattice):
         def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
             found = super().register(reference, scan, prior)
@@ -140,7 +140,7 @@ def test_a_contradiction_is_refused() -> None:
     assert "contradicts" in found.reason
 
 
-def test_what_can_not_be_registered_gives_its_reason() -> None:
+def test_a_refused_velocity_has_the_reason_of_the_registration() -> None:
     class Blind:
         def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
             return Registration.refused("nothing in common")
@@ -152,7 +152,7 @@ def test_what_can_not_be_registered_gives_its_reason() -> None:
 
 
 def test_a_tracker_notices_an_up_frame_followed_by_a_down_frame() -> None:
-    """On a lattice, the displacement alone would be that to the nearest site."""
+    """On a lattice, the displacement alone would lead to the nearest site."""
     following = BankTracker(Lattice(VELOCITY, spacing_m=30 * NM, sd_m=0.02 * NM))
     for scan in frames():
         update = following.add(scan)

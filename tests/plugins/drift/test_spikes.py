@@ -1,4 +1,4 @@
-"""Pixels that one scan alone has, and rows that are missing, do not move what the default estimator finds."""
+"""Spikes in only one scan, and missing rows, don't move the result of the default estimator."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def off_px(made: Pair, found: Registration) -> float:
 
 
 def rms_px(worse: dict[str, float], seed: int = 0) -> float:
-    """Of errors in some pairs, with so much spoiled: shares of the pixels and of the rows."""
+    """Return the rms error over some pairs with these shares of spoiled pixels and rows."""
     random = np.random.default_rng(seed)
 
     def spoiled(scan: DriftScan) -> DriftScan:
@@ -48,7 +48,7 @@ def scene(first: Array, second: Array) -> Scene:
     return Scene(Image(first, known), Image(second, known))
 
 
-def test_what_both_scans_have_is_no_spike_and_what_one_has_is_mended() -> None:
+def test_a_feature_of_both_scans_is_no_spike_and_a_spike_of_one_is_mended() -> None:
     random = np.random.default_rng(5)
     surface = np.zeros((64, 80))
     surface[20, 30] = surface[40, 61] = 1.0  # particles of one pixel, that the second scan sees 3 px to the right
@@ -66,7 +66,7 @@ def test_what_both_scans_have_is_no_spike_and_what_one_has_is_mended() -> None:
     assert abs(both.second.values[10, 50] - second[10, 50]) < 0.1
 
 
-def test_a_row_that_is_missing_alone_is_known_from_those_beside_it() -> None:
+def test_a_single_missing_row_is_interpolated_from_its_neighbours() -> None:
     y, x = np.mgrid[:64, :64].astype(float)
     whole = np.sin(x / 5) * np.cos(y / 7)
     values = whole.copy()

@@ -1,4 +1,4 @@
-"""Scans taken while the sample moves lie on top of each other in the stack."""
+"""Scans taken while the sample moves are aligned in the stack."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def scan(
     angle_rad: float = 0.0,
     upwards: bool | None = True,
 ) -> DriftScan:
-    """Of the landscape, with the sample displaced by `drift_m` in the middle of 100 s."""
+    """Return a scan of the landscape, with the sample displaced by `drift_m` in the middle of 100 s."""
     region = Region(center_m, (1e-6, 0.8e-6), angle_rad)
     shape = (51, 64)
     x, y = region.pixels_m(shape)
@@ -43,7 +43,7 @@ def scan(
 
 @pytest.mark.parametrize("angle_rad", [0.0, math.radians(35)])
 @pytest.mark.parametrize("upwards", [True, False])
-def test_scans_that_drifted_and_were_distorted_by_it_show_the_same_place(angle_rad: float, upwards: bool) -> None:
+def test_drift_distorted_scans_show_the_same_place_in_the_stack(angle_rad: float, upwards: bool) -> None:
     drifts, rates = [(0.0, 0.0), (80e-9, -50e-9), (-30e-9, 120e-9)], [(0.0, 0.0), (0.3e-9, 0.4e-9), (-0.5e-9, 0.2e-9)]
     scans = [
         scan(drift, rate, angle_rad=angle_rad, upwards=upwards, center_m=(50e-9 * k, 0.0))
@@ -59,7 +59,7 @@ def test_scans_that_drifted_and_were_distorted_by_it_show_the_same_place(angle_r
     assert np.abs(still.values[1][inner] - truth).max() > 0.1, "without the rate the rows lie elsewhere"
 
 
-def test_the_stack_covers_what_all_scans_show_with_the_pixels_of_the_first() -> None:
+def test_the_stack_covers_the_common_area_with_the_pixels_of_the_first() -> None:
     stack = corrected([scan((0.0, 0.0)), scan((200e-9, 0.0))], np.array([(0.0, 0.0), (200e-9, 0.0)]))
     (left, _), (width, height) = stack.region.top_left_m, stack.region.size_m
     assert width == pytest.approx(0.8e-6, abs=PIXEL_M)
@@ -68,7 +68,7 @@ def test_the_stack_covers_what_all_scans_show_with_the_pixels_of_the_first() -> 
     assert width / (stack.values.shape[2] - 1) == pytest.approx(PIXEL_M)
 
 
-def test_what_was_not_measured_stays_empty_in_the_stack() -> None:
+def test_unmeasured_pixels_stay_empty_in_the_stack() -> None:
     holed = scan((0.0, 0.0))
     holed.values[:10] = np.nan
     stack = corrected([holed, scan((0.0, 0.0))], np.zeros((2, 2)))
@@ -84,7 +84,7 @@ def test_scans_without_a_common_area_and_of_different_angles_are_refused() -> No
         corrected([scan((0.0, 0.0)), scan((0.0, 0.0), angle_rad=0.1)], np.zeros((2, 2)))
 
 
-def test_a_stack_that_was_written_opens_with_its_coordinates(tmp_path: Path) -> None:
+def test_a_written_stack_opens_with_its_coordinates(tmp_path: Path) -> None:
     xarray = pytest.importorskip("xarray")
     stack = corrected([scan((0.0, 0.0)), scan((0.0, 0.0))], np.zeros((2, 2)))
     stack.write(tmp_path / "stack.nc", channel="Height", unit="m")

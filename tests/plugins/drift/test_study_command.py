@@ -22,7 +22,7 @@ def test_a_study_names_the_best_and_judges_the_defaults() -> None:
     assert "The defaults" in output
 
 
-def test_settings_that_fail_are_told_and_the_others_go_on() -> None:
+def test_failing_settings_are_reported_and_the_others_go_on() -> None:
     output = told(*SMALL, "tracker=bank,paper", "paper.queue=0", "-n", "2", "-j", "1")
     assert "tracker=paper: 2 nights failed" in output
     assert "The defaults are the best." in output

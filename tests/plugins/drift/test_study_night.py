@@ -1,4 +1,4 @@
-"""A simulated night: what is measured of it is what happened."""
+"""A simulated night: its metrics match its events."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SMALL: dict[str, Any] = {"pixels": 32, "hours": 2.0, "surface": "particles", "si
 
 
 class Still:
-    """An estimator that says that nothing has moved."""
+    """An estimator whose displacement is always zero."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         followed = np.subtract(scan.region.center_m, reference.region.center_m)
@@ -30,7 +30,7 @@ class Still:
 
 
 class Blind:
-    """An estimator that never sees anything."""
+    """An estimator that refuses every pair."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         return Registration.refused("nothing to be seen")
@@ -40,7 +40,7 @@ def settings(**names: Any) -> NightSettings:
     return NightSettings.of(SMALL | names)
 
 
-def test_a_night_that_is_followed_keeps_its_place() -> None:
+def test_a_followed_night_keeps_its_place() -> None:
     followed = night(settings(pixels=64, estimator="correlation", drift_m=0.5e-6), seed=3)
     still = night(settings(estimator=f"{__name__}.Still", drift_m=0.5e-6), seed=3)
     assert followed.record.matched.all()
@@ -49,7 +49,7 @@ def test_a_night_that_is_followed_keeps_its_place() -> None:
     assert np.abs(followed.unknown_m).max() < 16e-9, "a pixel"
 
 
-def test_who_believes_that_nothing_moves_is_wrong_by_all_that_has_moved() -> None:
+def test_an_estimator_without_motion_is_off_by_the_whole_drift() -> None:
     wrong = night(settings(estimator=f"{__name__}.Still"), seed=1)
     np.testing.assert_allclose(wrong.misplaced_m, np.hypot(*wrong.truth_m.T), atol=1e-15)
     np.testing.assert_allclose(wrong.unknown_m, -wrong.truth_m, atol=1e-15)
@@ -60,7 +60,7 @@ def test_who_believes_that_nothing_moves_is_wrong_by_all_that_has_moved() -> Non
     assert told["rescans"] == told["refused"] == 0.0
 
 
-def test_who_sees_nothing_is_lost_and_says_so() -> None:
+def test_an_estimator_that_refuses_everything_is_lost() -> None:
     blind = night(settings(estimator=f"{__name__}.Blind"), seed=1)
     assert blind.lost
     assert blind.metrics()["refused"] == len(blind.record) - 1
@@ -73,7 +73,7 @@ def test_the_same_seed_is_the_same_night_for_all_settings() -> None:
 
 
 @pytest.mark.parametrize("rule", ["paper", "tolerance"])
-def test_a_scan_that_is_too_far_off_is_taken_again(rule: str) -> None:
+def test_a_scan_too_far_off_is_taken_again(rule: str) -> None:
     jumping = {"estimator": "correlation", "pixels": 64, "drift_m": 3e-6, "every_s": 900.0, "hours": 1.5}
     told = {"f_rescan": 0.95, "tolerance_m": 30e-9}
     again = night(settings(**jumping, **told, rescan=rule), seed=3)

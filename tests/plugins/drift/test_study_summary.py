@@ -1,4 +1,4 @@
-"""Settings are judged by where scans are taken, and the defaults by the spread of the best."""
+"""Settings are ranked by the misplacement of scans, and the defaults are judged by the spread of the best."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_defaults_worse_than_the_spread_of_the_best_do_not_hold() -> None:
     assert not rows[-1].holds
 
 
-def test_a_night_that_was_lost_counts_as_infinitely_bad_and_one_that_failed_is_told() -> None:
+def test_a_lost_night_counts_as_infinitely_bad_and_a_failed_one_is_reported() -> None:
     metrics = {"defaults": nights(1, 1, 1, lost=2), "other": nights(3, 3, 3)}
     rows = summarised(["defaults", "other", "none"], metrics, {"none": ["no such tracker"]})
     assert [row.label for row in rows] == ["other", "defaults", "none"]

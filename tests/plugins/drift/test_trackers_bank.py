@@ -1,4 +1,4 @@
-"""The default tracker: near the best there is, not thrown off, lost and found, in any place and at any size."""
+"""The default tracker: near the optimum, robust to wrong pairs, lost and found, at any place and size."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STEADY = steady((0.05 * NM, -0.03 * NM))
 
 
 def night(seed: int, walk_m: float = NM) -> Drift:
-    """Relaxations of hours and of half an hour, a day's wave, and a random walk of so much in 15 minutes."""
+    """Relaxations of hours and of half an hour, a day's wave, and a random walk of this step in 15 minutes."""
     random = np.random.default_rng(seed)
     slow, fast, daily = (v / np.linalg.norm(v) for v in random.standard_normal((3, 2)))
     times_s = np.arange(0.0, 120 * INTERVAL_S, 60.0)
@@ -38,7 +38,7 @@ def night(seed: int, walk_m: float = NM) -> Drift:
 
 
 def error_m(world: World, prediction: Prediction, start_s: float = FRAME_S) -> Array:
-    """What it says less the truth; positions are counted from the first scan."""
+    """Return the estimate minus the truth; positions are counted from the first scan."""
     drift = world.drift_m(prediction.time_s) - world.drift_m(start_s)
     return np.asarray(-prediction.mapping.translation_m - drift)
 
@@ -54,8 +54,8 @@ def nights() -> list[tuple[World, list[Update]]]:
     return [(world, follow(BankTracker(world), 60)) for world in worlds]
 
 
-def test_it_predicts_better_than_the_last_step_does(nights: list[tuple[World, list[Update]]]) -> None:
-    """Late misplacement of the same nights: at most 0.85 of the paper's scheme with the same estimator."""
+def test_the_bank_predicts_better_than_the_last_step(nights: list[tuple[World, list[Update]]]) -> None:
+    """Late misplacement in the same nights: at most 0.85 of the paper's scheme with the same estimator."""
     late: dict[type, list[Array]] = {BankTracker: [], PaperTracker: []}
     for seed, (world, updates) in enumerate(nights[:3]):
         late[BankTracker] += [error_m(world, update.before) for update in updates[8:]]
@@ -65,8 +65,8 @@ def test_it_predicts_better_than_the_last_step_does(nights: list[tuple[World, li
     assert rms_m(late[BankTracker]) < 0.85 * rms_m(late[PaperTracker])
 
 
-def test_it_knows_how_well_it_knows(nights: list[tuple[World, list[Update]]]) -> None:
-    """Neither over-confident nor careless, before a scan and after it."""
+def test_the_bank_knows_its_own_uncertainty(nights: list[tuple[World, list[Update]]]) -> None:
+    """Neither over-confident nor over-cautious, before a scan and after it."""
     before, after = [], []
     for world, updates in nights:
         for update in updates[8:]:
@@ -78,20 +78,20 @@ def test_it_knows_how_well_it_knows(nights: list[tuple[World, list[Update]]]) ->
 
 
 class WorldByRows(World):
-    """A scan shows the sample where it was in the mean of its rows."""
+    """A scan shows the sample at the mean of its displacement over the rows."""
 
     def _seen(self, scan: DriftScan, position_m: Array) -> Array:
         return super()._seen(scan, position_m) + self.shown_m(scan) - self.drift_m(scan.mid_s)
 
     def shown_m(self, scan: DriftScan) -> Array:
-        """(2,) the mean of the displacement over the rows."""
+        """Return the mean (2,) of the displacement over the rows."""
         times_s = np.linspace(scan.start_s, scan.end_s, 65)
         return np.asarray(np.mean([self.drift_m(float(t)) for t in times_s], axis=0))
 
 
 @pytest.mark.parametrize("walk_m", [1 * NM, 4 * NM])
-def test_it_knows_what_the_sample_wanders_during_a_scan(walk_m: float) -> None:
-    """Told after a scan is where the sample was in the middle of it, but the scan shows the mean of its rows."""
+def test_the_bank_counts_the_wandering_of_the_sample_during_a_scan(walk_m: float) -> None:
+    """The estimate is for the middle of a scan, but the scan shows the mean over its rows."""
     chi2 = []
     for seed in range(6):
         world = WorldByRows(night(seed, walk_m), noise_m=0.05 * NM, seed=seed)
@@ -108,7 +108,7 @@ def test_errors_do_not_accumulate() -> None:
     assert rms_m([error_m(world, update.after) for update in updates[-20:]]) < 1.0 * NM
 
 
-def test_the_first_scan_is_where_positions_are_counted_from() -> None:
+def test_positions_are_counted_from_the_first_scan() -> None:
     update = BankTracker(World(STEADY)).add(scan_at(5000.0))
     assert update.matched
     assert not update.lost
@@ -118,8 +118,8 @@ def test_the_first_scan_is_where_positions_are_counted_from() -> None:
 
 
 @pytest.mark.parametrize("upwards", [True, False])
-def test_an_overlap_off_the_middle_biases_nothing(*, upwards: bool) -> None:
-    """At a fifth of the frame from its middle, what drifts by 26 nm a frame is 5 nm further."""
+def test_an_overlap_off_the_middle_gives_no_bias(*, upwards: bool) -> None:
+    """A fifth of the frame from its middle, a sample that drifts by 26 nm a frame is 5 nm further."""
     world = World(steady((0.0, 0.1 * NM)), noise_m=0.0)
     following = BankTracker(world)
     for k, offset in enumerate((0.0, 0.4, -0.4, 0.3, -0.3)):
@@ -130,7 +130,7 @@ def test_an_overlap_off_the_middle_biases_nothing(*, upwards: bool) -> None:
     assert update.after.rate_m_s == pytest.approx((0.0, 0.1 * NM), abs=1e-3 * NM)
 
 
-def test_a_direction_that_is_not_known_is_no_bias_but_uncertainty() -> None:
+def test_an_unknown_direction_gives_uncertainty_and_no_bias() -> None:
     world = World(steady((0.0, 0.1 * NM)), noise_m=0.0)
     errors, deviations = [], []
     following = BankTracker(world)
@@ -184,7 +184,7 @@ def test_a_jump_that_stays_is_believed_the_second_time() -> None:
     assert np.linalg.norm(error_m(world, updates[22].before)) < 15.0 * NM
 
 
-def test_it_says_when_it_is_lost_and_finds_itself_again() -> None:
+def test_a_lost_bank_reports_it_and_recovers() -> None:
     jump = np.array([900.0, -500.0]) * NM
     unusable = {f"scan {k}" for k in (11, 12, 13)}
     world = World(lambda t: STEADY(t) + (t > 10.5 * INTERVAL_S) * jump, blind=unusable)
@@ -201,7 +201,7 @@ def test_it_says_when_it_is_lost_and_finds_itself_again() -> None:
     assert all(prior is None for prior in searched)
 
 
-def test_scans_that_could_not_match_anything_do_not_make_it_lost_soon() -> None:
+def test_scans_without_comparable_references_do_not_make_the_bank_lost_soon() -> None:
     following = BankTracker(World())
     follow(following, 8)
     for k in range(3):
@@ -212,7 +212,7 @@ def test_scans_that_could_not_match_anything_do_not_make_it_lost_soon() -> None:
         assert update.reason == "no earlier scan of this part of the sample is stored"
 
 
-def test_it_is_lost_when_positions_are_too_uncertain() -> None:
+def test_the_bank_is_lost_when_positions_are_too_uncertain() -> None:
     world = World(night(4))
     following = BankTracker(world)
     follow(following, 3)
@@ -234,7 +234,7 @@ def test_a_jump_of_half_a_scan_is_found_at_once_and_believed_the_second_time() -
 
 
 def far_jump(distance_m: float) -> World:
-    """The sample jumps so far between scans 10 and 11 that the next ones share nothing with those before."""
+    """Return a sample that jumps so far between scans 10 and 11 that later scans share nothing with earlier ones."""
     jump = np.array([distance_m, 0.0])
     return World(lambda t: STEADY(t) + (t > 10.5 * INTERVAL_S) * jump)
 
@@ -252,7 +252,7 @@ def test_scans_that_match_only_each_other_do_not_count_as_found(frames: float) -
     assert "scan 0" in updates[29].registrations
 
 
-def test_after_a_far_jump_one_scan_that_shows_an_old_place_puts_all_right() -> None:
+def test_after_a_far_jump_one_scan_of_an_old_place_corrects_all() -> None:
     world = far_jump(0.9 * SIZE_M)
     following = BankTracker(world)
     follow(following, 20)
@@ -269,8 +269,8 @@ def test_after_a_far_jump_one_scan_that_shows_an_old_place_puts_all_right() -> N
     assert np.linalg.norm(error_m(world, updates[-1].after)) < 2.0 * NM
 
 
-def test_a_place_first_seen_adrift_is_known_once_an_older_one_says_so() -> None:
-    """The first scan of a place next to the known one was not usable with any older; the next ones are."""
+def test_a_place_first_seen_adrift_is_known_once_it_matches_an_older_scan() -> None:
+    """The first scan of a place next to the known one matched no older scan; the next ones do."""
     world = World(STEADY)
     following = BankTracker(world)
     follow(following, 8)
@@ -288,7 +288,7 @@ def test_a_place_first_seen_adrift_is_known_once_an_older_one_says_so() -> None:
 
 
 @pytest.mark.parametrize("unusable", [1, 2, 6])
-def test_where_the_first_scans_were_not_usable_the_first_two_that_match_begin(unusable: int) -> None:
+def test_tracking_begins_with_the_first_two_scans_that_match(unusable: int) -> None:
     world = World(STEADY, blind={f"scan {k}" for k in range(unusable)})
     updates = follow(BankTracker(world), unusable + 8)
     assert [update.matched for update in updates[1:]] == [k > unusable for k in range(1, unusable + 8)]
@@ -299,7 +299,7 @@ def test_where_the_first_scans_were_not_usable_the_first_two_that_match_begin(un
     assert last.after.sd_m < 50.0 * NM
 
 
-def test_however_long_it_is_lost_it_goes_on() -> None:
+def test_the_bank_goes_on_after_any_time_lost() -> None:
     world = World(STEADY)
     following = BankTracker(world)
     follow(following, 5)
@@ -320,7 +320,7 @@ def test_a_new_velocity_is_learned_within_three_scans() -> None:
     assert np.linalg.norm(error_m(world, updates[19].before)) < 20.0 * NM
 
 
-def test_an_unusable_picture_is_passed_over() -> None:
+def test_an_unusable_scan_is_skipped() -> None:
     world = World(night(5), blind={"scan 12", "scan 13"})
     updates = follow(BankTracker(world), 20)
     assert [update.matched for update in updates[11:15]] == [True, False, False, True]
@@ -328,8 +328,8 @@ def test_an_unusable_picture_is_passed_over() -> None:
     assert np.linalg.norm(error_m(world, updates[14].after)) < 2.0 * NM
 
 
-def test_an_anchor_that_can_not_be_recognised_any_more_is_given_up() -> None:
-    """The tip has changed: new scans match each other, old ones do not match them."""
+def test_an_anchor_that_is_no_longer_recognised_is_removed() -> None:
+    """The tip has changed: new scans match each other, and no older ones."""
     world = World(night(6))
     following = BankTracker(world)
     follow(following, 10)
@@ -348,7 +348,7 @@ def test_the_first_scan_stays_the_anchor_while_it_is_recognised() -> None:
 
 
 def test_other_places_get_anchors_of_their_own() -> None:
-    """Two places, scanned in turn: what is known of one holds for the other, and for what is certain."""
+    """Two places, scanned in turn: the drift measured at one place holds for the other, with its uncertainty."""
     world = World(night(8), noise_m=0.3 * NM)
     following = BankTracker(world)
     places = [(0.0, 0.0), (3.5 * SIZE_M, 1.0 * SIZE_M)]
@@ -364,7 +364,7 @@ def test_other_places_get_anchors_of_their_own() -> None:
     assert rms_m([error_m(world, update.before) for update in updates[20:]]) < 6.0 * NM
 
 
-def test_a_wide_scan_and_narrow_ones_in_it() -> None:
+def test_zooms_in_an_overview_are_followed() -> None:
     world = World(night(9))
     following = BankTracker(world)
     following.add(scan_at(FRAME_S, size_m=4 * SIZE_M, pixels=16, key="wide"))
@@ -379,8 +379,8 @@ def test_a_wide_scan_and_narrow_ones_in_it() -> None:
     assert np.linalg.norm(error_m(world, updates[-1].after)) < 2.0 * NM
 
 
-def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_own() -> None:
-    """It is as far from the overview as it is, and to scan it again would not change that."""
+def test_a_zoom_too_fine_for_the_overview_begins_a_series_of_its_own() -> None:
+    """Its distance from the overview stays unknown, and a rescan would not change that."""
     world = World(night(4))
     following = BankTracker(world, sr_norm_min=0.25)
     following.add(scan_at(FRAME_S, pixels=16, key="overview"))
@@ -403,7 +403,7 @@ def test_a_zoom_that_can_not_be_compared_with_the_overview_begins_a_row_of_its_o
 
 
 def refusing(world: World) -> list[Prior | None]:
-    """Have every registration refused; returns where each is expected, as they are asked for."""
+    """Refuse every registration; return the list to which each registration adds its prior."""
     asked: list[Prior | None] = []
 
     def refuse(reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
@@ -414,7 +414,7 @@ def refusing(world: World) -> list[Prior | None]:
     return asked
 
 
-def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewhere() -> None:
+def test_zooms_unclear_in_the_overview_are_not_searched_elsewhere() -> None:
     """In an overview a zoom of a particle fits every particle."""
     world = World(night(4))
     following = BankTracker(world)
@@ -430,7 +430,7 @@ def test_zooms_that_the_overview_does_not_show_clearly_are_not_looked_for_elsewh
     assert not any(update.lost for update in updates)
 
 
-def test_long_after_the_overview_a_zoom_is_still_not_looked_for_everywhere_in_it() -> None:
+def test_a_zoom_long_after_the_overview_is_not_searched_everywhere_in_it() -> None:
     world = World(night(4))
     following = BankTracker(world)
     following.add(scan_at(FRAME_S, pixels=64, key="overview"))
@@ -464,7 +464,7 @@ def test_memory_is_bounded_in_scans_and_in_bytes() -> None:
     assert {one["scan"]["key"] for one in small.state()["references"]} >= {"0", "9"}
 
 
-def test_saved_and_restored_it_goes_on_with_the_same_bits() -> None:
+def test_a_restored_tracker_continues_with_the_same_bits() -> None:
     def world() -> World:
         return World(night(10), blind={"scan 5"}, wrong={"scan 8": np.array([60.0, 0.0]) * NM})
 
@@ -486,7 +486,7 @@ def test_the_same_scans_give_the_same_numbers() -> None:
     assert first[-1].forecast.to_dict() == second[-1].forecast.to_dict()
 
 
-def test_a_forecast_survives_json_and_speaks_of_any_time() -> None:
+def test_a_forecast_survives_json_and_predicts_any_time() -> None:
     world = World(STEADY, noise_m=0.01 * NM)
     following = BankTracker(world)
     follow(following, 12)
@@ -527,11 +527,11 @@ def test_a_velocity_before_the_first_scan_is_refused() -> None:
 
 
 def compensating(drift: Drift, since_s: float, velocity: Array) -> Drift:
-    """What is left in tip coordinates when a controller follows."""
+    """Return the remaining drift in tip coordinates when a controller compensates."""
     return lambda t: drift(t) - velocity * max(t - since_s, 0.0)
 
 
-def test_a_rate_that_the_controller_takes_over_is_taken_off() -> None:
+def test_a_rate_compensated_by_the_controller_is_subtracted() -> None:
     calm = night(12)
     changed_s = FRAME_S + 10.4 * INTERVAL_S
     velocity = (calm(changed_s) - calm(changed_s - 900.0)) / 900.0
@@ -550,8 +550,8 @@ def test_a_rate_that_the_controller_takes_over_is_taken_off() -> None:
     assert predicted[True][-1] < 10.0 * NM
 
 
-def test_compensation_may_be_told_while_a_scan_is_taken_and_survives_a_kill() -> None:
-    """The file of a scan that was half done at that time comes after the news."""
+def test_compensation_may_change_during_a_scan_and_survives_a_kill() -> None:
+    """The file of a scan that was half done at that time comes after the change."""
     velocity = np.array([0.05, -0.03]) * NM
     changed_s = FRAME_S + 9 * INTERVAL_S + 30.0
     world = World(compensating(STEADY, changed_s, velocity), noise_m=0.01 * NM)
@@ -566,7 +566,7 @@ def test_compensation_may_be_told_while_a_scan_is_taken_and_survives_a_kill() ->
     assert np.linalg.norm(update.after.rate_m_s) < 0.003 * NM
 
 
-def test_compensation_that_is_told_too_late_is_refused() -> None:
+def test_compensation_reported_too_late_is_refused() -> None:
     following = BankTracker(World())
     follow(following, 2)
     with pytest.raises(InvalidValue, match="before the next scan"):
@@ -585,7 +585,7 @@ def test_an_older_scan_is_refused_and_changes_nothing() -> None:
 @pytest.mark.parametrize(
     "settings", [{"forgett": 1.0}, {"densities_m2_s3": []}, {"inflation": 1.0}, {"walks_m2_s": [0.0]}, {"forget": "x"}]
 )
-def test_settings_without_a_meaning_are_refused(settings: dict[str, object]) -> None:
+def test_meaningless_tracker_settings_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises(ConfigError):
         tracker({"class": "bank", **settings}, World())
 

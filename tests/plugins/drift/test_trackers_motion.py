@@ -1,4 +1,4 @@
-"""How the filters of the bank let drift move."""
+"""The models of motion in the filters of the bank."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ MODELS = Models(np.full(4, 2e-24), np.array([0.0, 1 / 10800.0, 1 / 2700.0, 1 / 3
 
 
 @pytest.mark.parametrize(("first_s", "second_s"), [(900.0, 900.0), (20.0, 1.0), (0.001, 26.999), (3600.0, 0.1)])
-def test_two_steps_are_one_long_one(first_s: float, second_s: float) -> None:
-    """Also across the times where a series takes the place of the exponentials."""
+def test_two_steps_of_a_model_equal_one_long_step(first_s: float, second_s: float) -> None:
+    """Also across the step length at which a series replaces the exponentials."""
     (f1, q1), (f2, q2), (f, q) = MODELS.over(first_s), MODELS.over(second_s), MODELS.over(first_s + second_s)
     assert np.allclose(f2 @ f1, f, rtol=1e-12)
     together = f2 @ q1 @ f2.transpose(0, 2, 1) + q2
     assert np.allclose(together, q, rtol=1e-6, atol=0.0)
 
 
-def test_a_velocity_that_stays_is_the_textbooks_one() -> None:
+def test_a_constant_velocity_model_matches_the_textbook() -> None:
     f, q = (part[0] for part in MODELS.over(100.0))
     assert f[0, 2] == 100.0
     assert q[0, 0] == pytest.approx(2e-24 * 100.0**3 / 3 + 5e-22 * 100.0)
@@ -32,7 +32,7 @@ def test_a_velocity_that_stays_is_the_textbooks_one() -> None:
     assert q[0, 1] == q[0, 3] == 0.0
 
 
-def test_a_velocity_that_fades_comes_to_rest() -> None:
+def test_a_fading_velocity_comes_to_rest() -> None:
     f, q = (part[3] for part in MODELS.over(3000.0))
     assert f[0, 2] == pytest.approx(30.0)
     assert f[2, 2] == pytest.approx(0.0, abs=1e-30)
@@ -40,13 +40,13 @@ def test_a_velocity_that_fades_comes_to_rest() -> None:
 
 
 @pytest.mark.parametrize("step_s", [-2000.0, -1.0, 0.0, 1e-3, 26.0, 28.0, 1e6])
-def test_what_is_gained_is_a_covariance(step_s: float) -> None:
+def test_the_added_covariance_is_a_covariance(step_s: float) -> None:
     _, q = MODELS.over(step_s)
     scale = np.sqrt(np.einsum("nii->ni", q)) + 1e-300
     assert np.linalg.eigvalsh(q / scale[:, :, None] / scale[:, None, :]).min() > -1e-9
 
 
-def test_what_a_scan_shows_differs_from_its_middle_by_what_it_wandered() -> None:
+def test_the_mean_over_a_scan_differs_from_its_middle_by_the_wandering() -> None:
     """Against the covariances of a walk and of an integrated random acceleration (Wiener processes), row by row."""
     duration_s, rows = 256.0, 512
     t = duration_s * ((np.arange(rows // 2) + 0.5) / rows)  # from the middle on: both halves are alike
@@ -69,7 +69,7 @@ def test_a_controller_follows_in_steps() -> None:
     assert from_plain(Compensation, json.loads(json.dumps(to_plain(second)))) == second
 
 
-def test_changes_that_nobody_asks_for_any_more_are_forgotten() -> None:
+def test_changes_no_longer_needed_are_forgotten() -> None:
     changing = Compensation()
     for k in range(100):
         changing = changing.changed(float(k), np.array([k, 0.0]), needed_s=k - 1.5)

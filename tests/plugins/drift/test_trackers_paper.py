@@ -1,4 +1,4 @@
-"""The tracker of the paper does what the paper says."""
+"""The tracker of the paper follows the paper."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NM = 1e-9
 
 
 def test_the_worked_example_of_the_paper() -> None:
-    """Supporting information, "Drift Correction Example", in nm: x_tot is what M_tot adds to tip coordinates."""
+    """Supporting information, "Drift Correction Example", in nm: M_tot adds x_tot to tip coordinates."""
     total = {0: 0.0, 1: 1.0, 2: 2.0, **{k: float(k) for k in range(3, 13)}, 13: 12.5, 14: 13.0}
     world = World(lambda t: np.array([-np.interp(t, [*total], [*total.values()]) * NM, 0.0]), noise_m=0.0)
     following = PaperTracker(world, queue=20)
@@ -74,7 +74,7 @@ def test_the_queue_forgets_the_oldest() -> None:
     assert list(update.registrations) == ["1"]
 
 
-def test_pairs_that_share_too_little_in_sample_coordinates_are_left_alone() -> None:
+def test_pairs_with_too_little_overlap_in_sample_coordinates_are_not_registered() -> None:
     """The same tip coordinates show another part once the sample has drifted away."""
     world = World(steady((0.45 * SIZE_M / 1000.0, 0.0)))
     following = PaperTracker(world, f_min=0.5)
@@ -86,7 +86,7 @@ def test_pairs_that_share_too_little_in_sample_coordinates_are_left_alone() -> N
 
 
 @pytest.mark.parametrize(("pixels", "comparable"), [(32, True), (33, False)])
-def test_pairs_of_very_different_resolution_are_left_alone(pixels: int, *, comparable: bool) -> None:
+def test_pairs_of_very_different_resolution_are_not_registered(pixels: int, *, comparable: bool) -> None:
     following = PaperTracker(World(), sr_norm_min=0.25)
     following.add(scan_at(0.0, pixels=8))
     assert following.add(scan_at(1000.0, pixels=pixels)).matched == comparable
@@ -104,7 +104,7 @@ def test_without_a_match_only_the_prediction_applies() -> None:
     assert following.forecast.at(3000.0).mapping.translation_m == pytest.approx([-30.0 * NM, 0.0])
 
 
-def test_scans_of_places_that_nothing_is_known_of_are_no_sign_of_being_lost() -> None:
+def test_scans_of_unknown_places_are_no_sign_of_being_lost() -> None:
     following = PaperTracker(World(), queue=3, lost_after=3)
     places = [(k * 10e-6, 0.0) for k in range(6)]
     updates = [
@@ -114,7 +114,7 @@ def test_scans_of_places_that_nothing_is_known_of_are_no_sign_of_being_lost() ->
     assert [update.matched for update in updates] == [True] + 11 * [False]
 
 
-def test_it_is_lost_after_some_scans_without_a_match() -> None:
+def test_the_paper_s_tracker_is_lost_after_some_scans_without_a_match() -> None:
     world = World(blind={"2", "3", "4"})
     following = PaperTracker(world, lost_after=3)
     lost = [following.add(scan_at(1000.0 * k, key=str(k))).lost for k in range(6)]
@@ -122,7 +122,7 @@ def test_it_is_lost_after_some_scans_without_a_match() -> None:
 
 
 class Turning:
-    """An estimator for a sample that turns about the origin and grows, at constant rates."""
+    """An estimator for a sample that rotates about the origin and grows, at constant rates."""
 
     rad_per_s, growth_per_s = 1e-4, 2e-5
 
@@ -184,8 +184,8 @@ def test_a_translation_leaves_rotation_out() -> None:
     assert update.after.mapping.translation_m == pytest.approx(-moved)
 
 
-def test_a_rotated_scan_is_taken_by_what_the_matrices_say() -> None:
-    """M_k x_k = M_j x_j for every feature, whatever the prediction was."""
+def test_a_rotated_scan_follows_the_matrices() -> None:
+    """M_k x_k = M_j x_j for every feature, with any prediction."""
     following = PaperTracker(Turning(), transform="affine")
     for time_s in (0.0, 100.0, 250.0):
         update = following.add(scan_at(time_s, (0.2e-6, -0.1e-6)))
@@ -194,7 +194,7 @@ def test_a_rotated_scan_is_taken_by_what_the_matrices_say() -> None:
     assert found == pytest.approx(feature)
 
 
-def test_saved_and_restored_it_goes_on_with_the_same_bits() -> None:
+def test_a_restored_tracker_continues_with_the_same_bits() -> None:
     drift = steady((0.013 * NM, 0.007 * NM))
     whole = follow(PaperTracker(World(drift), w_update=0.7, queue=3), 8)
     for cut in range(8):
@@ -238,12 +238,12 @@ def test_the_state_of_another_tracker_is_refused() -> None:
     "settings",
     [{"transform": "projective"}, {"w_update": 1.1}, {"f_min": -0.1}, {"queue": 0}, {"lost_after": 0}, {"quue": 3}],
 )
-def test_settings_without_a_meaning_are_refused(settings: dict[str, Any]) -> None:
+def test_meaningless_tracker_settings_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         tracker({"class": "paper", **settings}, World())
 
 
-def test_a_scan_of_another_direction_is_taken_as_it_is() -> None:
+def test_a_scan_in_the_other_direction_is_taken_like_any_other() -> None:
     following = PaperTracker(World())
     following.add(scan_at(0.0))
     assert following.add(replace(scan_at(1000.0), upwards=None)).matched

@@ -1,4 +1,4 @@
-"""The default tracker with rotation and scale: corners stay in place, nothing is made up, and nothing is lost."""
+"""The default tracker with rotation and scale: corners stay in place, no rotation is invented, and no scan is lost."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ TURN = 1.5e-3j  # in an interval
 
 @dataclass(frozen=True)
 class Sample:
-    """It drifts, and turns and expands about a place that is not the frame's.
+    """Drifts, rotates and expands about a pivot outside the frame.
 
     Attributes:
         rate_per_s: logarithm of the scale, plus i times the angle in rad, in a second.
-        pivot_m: about which it does.
+        pivot_m: the centre of rotation and expansion.
     """
 
     rate_per_s: complex
@@ -54,7 +54,7 @@ class Sample:
         return Mapping.of(linear, pivot - linear @ pivot + VELOCITY_M_S * time_s)
 
     def scanned(self, region: Region, time_s: float, seed: int) -> DriftScan:
-        """Scanned so fast that nothing moves meanwhile."""
+        """Return a scan so fast that nothing moves meanwhile."""
         x, y = region.pixels_m((PIXELS, PIXELS))
         at = self.to_tip(time_s).inverse.apply(np.stack([x, y], axis=-1))
         values = SURFACE.at_points(at)
@@ -64,11 +64,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class Night:
-    """Scans of one place of the sample, each where the tracker says that it is.
+    """Scans of one place of the sample, each at the tracker's prediction.
 
     Attributes:
-        corners_m: (n,) how far the corner of each scan that is furthest off is from where it was meant to be.
-        truth: (n,) logarithm of the scale, plus i times the angle, that there really was.
+        corners_m: (n,) distance of each scan's furthest corner from its intended place.
+        truth: (n,) true logarithm of the scale, plus i times the angle.
     """
 
     updates: list[Update]
@@ -96,14 +96,14 @@ def night(rate_per_scan: complex, transform: str, count: int, compared: int = 1)
 
 
 def estimate(update: Update) -> complex:
-    """Logarithm of the scale of the sample, plus i times its angle."""
+    """Return the estimated logarithm of the scale of the sample, plus i times its angle."""
     inverse = update.after.mapping.inverse
     return complex(np.log(inverse.scale), inverse.angle_rad)
 
 
 @pytest.mark.parametrize("rate", [TURN, -1.1e-3 + 1.1e-3j], ids=["turns", "turns and shrinks"])
-def test_corners_stay_in_place_on_a_sample_that_turns_or_expands(rate: complex) -> None:
-    """So does what lies beside the frame, three frames away."""
+def test_corners_stay_in_place_on_a_rotating_or_expanding_sample(rate: complex) -> None:
+    """So do places beside the frame, three frames away."""
     plain, corrected = night(rate, "translation", 24), night(rate, "similarity", 24)
     assert all(update.matched for update in corrected.updates)
     assert plain.corners_m[-6:].mean() > 12 * NM
@@ -117,7 +117,7 @@ def test_corners_stay_in_place_on_a_sample_that_turns_or_expands(rate: complex) 
     assert off_m[1] < 0.2 * off_m[0]
 
 
-def test_without_a_turn_none_is_made_up_and_corners_lose_less_than_a_twentieth_of_a_pixel() -> None:
+def test_without_a_rotation_none_is_found_and_corners_stay_within_a_twentieth_of_a_pixel() -> None:
     plain, corrected = night(0j, "translation", 14, compared=2), night(0j, "similarity", 14, compared=2)
     chi2 = [abs(estimate(one)) ** 2 / one.quality["linear_sd"] ** 2 for one in corrected.updates[1:]]
     assert max(chi2) < 9.0
@@ -125,8 +125,8 @@ def test_without_a_turn_none_is_made_up_and_corners_lose_less_than_a_twentieth_o
     assert corrected.corners_m[4:].mean() < plain.corners_m[4:].mean() + 0.05 * PIXEL_M
 
 
-def test_translations_are_the_default_and_are_not_touched() -> None:
-    """With the option off neither the mapping nor what is saved and told knows of it."""
+def test_the_default_follows_translations_only() -> None:
+    """With the option off, neither the mapping nor the saved and published state contains it."""
     tracker = BankTracker(LeastSquares(), compared=2)
     update = followed(Sample(TURN / INTERVAL_S), tracker, 3).updates[-1]
     assert np.array_equal(update.after.mapping.linear, np.eye(2))
@@ -135,14 +135,14 @@ def test_translations_are_the_default_and_are_not_touched() -> None:
     assert list(update.quality) == ["references"]
 
 
-def test_an_estimator_that_tells_no_linear_part_leaves_the_mapping_a_translation() -> None:
+def test_an_estimator_without_a_linear_part_leaves_the_mapping_a_translation() -> None:
     world = World(lambda time_s: VELOCITY_M_S * time_s)
     plain, asked = (follow(BankTracker(world, transform=one), 8) for one in ("translation", "similarity"))
     assert np.array_equal(asked[-1].after.mapping.linear, np.eye(2))
     assert np.linalg.norm(asked[-1].after.mapping.translation_m - plain[-1].after.mapping.translation_m) < 0.1 * NM
 
 
-def test_saved_on_disk_and_restored_it_goes_on_with_the_same_bits(tmp_path: Path) -> None:
+def test_a_tracker_restored_from_disk_continues_with_the_same_bits(tmp_path: Path) -> None:
     sample, store = Sample(TURN / INTERVAL_S), WorkerStateFile(tmp_path / "drift")
     whole = night(TURN, "similarity", 6).updates
     for cut in (1, 4):
@@ -157,7 +157,7 @@ def test_saved_on_disk_and_restored_it_goes_on_with_the_same_bits(tmp_path: Path
             assert update.forecast.to_dict() == expected.forecast.to_dict()
 
 
-def test_a_forecast_with_a_turn_survives_json() -> None:
+def test_a_forecast_with_a_rotation_survives_json() -> None:
     forecast = night(TURN, "similarity", 6).updates[-1].forecast
     again = forecast_from_dict(json.loads(json.dumps(forecast.to_dict(), allow_nan=False)))
     mapping = forecast.at(6 * INTERVAL_S).mapping
@@ -165,7 +165,7 @@ def test_a_forecast_with_a_turn_survives_json() -> None:
     assert np.array_equal(again.at(6 * INTERVAL_S).mapping.matrix, mapping.matrix)
 
 
-def test_one_wrong_turn_is_not_believed() -> None:
+def test_one_wrong_rotation_is_not_believed() -> None:
     estimator = LeastSquares()
     tracker = BankTracker(estimator, compared=1, transform="similarity")
     sample = Sample(0j)

@@ -1,4 +1,4 @@
-"""A laboratory for trackers: a sample that drifts as told, a microscope that follows, and an estimator that knows."""
+"""A laboratory for trackers: a sample with a given drift, a microscope that follows it, and an ideal estimator."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def steady(velocity_m_s: tuple[float, float]) -> Callable[[float], Array]:
 
 @dataclass
 class World:
-    """Where the sample is, x_tip = x_sample + drift(t), and what an ideal estimator sees of it.
+    """The place of the sample, x_tip = x_sample + drift(t), and an ideal estimator for it.
 
     Attributes:
         noise_m: standard deviation of each scan's location error.
         blind: keys of scans with which nothing can be registered.
-        wrong: by the key of a scan, what is added to each displacement found in it.
-        asked: (key of the reference, key of the scan, prior) of every question.
+        wrong: by the key of a scan, an error added to each displacement in it.
+        asked: (key of the reference, key of the scan, prior) of every registration.
     """
 
     drift_m: Callable[[float], Array] = still
@@ -49,7 +49,7 @@ class World:
     location_errors: dict[str, Array] = field(default_factory=dict)
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """The displacement of the middle of the overlap, with the rows' times."""
+        """Return the displacement at the middle of the overlap, at the times of its rows."""
         self.asked.append((reference.key, scan.key, prior))
         if {reference.key, scan.key} & self.blind:
             return Registration.refused("blind")
@@ -87,7 +87,7 @@ def scan_at(
     key: str = "",
     frame_s: float = FRAME_S,
 ) -> DriftScan:
-    """A scan whose middle is at a time."""
+    """Return a scan with its middle at a time."""
     x, y = center_m
     region = Region((float(x), float(y)), (size_m, size_m))
     half_s = frame_s / 2
@@ -97,7 +97,7 @@ def scan_at(
 
 
 def follow(tracker: Tracker, count: int, *, first: int = 0, sample_m: tuple[float, float] = (0.0, 0.0)) -> list[Update]:
-    """Scans of one place of the sample, each where the tracker says that it is."""
+    """Take scans of one place of the sample, each at the tracker's prediction."""
     updates = []
     for k in range(first, first + count):
         time_s = FRAME_S + k * INTERVAL_S

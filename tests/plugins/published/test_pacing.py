@@ -1,11 +1,11 @@
-"""Packets for peers that look at one message a poll."""
+"""Packets for peers that process one message per poll."""
 
 from __future__ import annotations
 
 import math
 
 from afspm.model import Packet, ScopeState
-from afspm.plugins.published.pacing import MOST_WAITING, PAUSE_S, Pacing
+from afspm.plugins.published.version_1 import MOST_WAITING, PAUSE_S, Pacing
 
 
 def put(pacing: Pacing, *messages: str | ScopeState) -> None:
@@ -19,7 +19,7 @@ def taken(pacing: Pacing, now_s: float) -> list[str]:
     return [packet.envelope for packet in pacing.take(now_s)]
 
 
-def test_channels_of_a_scan_go_out_one_a_poll_and_the_state_after_them() -> None:
+def test_channels_of_a_scan_go_out_one_per_poll_and_the_state_after_them() -> None:
     pacing = Pacing()
     put(pacing, "Scan2d", "Scan2d", ScopeState.FREE)
     assert taken(pacing, 10.0) == ["Scan2d"]
@@ -46,7 +46,7 @@ def test_an_interruption_lasts_a_poll_and_scanning_is_no_passing_state() -> None
     assert taken(pacing, 10.0 + PAUSE_S) == ["FREE"]
 
 
-def test_what_is_held_for_a_late_joiner_waits_and_keeps_its_order() -> None:
+def test_packets_held_for_a_late_joiner_keep_their_order() -> None:
     pacing = Pacing()
     pacing.hold(11.0)
     put(pacing, "ZCtrlParameters", "Scan2d")
@@ -54,7 +54,7 @@ def test_what_is_held_for_a_late_joiner_waits_and_keeps_its_order() -> None:
     assert taken(pacing, 11.0) == ["ZCtrlParameters", "Scan2d"]
 
 
-def test_more_than_can_be_spaced_goes_out_at_once() -> None:
+def test_packets_beyond_the_bound_go_out_at_once() -> None:
     pacing = Pacing()
     put(pacing, *(["Scan2d"] * (MOST_WAITING + 10)))
     assert len(taken(pacing, 10.0)) == 10

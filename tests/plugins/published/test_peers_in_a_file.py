@@ -37,7 +37,7 @@ def errors(folder: Path, text: str) -> list[str]:
     return [f"{finding.what} {finding.hint}" for finding in load(file).check() if finding.is_error]
 
 
-def test_peers_without_keys_are_let_in_by_consent_alone(tmp_path: Path) -> None:
+def test_peers_without_keys_need_consent(tmp_path: Path) -> None:
     (error,) = errors(tmp_path, PEERS)
     assert "[peers] lets programs without keys command the microscope" in error
     assert "[security] plain = true" in error
@@ -52,7 +52,7 @@ def test_each_class_of_the_bridge_has_its_role(tmp_path: Path) -> None:
     assert roles["peers"] is Role.COMPONENT
 
 
-def test_their_scheduler_takes_no_limits_which_it_would_not_enforce(tmp_path: Path) -> None:
+def test_a_published_scheduler_refuses_limits_that_it_would_not_enforce(tmp_path: Path) -> None:
     text = """
 [microscope]
 component = true

@@ -13,7 +13,7 @@ from afspm.plugins.published.translator import by_point
 
 
 @pytest.mark.parametrize("shape", [(5, 2), (2, 5), (1, 3), (4, 1), (0, 2)])
-def test_a_spectrum_that_came_variable_after_variable_is_put_in_order(shape: tuple[int, int]) -> None:
+def test_a_spectrum_sent_variable_by_variable_is_reordered(shape: tuple[int, int]) -> None:
     points, variables = shape
     values = np.arange(float(points * variables)).reshape(shape)
     names = tuple(f"v{n}" for n in range(variables))

@@ -36,7 +36,7 @@ def access(
 
 
 def who(guard: Access, cookie: str | None) -> str | None:
-    """The name of who shows a cookie; None: nobody who may come in."""
+    """Return the name of a cookie's viewer; None: access is refused."""
     visitor = guard.visitor(cookie)
     return None if visitor is None else visitor.person
 
@@ -54,11 +54,11 @@ def test_a_password_is_kept_as_a_hash_that_is_different_each_time() -> None:
     [("127.0.0.1", True), ("localhost", True), ("::1", True), ("127.8.9.1", True), ("0.0.0.0", False),
      ("192.168.1.4", False), ("::", False), ("lab.example.org", False), ("", False)],
 )  # fmt: skip
-def test_loopback_is_this_computer_alone(host: str, expected: bool) -> None:
+def test_loopback_addresses_are_recognised(host: str, expected: bool) -> None:
     assert is_loopback(host) is expected
 
 
-def test_on_loopback_anybody_may_look_and_a_name_is_enough_to_steer() -> None:
+def test_on_loopback_every_viewer_may_look_and_a_name_is_enough_to_steer() -> None:
     guard = access("127.0.0.1", "", people={})
     assert guard.visitor(None) == Visitor("")
     assert who(guard, guard.enter("Ada", "", "127.0.0.1")) == "Ada"
@@ -67,7 +67,7 @@ def test_on_loopback_anybody_may_look_and_a_name_is_enough_to_steer() -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.4", "::", ""])
-def test_where_others_can_reach_it_it_refuses_to_start_without_a_password(host: str) -> None:
+def test_a_reachable_page_without_a_password_refuses_to_start(host: str) -> None:
     with pytest.raises(ConfigError, match="has no password"):
         access(host, "", people={})
 
@@ -83,7 +83,7 @@ def test_a_plain_password_in_the_file_is_refused() -> None:
         access(people={"a:b": ADAS})
 
 
-def test_elsewhere_nobody_looks_without_a_password() -> None:
+def test_beyond_loopback_a_viewer_needs_a_password_to_look() -> None:
     guard = access()
     assert guard.visitor(None) is None
     assert guard.enter("", "wrong", "10.0.0.2") is None
@@ -93,7 +93,7 @@ def test_elsewhere_nobody_looks_without_a_password() -> None:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1"])
 @pytest.mark.parametrize("kept", [KEPT, ""], ids=["common", "none"])
-def test_nobody_takes_the_name_of_another_nor_one_that_is_not_in_the_file(host: str, kept: str) -> None:
+def test_names_of_others_and_unknown_names_are_refused(host: str, kept: str) -> None:
     guard = access(host, kept, people={"Ada": ADAS, "Max": KEPT})
     assert guard.enter("Ada", "open sesame", "x") is None
     assert guard.enter("Eve", "analytical", "x") is None
@@ -109,18 +109,18 @@ def test_the_common_password_may_be_in_the_environment_and_lets_look_only() -> N
     assert guard.enter("", "", "x") is None
 
 
-def test_a_password_on_loopback_is_asked_for_too() -> None:
+def test_a_password_is_required_on_loopback_too() -> None:
     assert access("127.0.0.1").visitor(None) is None
 
 
-def test_on_loopback_with_persons_everybody_looks_and_only_they_steer() -> None:
+def test_on_loopback_with_persons_every_viewer_looks_and_only_persons_steer() -> None:
     guard = access("127.0.0.1", "")
     assert guard.visitor(None) == Visitor()
     assert who(guard, guard.enter("", "", "x")) == ""
     assert guard.enter("Ada", "", "x") is None
 
 
-def test_a_program_shows_its_name_and_password_each_time() -> None:
+def test_a_program_sends_its_name_and_password_with_each_request() -> None:
     guard = access()
     for _ in range(2):
         assert guard.by_password("Ada", "analytical", "x") == Visitor("Ada")
@@ -129,7 +129,7 @@ def test_a_program_shows_its_name_and_password_each_time() -> None:
 
 
 @pytest.mark.parametrize("change", [lambda c: c[:-1], lambda c: "x" + c, lambda c: "", lambda c: c + "é"])
-def test_a_cookie_that_was_not_given_here_counts_for_nothing(change: object) -> None:
+def test_a_foreign_cookie_is_worthless(change: object) -> None:
     guard = access()
     cookie = guard.enter("Ada", "analytical", "x")
     assert cookie is not None
@@ -149,7 +149,7 @@ def test_a_session_outlives_a_restart_but_not_another_password(tmp_path: Path) -
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
-def test_after_signing_out_a_cookie_counts_no_more_even_after_a_restart(tmp_path: Path) -> None:
+def test_a_cookie_is_worthless_after_signing_out_even_over_a_restart(tmp_path: Path) -> None:
     file = tmp_path / "dashboard.sessions"
     guard = access(file=file)
     here, there, others = guard.cookie("Ada"), guard.cookie("Ada"), guard.cookie("")
@@ -164,14 +164,14 @@ def test_after_signing_out_a_cookie_counts_no_more_even_after_a_restart(tmp_path
     assert [who(access(file=file), cookie) for cookie in (there, others)] == [None, ""]
 
 
-def test_everywhere_means_every_session_of_this_person() -> None:
+def test_signing_out_everywhere_ends_every_session_of_this_person() -> None:
     guard = access()
     cookies = [guard.cookie("Ada") for _ in range(3)]
     guard.leave(cookies[0], everywhere=True)
     assert [who(guard, cookie) for cookie in cookies] == [None] * 3
 
 
-def test_a_damaged_file_of_sessions_means_signing_in_anew(tmp_path: Path) -> None:
+def test_a_damaged_file_of_sessions_means_signing_in_again(tmp_path: Path) -> None:
     file = tmp_path / "dashboard.sessions"
     for damaged in (b"", b"[{}]", b"{", b"7", b"\xff"):
         file.write_bytes(damaged)
@@ -198,7 +198,7 @@ def test_a_session_ends_after_a_month() -> None:
     assert guard.visitor(cookie) is None
 
 
-def test_wrong_passwords_are_looked_at_every_three_seconds_and_lock_nobody_out() -> None:
+def test_wrong_passwords_are_checked_every_three_seconds_and_lock_no_person_out() -> None:
     time = Time()
     guard = access(time=time, people={"Ada": ADAS, "Max": KEPT})
     for _ in range(6):
@@ -212,7 +212,7 @@ def test_wrong_passwords_are_looked_at_every_three_seconds_and_lock_nobody_out()
     assert guard.enter("Ada", "analytical", "10.0.0.9") is not None
 
 
-def test_password_that_was_right_is_right_at_once_where_others_are_wrong() -> None:
+def test_a_password_that_was_right_is_accepted_at_once_among_wrong_ones() -> None:
     guard = access()
     assert guard.by_password("Ada", "analytical", "10.0.0.9") == Visitor("Ada")
     for _ in range(20):
@@ -220,7 +220,7 @@ def test_password_that_was_right_is_right_at_once_where_others_are_wrong() -> No
     assert guard.by_password("Ada", "analytical", "10.0.0.9") == Visitor("Ada")
 
 
-def test_passwords_that_come_at_once_are_not_all_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_simultaneous_passwords_are_not_all_checked(monkeypatch: pytest.MonkeyPatch) -> None:
     guard, looked_at = access(), list[str]()
 
     def wrong(password: str, kept: str) -> bool:
@@ -234,7 +234,7 @@ def test_passwords_that_come_at_once_are_not_all_looked_at(monkeypatch: pytest.M
     assert len(looked_at) == 6
 
 
-def test_many_that_are_wrong_take_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_wrong_passwords_take_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("afspm.plugins.web.passwords.matches", lambda password, kept: False)  # which takes its time
     guard = access()
     for i in range(3000):
@@ -247,5 +247,5 @@ def test_many_that_are_wrong_take_no_more_memory(monkeypatch: pytest.MonkeyPatch
     [("Ada", "Ada"), ("  Ada   Lovelace ", "Ada Lovelace"), ("Žofie", "Žofie"), ("o'Neil-Smith", "o'Neil-Smith"),
      ("", ""), ("a/b", ""), ("a:b", ""), ("<b>", ""), ("x" * 41, ""), ("-", ""), ("a\nb", "a b"), ("a|b", "")],
 )  # fmt: skip
-def test_names_are_what_may_stand_in_the_record(given: str, expected: str) -> None:
+def test_names_are_restricted_to_those_allowed_in_the_record(given: str, expected: str) -> None:
     assert check_name(given) == expected

@@ -36,12 +36,12 @@ from afspm.record.store import RecordSettings, RecordStore
 S = 1_000_000_000
 
 
-def test_where_nothing_is_recorded_nothing_is_found(tmp_path: Path) -> None:
+def test_an_archive_without_a_record_finds_nothing(tmp_path: Path) -> None:
     assert Archive(None).frame(S, "Height") is None
     assert Archive(tmp_path).frame(S, "Height") is None
 
 
-def test_the_past_is_what_was_recorded(tmp_path: Path) -> None:
+def test_the_past_is_read_from_the_record(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings())
     region = Region((0.0, 0.0), (1e-6, 1e-6))
     things: list[tuple[str, object]] = [
@@ -72,7 +72,7 @@ def test_the_past_is_what_was_recorded(tmp_path: Path) -> None:
     assert watch.overview.timelines.control.now is None
 
 
-def test_of_a_run_without_a_record_and_of_a_replay_no_past_is_known(tmp_path: Path) -> None:
+def test_a_run_without_a_record_and_a_replay_have_no_past(tmp_path: Path) -> None:
     recorded, replay = tmp_path / "recorded", tmp_path / "replay"
     for folder in (recorded, replay):
         folder.mkdir()
@@ -85,7 +85,7 @@ def test_of_a_run_without_a_record_and_of_a_replay_no_past_is_known(tmp_path: Pa
     assert Archive(recorded).past(ProblemNames()) is None
 
 
-def test_a_watch_rings_when_something_has_changed_and_tells_how_long_it_is_silent() -> None:
+def test_a_watch_rings_on_a_change_and_measures_silence() -> None:
     watch = Watch(ExperimentClock.real())
     rung = []
     watch.on_change(lambda: rung.append(watch.changes))
@@ -99,7 +99,7 @@ def test_a_watch_rings_when_something_has_changed_and_tells_how_long_it_is_silen
 
 
 class _Later(ExperimentClock):
-    """A minute later each time that it is asked."""
+    """A clock that advances a minute with each reading."""
 
     looks = 0
 
@@ -108,7 +108,7 @@ class _Later(ExperimentClock):
         return 60.0 * self.looks
 
 
-def test_a_run_that_is_silent_is_said_to_be_and_why_if_that_is_known() -> None:
+def test_a_silent_run_is_reported_with_its_known_reason() -> None:
     said = {"": "", "it was cut off; `…` goes on with it": " It was cut off; `…` goes on with it."}
     for cut_off, told in said.items():
         watch = Watch(_Later(), cut_off=lambda text=cut_off: text)  # type: ignore[misc]

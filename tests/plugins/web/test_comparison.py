@@ -1,4 +1,4 @@
-"""Two scans laid over each other."""
+"""The difference of two aligned scans."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def frame(values: np.ndarray, size_m: tuple[float, float] = SIZE_M, unit: str = 
 
 
 @pytest.mark.parametrize(("x_px", "y_px"), [(0, 0), (5, -3), (-8, 6)])
-def test_what_only_moved_is_no_difference(x_px: int, y_px: int) -> None:
+def test_a_mere_displacement_is_no_difference(x_px: int, y_px: int) -> None:
     found, words = difference(frame(surface()), frame(surface(x_px, y_px)), Levelling.NONE)
     assert words.startswith("registered")
     rough = np.std(surface())
@@ -38,7 +38,7 @@ def test_what_only_moved_is_no_difference(x_px: int, y_px: int) -> None:
     assert found.region == frame(surface()).region
 
 
-def test_a_particle_that_came_is_seen_in_its_place() -> None:
+def test_a_new_particle_is_shown_at_its_place() -> None:
     second = surface(4, 2)
     second[50:56, 30:36] += 100e-9
     found, _ = difference(frame(surface()), frame(second), Levelling.PLANE)
@@ -46,7 +46,7 @@ def test_a_particle_that_came_is_seen_in_its_place() -> None:
     assert (abs(row - (52 + 2)) < 4, abs(column - (32 + 4)) < 4) == (True, True)
 
 
-def test_other_sizes_and_what_can_not_be_registered_are_compared_pixel_by_pixel() -> None:
+def test_scans_of_other_sizes_or_without_registration_are_compared_pixel_by_pixel() -> None:
     _, words = difference(frame(surface()), frame(surface(), (2e-6, 1e-6)), Levelling.NONE)
     assert "sizes differ" in words
     found, words = difference(frame(surface()), frame(np.zeros((SIDE, SIDE))), Levelling.NONE)

@@ -1,4 +1,4 @@
-"""Map, time line, curves, words: what is in the HTML."""
+"""Map, time line, curves and texts in the HTML."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def corners(shape: ElementTree.Element) -> np.ndarray:
 # --- the map ---
 
 
-def test_scans_lie_where_they_were_taken_turned_and_with_y_upwards() -> None:
+def test_scans_lie_at_their_places_rotated_and_with_y_upwards() -> None:
     high = Region((3e-6, 4e-6), (2e-6, 1e-6), 0.5)
     html = map_html(MapContent([taken(1), taken(2, high)]))
     drawn = {shape.get("data-time"): corners(shape) for shape in shapes(html, "scan")}
@@ -77,12 +77,12 @@ def test_scans_lie_where_they_were_taken_turned_and_with_y_upwards() -> None:
     assert np.allclose(high_px - high_px.mean(axis=0), wanted, atol=0.1)
 
 
-def test_a_click_knows_which_scan_and_channel_is_meant() -> None:
+def test_a_scan_on_the_map_carries_its_time_and_channel() -> None:
     (shape,) = shapes(map_html(MapContent([taken(7, channel='A "B"')])), "scan")
     assert (shape.get("data-time"), shape.get("data-channel")) == (str(7 * S), 'A "B"')
 
 
-def test_scans_of_one_place_are_one_on_the_map_and_the_newest_is_meant() -> None:
+def test_scans_of_one_place_are_one_on_the_map_the_newest() -> None:
     places, left_out = places_of([taken(i, channel=c) for i in range(1, 50) for c in ("Height", "Phase")])
     assert left_out == 0
     ((newest, count),) = places
@@ -97,7 +97,7 @@ def test_squares_of_different_sizes_at_one_place_are_all_on_the_map(center_m: tu
     assert drawn == {str(i * S) for i in range(1, 5)}
 
 
-def test_pictures_lie_where_scans_were_taken_the_newest_on_top() -> None:
+def test_pictures_lie_at_the_places_of_their_scans_the_newest_on_top() -> None:
     wide, narrow = Region((0.0, 0.0), (2e-6, 2e-6)), Region((4e-7, 2e-7), (5e-7, 2.5e-7), 0.3)
     html = map_html(MapContent([taken(1, narrow), taken(2, wide, 'A "B"')], pictures="/p"))
     pictures = [shape for shape in svg(html) if shape.tag == "image"]
@@ -130,7 +130,7 @@ def test_a_probe_outside_the_view_is_shown_by_an_arrow_with_its_distance(
     assert "map-away" not in map_html(MapContent([taken(1)], probe_m=(1e-7, 0.0)), whole=False)
 
 
-def test_places_that_a_component_has_found_are_on_the_map() -> None:
+def test_targets_of_a_component_are_on_the_map() -> None:
     overview = Overview()
     message = wire.message_type("SpatialPointWithScoreList")(channel="Height")
     for x_nm, score in ((100.0, 0.5), (-200.0, 0.9)):
@@ -143,14 +143,14 @@ def test_places_that_a_component_has_found_are_on_the_map() -> None:
     assert ["score 0.5" in "".join(shape.itertext()) for shape in drawn] == [True, False]
 
 
-def test_ten_thousand_places_are_drawn_as_far_as_that_makes_sense_and_the_rest_is_told() -> None:
+def test_ten_thousand_places_are_drawn_up_to_a_bound_and_the_rest_counted() -> None:
     scans = [taken(i, Region((i * 1e-6, 0.0), (1e-6, 1e-6))) for i in range(10_000)]
     html = map_html(MapContent(scans))
     assert "8500 older places are left out" in html
     assert len(shapes(html, "scan")) == 1500
 
 
-def test_what_is_set_the_limits_the_probe_and_spectra_are_on_it() -> None:
+def test_region_limits_probe_and_spectra_are_on_the_map() -> None:
     spectrum = SpectrumSummary(5 * S, "IV", (1e-7, 2e-7), Frame.TIP, ("V",), ("V",))
     limits = Region((0.0, 0.0), (20e-6, 20e-6))
     html = map_html(MapContent([taken(1)], [spectrum], HERE.moved_to((1e-6, 0.0)), limits, probe_m=(0.0, 0.0)))
@@ -158,14 +158,14 @@ def test_what_is_set_the_limits_the_probe_and_spectra_are_on_it() -> None:
     assert shapes(html, "spectrum")[0].get("data-spectrum") == str(5 * S)
 
 
-def test_the_part_where_something_was_measured_fills_the_map_unless_all_limits_are_wanted() -> None:
+def test_the_measured_area_fills_the_map_unless_all_limits_are_shown() -> None:
     content = MapContent([taken(1)], limits=Region((0.0, 0.0), (1e-3, 1e-3)))
     near, whole = (np.ptp(corners(shapes(map_html(content, whole=w), "scan")[0]), axis=0).max() for w in (False, True))
     assert near > 600
     assert whole < 2
 
 
-def test_the_limits_move_over_a_sample_that_drifts() -> None:
+def test_the_limits_move_over_a_drifting_sample() -> None:
     mapping = np.array([[1.0, 0.0, -2e-6], [0.0, 1.0, 0.0]])
     content = MapContent([taken(1)], limits=Region((0.0, 0.0), (4e-6, 4e-6)), tip_to_sample=mapping)
     html = map_html(content)
@@ -216,7 +216,7 @@ def test_processes_are_one_row_of_the_time_line_until_one_fails() -> None:
     assert rows(unfolded=False) == ["series", "processes"]
 
 
-def test_scans_are_pictures_on_the_time_line_of_which_the_last_of_those_that_overlap_is_shown() -> None:
+def test_scans_are_pictures_on_the_time_line_the_last_of_overlapping_ones_shown() -> None:
     lane = Overview()
     lane.take("ScopeStateMsg", ScopeStatus(ScopeState.FREE), S)
     html = timeline_html(rows_of(lane, {}), 0, 1400 * S, pictures=[(t * S, f"<img {t}>") for t in (10, 20, 700, 2000)])
@@ -267,14 +267,14 @@ def test_a_long_log_is_shown_to_a_bounded_length() -> None:
     assert "<span>1999</span>" in html
 
 
-def test_refusals_come_with_who_what_and_why() -> None:
+def test_refusals_have_client_request_and_reason() -> None:
     html = refusals_html([JournalEntry(S, "request", "dashboard:Ada", "set bias to 9 V", 9, "above max = 6 V")])
     assert "dashboard:Ada" in html
     assert "set bias to 9 V" in html
     assert "above max = 6 V" in html
 
 
-def test_a_process_is_told_of_in_words() -> None:
+def test_a_process_is_described_in_words() -> None:
     busy = ProcessState("series", "component", ProcessCondition.BUSY, S, 12.4, 3, 7, "killed: frozen")
     condition, since, restarts = process_words(busy)
     assert (condition, since, restarts) == (
@@ -290,7 +290,7 @@ ELSEWHERE = 600
 
 
 def gone() -> Overview:
-    """Two computers, one of which is not heard of from 30 s on."""
+    """Two computers; one of them sends no reports from 30 s on."""
     overview = Overview()
     for time_s in range(1, ELSEWHERE, 2):
         for name, computer in (("scheduler", "here"), ("series", "there")):
@@ -303,20 +303,20 @@ def gone() -> Overview:
     return overview
 
 
-def test_processes_of_a_computer_that_is_gone_are_not_told_of_as_alive() -> None:
+def test_processes_of_a_lost_computer_are_not_shown_as_alive() -> None:
     watch = Watch(ExperimentClock.real(), past=gone())
     silent = unheard(watch, watch.overview)
     assert silent == {"series": (ELSEWHERE - 1 - 29) * S}, "and what has ended there has ended"
     state = watch.overview.processes["series"]
     assert process_words(state, silent["series"])[:2] == (
-        "never heard from", "for 9 min 30 s: its supervisor has ended or can't be reached",
+        "no report", "for 9 min 30 s: its supervisor has ended or can't be reached",
     )  # fmt: skip
     html = time_line_html(watch.overview, ELSEWHERE * S, silent)
-    assert html.count("process-never-heard-from") == 1
-    assert "process-never-heard-from" not in time_line_html(gone(), ELSEWHERE * S)
+    assert html.count("process-no-report") == 1
+    assert "process-no-report" not in time_line_html(gone(), ELSEWHERE * S)
 
 
-def test_a_simulated_night_passes_faster_and_nobody_is_gone_for_that() -> None:
+def test_a_faster_simulated_night_makes_no_process_count_as_gone() -> None:
     watch = Watch(ExperimentClock.starting_now(speed=600.0), past=gone())
     assert unheard(watch, watch.overview) == {}
 
@@ -325,11 +325,11 @@ def test_a_simulated_night_passes_faster_and_nobody_is_gone_for_that() -> None:
 
 
 def lines(options: Any) -> list[list[list[float | None]]]:
-    """The points of each line of a chart, as the browser gets them."""
+    """Return the points of each line of a chart, as the browser gets them."""
     return [one["data"] for one in json.loads(json.dumps(options, allow_nan=False))["series"] if one["type"] == "line"]
 
 
-def test_drift_is_drawn_against_time_and_its_state_told() -> None:
+def test_drift_is_drawn_against_time_with_its_state_in_words() -> None:
     points = [DriftPoint(i * S, (i * 1e-9, -i * 1e-9), (1e-9, 0.0), correcting=True) for i in range(10)]
     chart = drift_chart(points)
     x, y = lines(chart.options)
@@ -341,7 +341,7 @@ def test_drift_is_drawn_against_time_and_its_state_told() -> None:
     assert lines(lost.options)[0][-1] == [11000.0, None], "a gap, and no line to zero"
 
 
-def test_what_was_only_predicted_is_drawn_as_dots() -> None:
+def test_predicted_positions_are_drawn_as_dots() -> None:
     points = [DriftPoint(i * S, (1e-9, 2e-9), (0.0, 0.0), matched=i % 2 == 0) for i in range(4)]
     options = drift_chart(points).options
     assert options is not None
@@ -360,7 +360,7 @@ def test_the_page_says_how_many_scans_were_registered_and_that_the_last_is_dead_
     assert "Registered 3 of 4 scans, 1 failed." in words
 
 
-def test_no_drift_is_said() -> None:
+def test_missing_drift_is_stated() -> None:
     chart = drift_chart([])
     assert "does not track drift" in chart.words
     assert chart.options is None
@@ -382,7 +382,7 @@ def test_a_spectrum_of_one_variable_is_no_error() -> None:
 
 
 @pytest.mark.parametrize("gone", [np.nan, np.inf])
-def test_what_is_not_finite_in_a_spectrum_is_a_gap(gone: float) -> None:
+def test_values_that_are_not_finite_are_gaps_in_a_spectrum(gone: float) -> None:
     values = np.array([[0.0, 1.0], [1.0, gone], [gone, 2.0], [3.0, 3.0]])
     chart = spectrum_chart([(S, Spectrum(None, "IV", ("V", "I"), ("", ""), values, S))], "I")
     assert [point[1] for point in lines(chart.options)[0]] == [1.0, None, None, 3.0]

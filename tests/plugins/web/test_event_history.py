@@ -1,4 +1,4 @@
-"""Events are kept in their order, bounded, and told to be missed where they are not."""
+"""Events are kept in order, bounded, and reported as missed where they are not."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def times(made: EventHistory, after_ns: int) -> list[int]:
     return [event.time_ns for event in made.after(after_ns, ALL, 1000).events]
 
 
-def test_a_client_goes_on_after_the_event_that_it_had_last() -> None:
+def test_a_client_continues_after_its_last_event() -> None:
     made = history(10, 20, 30)
     assert times(made, 20) == [30]
     assert times(made, 15) == [20, 30]
@@ -45,12 +45,12 @@ def test_a_client_goes_on_after_the_event_that_it_had_last() -> None:
     assert times(made, 30) == []
 
 
-def test_what_is_replayed_is_not_told_again() -> None:
+def test_replayed_messages_are_no_new_events() -> None:
     made = history(10, 20, 10, 20, 30)
     assert times(made, -1) == [10, 20, 30]
 
 
-def test_only_the_kinds_asked_for_are_told_and_the_others_passed() -> None:
+def test_only_the_requested_kinds_of_events_are_returned() -> None:
     made = history(10)
     made.take("ControlState", ControlState(ControlMode.MANUAL, None, (1,)), 20)
     batch = made.after(-1, {"control"}, 1000)
@@ -62,14 +62,14 @@ def test_only_the_kinds_asked_for_are_told_and_the_others_passed() -> None:
     assert (batch.events, batch.newest_ns) == ((), 30)
 
 
-def test_what_left_the_memory_is_told_as_missed() -> None:
+def test_events_that_left_the_memory_are_reported_as_missed() -> None:
     made = history(*range(1, MOST_EVENTS + 10))
     oldest = made.after(-1, ALL, 1)
     assert oldest.missed_until_ns == oldest.events[0].time_ns - 1
     assert made.after(MOST_EVENTS, ALL, 1).missed_until_ns is None
 
 
-def test_long_events_take_no_more_memory_than_many() -> None:
+def test_long_events_take_bounded_memory() -> None:
     made = EventHistory(ProblemNames())
     for time_ns in range(1, 40):
         made.take("LogLines", LogLines((LogLine(time_ns, "x", "INFO", "x" * 1_000_000),)), time_ns)
@@ -103,7 +103,7 @@ def test_times_are_texts_and_values_are_left_out() -> None:
     assert second["lines"][0]["time_ns"] == str(2**60)
 
 
-def test_of_a_past_that_only_a_cache_knows_it_is_said_that_some_is_missing() -> None:
+def test_a_past_from_the_cache_alone_is_reported_as_incomplete() -> None:
     made = history(10, 20)
     made.incomplete_before(15)
     assert made.after(5, ALL, 10).missed_until_ns == 15

@@ -21,7 +21,7 @@ def lines(row: int, value: float, began_ns: int = 10 * S, count: int = 1) -> Sca
     return ScanLines(REGION, SHAPE, "Height", "m", row, np.full((count, SHAPE[1]), value), began_ns)
 
 
-def test_a_scan_grows_line_by_line_and_is_then_whole() -> None:
+def test_a_frame_grows_line_by_line_and_is_then_complete() -> None:
     store = FrameStore()
     for row in range(3):
         store.take_lines(lines(row, float(row)))
@@ -39,7 +39,7 @@ def test_a_scan_grows_line_by_line_and_is_then_whole() -> None:
     assert (whole.values == 5.0).all()
 
 
-def test_a_growing_picture_that_was_handed_out_does_not_change_any_more() -> None:
+def test_a_returned_copy_of_a_growing_frame_does_not_change() -> None:
     store = FrameStore()
     store.take_lines(lines(0, 1.0))
     before = store.newest()
@@ -48,7 +48,7 @@ def test_a_growing_picture_that_was_handed_out_does_not_change_any_more() -> Non
     assert np.isnan(before.values[1]).all()
 
 
-def test_a_scan_from_above_tells_which_row_came_last() -> None:
+def test_a_downward_scan_has_its_newest_row() -> None:
     store = FrameStore()
     store.take_lines(lines(7, 1.0))
     store.take_lines(lines(6, 1.0))
@@ -101,7 +101,7 @@ def test_each_channel_has_its_own_newest() -> None:
     assert store.newest("Amplitude") is None
 
 
-def test_scans_are_kept_as_far_as_memory_goes_and_no_further() -> None:
+def test_finished_scans_are_kept_within_the_memory_bound() -> None:
     size = 8 * 8 * 6
     store = FrameStore(memory_bytes=10 * size)
     for i in range(1, 1001):
@@ -119,7 +119,7 @@ def test_a_scan_without_values_is_no_picture() -> None:
     assert store.newest_number() == (0, False)
 
 
-def test_a_picture_is_drawn_once_for_all_who_look_at_it_alike() -> None:
+def test_a_picture_is_drawn_once_for_all_viewers_with_the_same_look() -> None:
     store, drawer = FrameStore(), PictureCache()
     store.take_scan(scan(1.0, 10 * S), 10 * S)
     frame = store.newest()
@@ -143,7 +143,7 @@ def test_compared_pictures_are_drawn_with_one_range() -> None:
     assert drawer.draw(first, look).span != drawer.draw(second, look).span
 
 
-def test_the_head_says_what_is_needed_for_axes_and_fits_a_header() -> None:
+def test_the_head_has_the_data_for_axes_and_fits_a_header() -> None:
     store = FrameStore()
     named = Scan(REGION, "Höhe \n\r Retrace", "m", np.ones((2, 3)), 1763600000123456789)
     store.take_scan(named, 0)
@@ -157,7 +157,7 @@ def test_the_head_says_what_is_needed_for_axes_and_fits_a_header() -> None:
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_what_is_not_finite_can_be_drawn(value: float) -> None:
+def test_values_that_are_not_finite_can_be_drawn(value: float) -> None:
     store = FrameStore()
     store.take_scan(scan(value, 10 * S), 10 * S)
     frame = store.newest()
@@ -165,7 +165,7 @@ def test_what_is_not_finite_can_be_drawn(value: float) -> None:
     assert PictureCache().draw(frame, Look()).png.startswith(b"\x89PNG")
 
 
-def test_lines_that_are_said_to_be_of_millions_of_rows_take_no_memory() -> None:
+def test_lines_that_announce_millions_of_rows_take_no_memory() -> None:
     store = FrameStore()
     store.take_lines(lines(0, 1.0))
     announced = ScanLines(REGION, (3_000_000, 1000), "Phase", "V", 0, np.ones((1, 1000)), 20 * S)

@@ -1,4 +1,4 @@
-"""Who may ask a gateway, from where, and how much may be sent."""
+"""The guard of the gateway: names, origins, and sizes of requests."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Clock:
 
 
 async def echo(scope: Any, receive: Any, send: Any) -> None:
-    """Answers with the name, and how much came."""
+    """Answers with the name and the length of the body."""
     size, more = 0, True
     while more:
         message = await receive()
@@ -60,13 +60,13 @@ def basic(name: str, token: str) -> dict[str, str]:
     return {"Authorization": f"Basic {base64.b64encode(f'{name}:{token}'.encode()).decode()}"}
 
 
-def test_on_this_computer_everybody_looks_and_any_name_acts() -> None:
+def test_on_loopback_every_client_looks_and_any_name_acts() -> None:
     ask = gateway()
     assert ask().text == " 0"
     assert ask(headers=basic("ada", "")).text == "ada 0"
 
 
-def test_where_there_are_tokens_a_name_needs_its_own() -> None:
+def test_with_tokens_a_name_needs_its_own() -> None:
     ask = gateway(PEOPLE)
     assert ask().text == " 0"
     assert ask(headers=basic("ada", "secret")).text == "ada 0"
@@ -77,7 +77,7 @@ def test_where_there_are_tokens_a_name_needs_its_own() -> None:
         assert "Basic" in refused.headers["www-authenticate"]
 
 
-def test_elsewhere_nobody_looks_without_a_token() -> None:
+def test_beyond_loopback_a_client_needs_a_token_to_look() -> None:
     refused = gateway(PEOPLE, host="0.0.0.0")(at="https://lab-pc:8090")
     assert (refused.status_code, refused.json()["code"]) == (401, "name-needed")
 
@@ -96,7 +96,7 @@ def test_wrong_tokens_are_slowed_down_and_lock_out_neither_the_owner_nor_others(
     assert ask(headers=basic("ada", "secret")).text == "ada 0"
 
 
-def test_owner_of_the_token_comes_in_after_five_wrong_ones() -> None:
+def test_the_owner_of_a_token_comes_in_after_five_wrong_ones() -> None:
     ask = gateway(PEOPLE)
     for _ in range(5):
         assert ask(headers=basic("ada", "guess")).status_code == 401
@@ -117,19 +117,19 @@ def test_owner_of_the_token_comes_in_after_five_wrong_ones() -> None:
         ("http://127.0.0.1:8090", {"Sec-Fetch-Site": "cross-site"}),
     ],
 )
-def test_pages_of_others_may_not_ask(at: str, headers: dict[str, str]) -> None:
+def test_pages_of_other_sites_are_refused(at: str, headers: dict[str, str]) -> None:
     for method in ("GET", "POST"):
         refused = gateway()(method, at, headers={**basic("ada", ""), **headers})
         assert (refused.status_code, refused.json()["code"]) == (403, "wrong-origin")
 
 
-def test_pages_that_are_named_may_ask() -> None:
+def test_pages_of_allowed_origins_are_answered() -> None:
     ask = gateway(origins=("http://127.0.0.1:3000",))
     assert ask(headers={"Origin": "http://127.0.0.1:3000", "Sec-Fetch-Site": "cross-site"}).status_code == 200
     assert ask(headers={"Origin": "http://127.0.0.1:3001"}).status_code == 403
 
 
-def test_no_request_is_larger_than_any_needs() -> None:
+def test_requests_beyond_the_size_limit_are_refused() -> None:
     ask = gateway()
     assert ask("POST", content=b"x" * MOST_BODY_BYTES).status_code == 200
     refused = ask("POST", content=b"x" * (MOST_BODY_BYTES + 1))
@@ -147,7 +147,7 @@ def test_no_request_is_larger_than_any_needs() -> None:
         {"people": {"ada": "secret"}},
     ],
 )
-def test_what_would_let_others_in_or_listen_is_refused(settings: dict[str, Any]) -> None:
+def test_settings_open_to_intruders_or_eavesdroppers_are_refused(settings: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         Gateway(**settings)
     Gateway(host="0.0.0.0", people=PEOPLE, certificate="lab.crt", certificate_key="lab.key")  # type: ignore[arg-type]

@@ -19,13 +19,13 @@ PEOPLE = {"Ada": hashed("analytical")}
 
 
 def completed(doing: Coroutine[Any, Any, Any]) -> Any:
-    """What comes of it; in a thread of its own, as a browser that is tested has its loop running in this one."""
+    """Run a coroutine in a thread of its own: the browser under test has its loop running in this one."""
     with ThreadPoolExecutor(1) as thread:
         return thread.submit(asyncio.run, doing).result()
 
 
 class Browser:
-    """Asks an application without a network in between, and keeps its cookies."""
+    """Sends requests to an application without a network, and keeps its cookies."""
 
     def __init__(self, app: Guard, at: str) -> None:
         self._app = app
@@ -46,7 +46,7 @@ class Browser:
         return answer
 
     def talk(self, origin: str) -> list[str]:
-        """What a websocket is told, one word a message."""
+        """Connect a websocket; return the messages it receives, one word each."""
         cookies = "; ".join(f"{cookie.name}={cookie.value}" for cookie in self._cookies.jar)
         headers = {"host": self._at.netloc.decode(), "origin": origin, "cookie": cookies}
         scope = {
@@ -94,7 +94,7 @@ def served() -> Served:
     return serve
 
 
-def test_on_loopback_one_may_look_at_once_and_gives_a_name_to_steer(served: Served) -> None:
+def test_on_loopback_a_viewer_looks_at_once_and_gives_a_name_to_steer(served: Served) -> None:
     browser = served()
     assert browser.get("/").json() == {"person": ""}
     answer = browser.post("/login", data={"person": "Ada"})
@@ -107,7 +107,7 @@ def test_on_loopback_one_may_look_at_once_and_gives_a_name_to_steer(served: Serv
     assert browser.get("/").json() == {"person": ""}
 
 
-def test_elsewhere_everything_but_the_entrance_is_closed(served: Served) -> None:
+def test_beyond_loopback_everything_but_the_sign_in_page_is_closed(served: Served) -> None:
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     assert browser.get("/", headers={"accept": "text/html"}).headers["location"] == "/login"
     assert browser.get("/", headers={"accept": "image/png"}).status_code == 401
@@ -116,7 +116,7 @@ def test_elsewhere_everything_but_the_entrance_is_closed(served: Served) -> None
     assert browser.get("/login").status_code == 200
 
 
-def test_the_password_opens_it(served: Served) -> None:
+def test_the_password_opens_the_page(served: Served) -> None:
     browser = served("0.0.0.0", KEPT, "https://lab:8080")
     assert browser.post("/login", data={"person": "Eve", "password": "guess"}).status_code == 403
     answer = browser.post("/login", data={"person": "Ada", "password": "analytical"})
@@ -137,15 +137,15 @@ def test_a_cookie_is_worth_nothing_after_signing_out(served: Served, everywhere:
     assert browser.get("/", headers={"cookie": kept}).status_code == 401
 
 
-def test_guessing_is_slowed_down_and_said_to_be(served: Served) -> None:
+def test_guessing_is_slowed_down_with_a_message(served: Served) -> None:
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     answers = [browser.post("/login", data={"person": "Eve", "password": f"guess {i}"}) for i in range(6)]
     assert [answer.status_code for answer in answers] == [403, 403, 403, 403, 403, 429]
     assert "try again in 3 s" in answers[-1].text
 
 
-def test_link_with_a_token_signs_nobody_in(served: Served) -> None:
-    """A page of another site may hold one: its reader would steer under the name of its author."""
+def test_a_link_with_a_token_signs_no_person_in(served: Served) -> None:
+    """Another site's page may contain such a link: its reader would steer under the name of its author."""
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     answer = browser.get("/?token=analytical&name=Ada", headers={"accept": "text/html"})
     assert (answer.status_code, answer.headers["location"]) == (303, "/login")
@@ -153,7 +153,7 @@ def test_link_with_a_token_signs_nobody_in(served: Served) -> None:
     assert browser.get("/?token=analytical&name=Ada").status_code == 401
 
 
-def test_a_program_shows_its_token_each_time(served: Served) -> None:
+def test_a_program_sends_its_token_with_each_request(served: Served) -> None:
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     shown = {"authorization": "Bearer analytical"}
     assert browser.post("/act?name=Ada", headers=shown).json() == {"person": "Ada"}
@@ -163,7 +163,7 @@ def test_a_program_shows_its_token_each_time(served: Served) -> None:
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:9999", "null", "http://["])
-def test_pages_of_others_may_not_ask_it(served: Served, origin: str) -> None:
+def test_pages_of_other_sites_may_not_steer(served: Served, origin: str) -> None:
     browser = served()
     assert browser.post("/act", headers={"origin": origin}).status_code == 403
     assert browser.talk(origin) == ["close"]
@@ -171,24 +171,24 @@ def test_pages_of_others_may_not_ask_it(served: Served, origin: str) -> None:
     assert browser.talk("http://127.0.0.1:8080") == ["accept", "hello", "close"]
 
 
-def test_on_loopback_it_answers_to_no_other_name(served: Served) -> None:
+def test_on_loopback_requests_for_other_host_names_are_refused(served: Served) -> None:
     assert served(at="http://rebound.example:8080").get("/").status_code == 403
     assert served(at="http://localhost:8080").get("/").status_code == 200
 
 
 @pytest.mark.parametrize("host", ["[", "lab:port", "[::1"])
-def test_host_that_is_none_is_refused(served: Served, host: str) -> None:
+def test_a_malformed_host_is_refused(served: Served, host: str) -> None:
     browser = served("0.0.0.0", KEPT, "http://lab:8080")
     assert browser.get("/", headers={"host": host}).status_code == 403
 
 
-def test_nothing_from_elsewhere_is_loaded_and_nobody_frames_it(served: Served) -> None:
+def test_nothing_external_is_loaded_and_framing_is_forbidden(served: Served) -> None:
     headers = served().get("/").headers
     assert "default-src 'self'" in headers["content-security-policy"]
     assert headers["x-frame-options"] == "DENY"
 
 
-def test_the_entrance_says_what_is_not_safe_and_shows_names_as_text(served: Served) -> None:
+def test_the_sign_in_page_warns_of_missing_encryption_and_escapes_names(served: Served) -> None:
     page = served("0.0.0.0", KEPT, "http://lab:8080").get("/login").text
     assert "not encrypted" in page
     assert "certificate_key" in page

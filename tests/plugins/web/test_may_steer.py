@@ -1,4 +1,4 @@
-"""Steering asks for nothing in nobody's name, whatever the page lets a viewer press."""
+"""Steering sends no request without a name, even if the page shows a button."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def steering(access: Access, monkeypatch: pytest.MonkeyPatch) -> Steering:
 
 
 def done(steering: Steering, visitor: Visitor) -> list[Any]:
-    """In whose names an act was carried out."""
+    """Return the names under which an action was carried out."""
     asked: list[Any] = []
 
     def act(actions: Any) -> ActionResult:
@@ -48,7 +48,7 @@ def test_a_nameless_person_may_not_steer(steering: Steering, person: str) -> Non
     assert "Sign in" in steering.do(Visitor(person), cast("Any", str)).result(5.0).text
 
 
-def test_a_page_that_is_still_open_after_signing_out_steers_no_more(steering: Steering, access: Access) -> None:
+def test_an_open_page_steers_no_more_after_signing_out(steering: Steering, access: Access) -> None:
     cookie = access.enter("Ada", "", "x")
     visitor = access.visitor(cookie)
     assert visitor is not None

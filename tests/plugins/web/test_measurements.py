@@ -1,4 +1,4 @@
-"""A measurement is begun once for its key, whatever is refused, lost or killed in between."""
+"""A measurement is begun once for its key, over refusals, losses and kills."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOT_FREE = Response(int(ControlResponse.NOT_FREE))
 
 
 class Commands:
-    """A scheduler that answers as it is told, and keeps the ids that it was asked with."""
+    """A scheduler with given answers that keeps the ids of its requests."""
 
     def __init__(self, *answers: Response) -> None:
         self.answers = list(answers)
@@ -71,7 +71,7 @@ def file(tmp_path: Path) -> Path:
     return tmp_path / "measurements.json"
 
 
-def test_it_is_done_with_the_scan_and_not_begun_again(file: Path) -> None:
+def test_a_finished_measurement_is_not_begun_again(file: Path) -> None:
     lab, commands = Lab(file), Commands(OK)
     assert lab.begin(commands).state == "running"
     lab.publish(ScopeState.SCANNING, scan(), ScopeState.FREE)
@@ -80,7 +80,7 @@ def test_it_is_done_with_the_scan_and_not_begun_again(file: Path) -> None:
     assert commands.ids == ["gateway:ada/key/tile/1"]
 
 
-def test_each_attempt_that_was_refused_is_followed_by_one_of_another_id(file: Path) -> None:
+def test_a_refused_attempt_is_followed_by_one_with_another_id(file: Path) -> None:
     lab, commands = Lab(file), Commands(NOT_FREE, NOT_IN_CONTROL, OK)
     with pytest.raises(RefusedRequest) as refused:
         lab.begin(commands)
@@ -89,7 +89,7 @@ def test_each_attempt_that_was_refused_is_followed_by_one_of_another_id(file: Pa
     assert commands.ids == [f"gateway:ada/key/tile/{n}" for n in (1, 2, 3)]
 
 
-def test_what_may_have_begun_is_asked_for_again_by_its_own_id(file: Path) -> None:
+def test_an_attempt_of_unknown_outcome_is_repeated_under_its_own_id(file: Path) -> None:
     lab, commands = Lab(file), Commands(SILENCE, OK)
     with pytest.raises(RefusedRequest) as refused:
         lab.begin(commands)
@@ -98,7 +98,7 @@ def test_what_may_have_begun_is_asked_for_again_by_its_own_id(file: Path) -> Non
     assert commands.ids == ["gateway:ada/key/tile/1"] * 2
 
 
-def test_a_scan_that_was_never_answered_counts_when_it_comes(file: Path) -> None:
+def test_an_unanswered_scan_counts_when_its_result_arrives(file: Path) -> None:
     lab = Lab(file)
     with pytest.raises(RefusedRequest):
         lab.begin(Commands(SILENCE))
@@ -106,7 +106,7 @@ def test_a_scan_that_was_never_answered_counts_when_it_comes(file: Path) -> None
     assert lab.found().state == "done"
 
 
-def test_an_interrupted_one_fails_and_may_be_begun_again(file: Path) -> None:
+def test_an_interrupted_measurement_fails_and_may_be_begun_again(file: Path) -> None:
     lab, commands = Lab(file), Commands(OK, OK)
     lab.begin(commands)
     lab.publish(ScopeState.SCANNING, ScopeState.INTERRUPTED)
@@ -115,7 +115,7 @@ def test_an_interrupted_one_fails_and_may_be_begun_again(file: Path) -> None:
     assert commands.ids[-1].endswith("/2")
 
 
-def test_one_that_never_begins_does_not_run_for_ever(file: Path) -> None:
+def test_a_measurement_that_never_begins_ends(file: Path) -> None:
     lab = Lab(file)
     lab.begin(Commands(OK))
     assert lab.found().state == "running"
@@ -123,7 +123,7 @@ def test_one_that_never_begins_does_not_run_for_ever(file: Path) -> None:
     assert lab.found().model().refusal.code is RefusalCode.NO_RESULT  # type: ignore[union-attr]
 
 
-def test_a_restarted_gateway_goes_on_by_what_is_replayed(file: Path) -> None:
+def test_a_restarted_gateway_continues_with_the_replay(file: Path) -> None:
     Lab(file).begin(Commands(OK))
     lab = Lab(file)
     assert lab.found().state == "running"
@@ -132,7 +132,7 @@ def test_a_restarted_gateway_goes_on_by_what_is_replayed(file: Path) -> None:
     assert Lab(file).found().state == "done"
 
 
-def test_a_key_is_of_one_measurement_and_of_one_client(file: Path) -> None:
+def test_a_key_belongs_to_one_measurement_of_one_client(file: Path) -> None:
     lab = Lab(file)
     lab.begin(Commands(OK))
     other = ScanTarget.of(None, None, Frame.TIP)

@@ -1,4 +1,4 @@
-"""What a panel makes of names that somebody else chose, without a browser."""
+"""A panel with names from outside, without a browser."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.plugins.web.dashboard.panels import HealthPanel
 HOSTILE = """x" onmouseover="alert(1)" innerHTML="<img src=x onerror=alert(2)>"""
 
 
-def test_a_name_with_quotation_marks_sets_no_other_property() -> None:
+def test_a_name_with_quotation_marks_sets_no_property_of_an_element() -> None:
     with Client(ui.page("/")) as client:
         panel = HealthPanel(cast("Any", SimpleNamespace(may_steer=True)))
         panel.show([ProcessState(HOSTILE, "component", ProcessCondition.ALIVE, 1)], {})

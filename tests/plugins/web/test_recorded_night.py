@@ -70,7 +70,7 @@ def night(tmp_path: Path) -> Night:
     return Night(tmp_path)
 
 
-def test_at_each_moment_it_is_as_it_was(night: Night) -> None:
+def test_a_night_at_each_moment_equals_the_live_state(night: Night) -> None:
     watch = NightWatch(night)
     assert (len(watch.overview.scans), watch.overview.control) == (2, ControlState(ControlMode.MANUAL))
     assert watch.tip_to_sample is not None
@@ -83,7 +83,7 @@ def test_at_each_moment_it_is_as_it_was(night: Night) -> None:
     assert found.values.tolist() == np.ones((3, 2)).tolist()
 
 
-def test_when_the_run_is_over_no_process_is_alive(night: Night) -> None:
+def test_no_process_is_alive_after_the_run(night: Night) -> None:
     watch = NightWatch(night)
     contents = Contents(watch, None)
     (process,) = contents.get().processes
@@ -98,7 +98,7 @@ def test_in_manual_mode_the_page_says_that_a_person_is_in_control(night: Night) 
     assert "a person</b> is in control" in contents.get().status
 
 
-def test_forth_and_back_is_the_same(night: Night) -> None:
+def test_going_forth_and_back_gives_the_same_state(night: Night) -> None:
     watch, straight = NightWatch(night), NightWatch(night)
     for at_s in (5, 41, 12, 30, 22):
         watch.go(START + at_s * S)
@@ -107,7 +107,7 @@ def test_forth_and_back_is_the_same(night: Night) -> None:
     assert watch.overview.timelines.control.spans == straight.overview.timelines.control.spans
 
 
-def test_the_page_is_made_of_the_moment(night: Night) -> None:
+def test_the_page_shows_the_moment(night: Night) -> None:
     watch = NightWatch(night)
     contents = Contents(watch, None)
     assert "MANUAL" in contents.get().status
@@ -118,7 +118,7 @@ def test_the_page_is_made_of_the_moment(night: Night) -> None:
     assert contents.get().slow.time_line != ""
 
 
-def test_a_note_of_the_morning_stands_at_the_moment_that_it_is_about(night: Night) -> None:
+def test_a_later_note_stands_at_the_moment_that_it_describes(night: Night) -> None:
     watch, other = NightWatch(night), NightWatch(night)
     contents = Contents(watch, None)
     contents.get()
@@ -136,7 +136,7 @@ def test_a_note_of_the_morning_stands_at_the_moment_that_it_is_about(night: Nigh
     assert isinstance(overview.notes[0], Note)
 
 
-def test_the_flip_book_has_the_scans_of_which_the_place_is_known(night: Night) -> None:
+def test_the_flip_book_has_the_scans_with_a_known_place(night: Night) -> None:
     ((number, found),) = night.drifted().items()
     assert (number, found.tip_m) == (2, (30e-9, -10e-9))
     assert found.sample_m == pytest.approx((0.0, 0.0), abs=1e-15)

@@ -1,4 +1,4 @@
-"""What stands beside a scan: its number, times, and what was set."""
+"""Facts beside a scan: its number, times, and parameters."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ def overview_of(packets: Sequence[tuple[str, Any, int]]) -> Overview:
     return overview
 
 
-def test_channels_of_one_scan_have_one_number_and_scans_are_counted() -> None:
+def test_channels_of_one_scan_share_one_number() -> None:
     overview = overview_of([*a_scan(10), *a_scan(40), *a_scan(70)])
     assert [one.number for one in overview.scans] == [1, 1, 2, 2, 3, 3]
 
 
-def test_a_finished_scan_is_told_with_number_time_holder_place_and_what_was_set() -> None:
+def test_a_finished_scan_has_number_time_holder_place_and_parameters() -> None:
     overview = overview_of([*a_scan(10), *a_scan(40)])
     frame = ChannelFrame(1, "Height", "m", REGION, VALUES, 50 * S, None, 2)
     facts = dict(scan_facts(frame, overview, {"Bias": "100 mV"}, 60 * S))
@@ -60,7 +60,7 @@ def test_a_finished_scan_is_told_with_number_time_holder_place_and_what_was_set(
     }  # fmt: skip
 
 
-def test_a_scan_from_before_the_page_has_the_recorded_setpoint_of_its_beginning() -> None:
+def test_a_scan_before_the_page_s_start_has_its_recorded_setpoint() -> None:
     feedback = [("ZCtrlParameters", Feedback(setpoint=value), time_s * S) for value, time_s in ((0.7, 5), (0.5, 45))]
     overview = overview_of(sorted([*a_scan(10), *a_scan(40), *a_scan(70), *feedback], key=lambda packet: packet[2]))
     frames = [ChannelFrame(1, "Height", "m", REGION, VALUES, time_s * S, None, 2) for time_s in (50, 80)]
@@ -70,7 +70,7 @@ def test_a_scan_from_before_the_page_has_the_recorded_setpoint_of_its_beginning(
     assert dict(scan_facts(frames[0], overview, read, 90 * S))["Setpoint"] == "700 mV"
 
 
-def test_a_growing_scan_is_told_with_when_it_ends() -> None:
+def test_a_growing_scan_has_its_expected_end() -> None:
     overview = overview_of([*a_scan(10), *states((ScopeState.SCANNING, 40))])
     frame = ChannelFrame(1, "Height", "m", REGION, VALUES, None, 40 * S, 1, 0)
     facts = dict(scan_facts(frame, overview, {}, 44 * S))
@@ -99,7 +99,7 @@ def test_conditions_are_read_when_a_scan_begins_and_belong_to_it_alone() -> None
     assert conditions.at(4 * S) == {}
 
 
-def test_a_thumbnail_is_small_and_of_what_is_not_kept_there_is_none() -> None:
+def test_a_thumbnail_is_small_and_a_scan_no_longer_kept_has_none() -> None:
     values = np.add.outer(np.arange(300.0), np.arange(900.0)) * 1e-12 + 1.0
     values[100:140, 300:400] += 1e-9
     frame = ChannelFrame(1, "Height", "m", REGION, values, S, None, 300)

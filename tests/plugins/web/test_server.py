@@ -1,4 +1,4 @@
-"""Where the page is served, and under which name it is found; encrypted with the certificate that the docs make."""
+"""The server: addresses, names, stalled clients; encrypted with the certificate that the docs make."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "watch-and-steer.md"
 
 @pytest.fixture
 def certificate(tmp_path: Path) -> Path:
-    """Made as the how-to says, for this computer."""
+    """Made as in the how-to, for this computer."""
     if shutil.which("openssl") is None:
         pytest.skip("no openssl is found: `apt install openssl`")
     command = re.search(r"^\$ (openssl req .*\\\n.*)$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
@@ -46,7 +46,7 @@ async def hello(scope: Any, receive: Any, send: Any) -> None:
     await send({"type": "http.response.body", "body": scope["scheme"].encode()})
 
 
-def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) -> None:
+def test_a_client_that_trusts_the_certificate_connects_encrypted(certificate: Path) -> None:
     bound = listening("127.0.0.1", 0)
     server = WebServer(hello, bound, certificate, certificate.with_suffix(".key"))
     url = url_of("127.0.0.1", bound.getsockname()[1], encrypted=True)
@@ -63,8 +63,8 @@ def test_whoever_trusts_the_certificate_comes_in_encrypted(certificate: Path) ->
         server.stop()
 
 
-def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
-    """By the address it is counted how often somebody was wrong."""
+def test_a_forged_header_is_not_taken_as_the_client_s_address() -> None:
+    """Wrong passwords are counted by address."""
 
     async def origin(scope: Any, receive: Any, send: Any) -> None:
         await hello({**scope, "scheme": scope.get("client", ("",))[0]}, receive, send)
@@ -83,14 +83,14 @@ def test_a_forged_header_is_not_the_address_of_whoever_asks() -> None:
         server.stop()
 
 
-def test_what_is_no_certificate_is_refused(certificate: Path) -> None:
+def test_a_malformed_certificate_is_refused(certificate: Path) -> None:
     with listening("127.0.0.1", 0) as bound:
         for wrong in (certificate.with_name("none.crt"), PAGE):
             with pytest.raises(ConfigError, match="certificate or certificate_key can't be loaded"):
                 WebServer(hello, bound, wrong, certificate.with_suffix(".key"))
 
 
-def test_a_port_that_is_taken_is_told_unless_any_will_do() -> None:
+def test_a_taken_port_is_an_error_unless_any_port_will_do() -> None:
     with listening("127.0.0.1", 0) as first:
         taken = first.getsockname()[1]
         with pytest.raises(ConfigError, match=f"can't listen at 127.0.0.1, port {taken}"):
@@ -109,7 +109,7 @@ def test_a_port_that_is_taken_is_told_unless_any_will_do() -> None:
         ("::", f"http://{socket.gethostname()}:8080"),
     ],
 )
-def test_where_it_is_can_be_typed_into_a_browser(host: str, url: str) -> None:
+def test_the_url_works_in_a_browser(host: str, url: str) -> None:
     assert url_of(host, 8080, encrypted=False) == url
 
 
@@ -124,7 +124,7 @@ Serve = Callable[..., Callable[[], socket.socket]]
 
 @pytest.fixture
 def serve() -> Iterator[Serve]:
-    """Serve an application; returns what opens a connection to it."""
+    """Serve an application; returns a function that opens a connection to it."""
     with ExitStack() as stack:
 
         def begin(app: Any = hello, **settings: Any) -> Callable[[], socket.socket]:
@@ -139,12 +139,12 @@ def serve() -> Iterator[Serve]:
 
 
 def status(connection: socket.socket) -> int:
-    """Return the status of the answer that comes next."""
+    """Return the status of the next answer."""
     return int(connection.makefile("rb").readline().split()[1])
 
 
 def closes(connection: socket.socket) -> bool:
-    """Return whether the server ends a connection; an answer before that is passed over."""
+    """Return whether the server ends a connection; an earlier answer is skipped."""
     connection.settimeout(LONG_S)
     with suppress(ConnectionError):
         while connection.recv(1 << 16):
@@ -168,7 +168,7 @@ def test_head_of_the_greatest_length_is_answered(serve: Serve) -> None:
     assert status(connection) == 200
 
 
-def test_half_requests_keep_nobody_out(serve: Serve) -> None:
+def test_half_requests_do_not_block_other_clients(serve: Serve) -> None:
     connect = serve(most_requests=2)
     halves = [connect() for _ in range(2 * web_server.MOST_UNFINISHED)]
     for half in halves:
@@ -180,7 +180,7 @@ def test_half_requests_keep_nobody_out(serve: Serve) -> None:
     assert closes(halves[0])
 
 
-def test_tls_handshakes_that_never_end_keep_nobody_out_and_end_in_time(certificate: Path) -> None:
+def test_endless_tls_handshakes_do_not_block_other_clients_and_end_in_time(certificate: Path) -> None:
     bound = listening("127.0.0.1", 0)
     address = bound.getsockname()
     server = WebServer(hello, bound, certificate, certificate.with_suffix(".key"), head_s=2.0)
@@ -236,7 +236,7 @@ def test_body_that_does_not_come_ends_the_connection(serve: Serve) -> None:
     assert closes(connection)
 
 
-def test_only_requests_that_are_being_answered_count(serve: Serve) -> None:
+def test_only_requests_in_progress_count(serve: Serve) -> None:
     go_on, loops = asyncio.Event(), list[asyncio.AbstractEventLoop]()
 
     async def slow(scope: Any, receive: Any, send: Any) -> None:

@@ -1,4 +1,4 @@
-"""What a person may write and choose, and what is said about a problem."""
+"""Inputs and choices of a person, and the advice about a problem."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CHOICE = ScanChoice(Region((1e-6, 2e-6), (4e-7, 2e-7), 0.3), (32, 64))
     ("parameter", "text"),
     [("scan-speed", "4 µm/s"), ("scan-resolution-x", "64"), ("zctrl-setpoint", "0.5"), ("tip-bias-voltage", "-0.1 V")],
 )
-def test_a_value_with_its_unit_can_be_meant(parameter: str, text: str) -> None:
+def test_a_value_with_its_unit_is_clear(parameter: str, text: str) -> None:
     assert unclear(parameter, text, "") == ""
 
 
@@ -49,7 +49,7 @@ def test_a_scan_is_edited_with_units_and_has_square_pixels() -> None:
     assert edited.shape == (64, 128)
 
 
-def test_a_scan_is_turned_by_an_angle_with_its_unit() -> None:
+def test_a_scan_is_rotated_by_an_angle_with_its_unit() -> None:
     assert CHOICE.edited("1 um", "1 um", "8", "-90 deg").region.angle_rad == pytest.approx(-math.pi / 2)
     with pytest.raises(UnitError):
         CHOICE.edited("1 um", "1 um", "8", "30")
@@ -80,12 +80,12 @@ def test_a_scan_is_made_a_square_of_its_longer_side() -> None:
     [("400", "400 nm", "64"), ("-1 nm", "1 nm", "64"), ("0 nm", "1 nm", "8"), ("1 nm", "2 V", "8"),
      ("1 nm", "1 nm", "0"), ("1 nm", "1 nm", "6.5"), ("1 nm", "1 nm", "99999"), ("inf nm", "1 nm", "8")],
 )  # fmt: skip
-def test_what_is_no_scan_is_refused(width: str, height: str, pixels: str) -> None:
+def test_impossible_scans_are_refused(width: str, height: str, pixels: str) -> None:
     with pytest.raises((UnitError, InvalidValue)):
         CHOICE.edited(width, height, pixels)
 
 
-def test_a_problem_says_what_to_do_and_whether_a_component_does_it() -> None:
+def test_a_problem_has_advice_and_names_the_component_that_solves_it() -> None:
     overview = Overview()
     overview.take("ControlState", ControlState(ControlMode.AUTOMATED, None, (int(Problem.TIP_SHAPE_CHANGED), 9)), S)
     tip, own = flags(overview)

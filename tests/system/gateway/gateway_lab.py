@@ -1,4 +1,4 @@
-"""An experiment with a gateway, and a client that has nothing but Python's standard library."""
+"""An experiment with a gateway, and a client that uses only Python's standard library."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class Event:
 
 
 class Client:
-    """Asks a gateway, in a connection for each request."""
+    """Sends requests to a gateway, each in a connection of its own."""
 
     def __init__(self, url: str, name: str = "", token: str = "") -> None:
         self.address = urlsplit(url).netloc
@@ -105,14 +105,14 @@ class Client:
         return answer.body
 
     def until_measured(self, key: str) -> Any:
-        """The measurement at its end."""
+        """Return the measurement at its end."""
         end_s = time.monotonic() + DEADLINE_S
         while (found := self.get(f"/measurements/{key}?wait_s=5"))["state"] == "running":
             assert time.monotonic() < end_s, found
         return found
 
     def events(self, path: str = "/events", last: str = "") -> Generator[Event]:
-        """What is streamed, until the gateway closes or vanishes."""
+        """Yield the streamed events until the gateway closes or vanishes."""
         connection = HTTPConnection(self.address, timeout=DEADLINE_S)
         connection.request("GET", f"/v1{path}", headers={**self.headers, **({"Last-Event-ID": last} if last else {})})
         stream = connection.getresponse()
@@ -123,7 +123,7 @@ class Client:
             connection.close()
 
     def read_events(self, stream: IO[bytes]) -> Iterator[Event]:
-        """The events in a stream, up to the last whole one."""
+        """Return the events in a stream, up to the last complete one."""
         parts = dict[str, str]()
         try:
             while line := stream.readline().decode():

@@ -1,4 +1,4 @@
-"""The gateway does what its OpenAPI description says, as far as thousands of requests made from it can tell."""
+"""The gateway follows its OpenAPI description, in thousands of requests generated from it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_each_route_has_an_example_and_each_refusal_its_model(started: Started) 
 
 
 @pytest.mark.timeout(400)
-def test_requests_made_from_the_description_are_answered_as_it_says(started: Started, tmp_path: Path) -> None:
+def test_requests_generated_from_the_description_are_answered_accordingly(started: Started, tmp_path: Path) -> None:
     program = shutil.which("schemathesis", path=str(Path(sys.executable).parent))
     if program is None:
         pytest.skip("there is no schemathesis: `make test-gateway` installs it")

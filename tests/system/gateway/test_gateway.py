@@ -1,4 +1,4 @@
-"""A program that has nothing but HTTP takes part in an experiment."""
+"""A program that speaks only HTTP takes part in an experiment."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_client_that_vanishes_in_a_scan_loses_control_and_the_scan_is_stopped(
     assert ada.ask("PUT", "/control", {}).code == "not-in-control"
 
 
-def test_a_killed_gateway_goes_on_with_its_scans_and_its_clients_with_their_events(started: Started) -> None:
+def test_a_killed_gateway_continues_its_scans_and_its_clients_their_events(started: Started) -> None:
     run = started('[control]\ngrace = "60 s"\n', speed=20.0)
     ada = run.client("ada")
     ada.done("POST", "/control", {"lease_s": 60})
@@ -162,7 +162,7 @@ def test_spectra_from_before_a_restart_are_served_from_the_record(started: Start
     ada.done("POST", "/end")
 
 
-def test_a_reader_that_stalls_is_dropped_and_goes_on_without_loss(started: Started, tmp_path: Path) -> None:
+def test_a_stalled_reader_is_dropped_and_continues_without_loss(started: Started, tmp_path: Path) -> None:
     (tmp_path / "impatient.py").write_text(
         "from afspm.plugins.web.gateway.gateway import Gateway\n\n\nclass Impatient(Gateway):\n    stalled_s = 1.0\n",
         encoding="utf-8",
@@ -190,7 +190,7 @@ def test_a_reader_that_stalls_is_dropped_and_goes_on_without_loss(started: Start
     ada.done("POST", "/end")
 
 
-def test_strangers_take_neither_control_nor_its_lease_from_the_owner_of_a_token(started: Started) -> None:
+def test_strangers_can_not_take_control_or_lease_from_the_owner_of_a_token(started: Started) -> None:
     run = started(settings=f"people.ada = {hashed('secret')!r}")
     ada, guesser = run.client("ada", "secret"), run.client("ada", "guess")
     address = urlsplit(run.url)
@@ -214,7 +214,7 @@ def test_strangers_take_neither_control_nor_its_lease_from_the_owner_of_a_token(
 
 
 def _wait_until_dropped(process: psutil.Process, port: int) -> None:
-    """Wait until a process has no connection any more with a client at a port."""
+    # until the process has no connection left with a client at this port
     end_s = time.monotonic() + DEADLINE_S
     while any(one.raddr and one.raddr.port == port for one in process.net_connections()):
         assert time.monotonic() < end_s, "it keeps its connection"
@@ -222,7 +222,7 @@ def _wait_until_dropped(process: psutil.Process, port: int) -> None:
 
 
 def _streaming(run: GatewayRun, path: str) -> socket.socket:
-    """A connection by which events are streamed, of which little is taken unless it is read."""
+    # a small receive buffer: the stream stalls unless it is read
     host, _, port = Client(run.url).address.partition(":")
     connection = socket.socket()
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -233,7 +233,7 @@ def _streaming(run: GatewayRun, path: str) -> socket.socket:
     return connection
 
 
-def test_twenty_clients_at_a_time_are_not_noticed_by_the_experiment(started: Started) -> None:
+def test_twenty_clients_at_a_time_do_not_disturb_the_experiment(started: Started) -> None:
     scans = 8
     run = started(SERIES.format(every="1 min", scans=scans) + "end_when_done = true\n", speed=20.0)
     over, refused, failed = threading.Event(), list[str](), list[str]()

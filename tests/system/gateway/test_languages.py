@@ -1,4 +1,4 @@
-"""The scripts of the sample, each in its language, beside the series that it disturbs no more than it says."""
+"""The scripts of the sample, each in its language, beside the series; they disturb it no more than stated."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def served() -> Iterator[str]:
-    """The origin of the page, which is not that of the gateway."""
+    """The origin of the page, different from the gateway's."""
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(SAMPLE))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{server.server_port}"
@@ -41,7 +41,9 @@ def test_the_page_shows_each_new_scan(started: Started, browser: Any, served: st
     page.close()
 
 
-def test_a_page_that_is_not_named_hears_nothing_and_does_nothing(started: Started, browser: Any, served: str) -> None:
+def test_a_page_of_another_origin_receives_nothing_and_does_nothing(
+    started: Started, browser: Any, served: str
+) -> None:
     run = started()
     page = browser.new_page()
     page.goto(f"{served}/page.html")

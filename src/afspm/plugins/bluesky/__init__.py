@@ -5,8 +5,8 @@
         scope = Microscope("runs", parameters=["tip-bias-voltage"])
     RE(bp.scan([scope.scan], scope.scan.center_x, -1e-6, 1e-6, 5))
 
-The scheduler decides as it does for a notebook: a plan waits for control, limits hold, a repair of the tip comes first.
-While a plan has staged the microscope, it keeps control. A plan that is aborted stops what is being measured.
+The scheduler treats a plan like a notebook: the plan waits for control, limits hold, a repair of the tip comes first. A
+plan keeps control while it has staged the microscope. An aborted plan stops its measurement.
 """
 
 from __future__ import annotations
@@ -51,12 +51,13 @@ class _PlanSession:
     def __init__(self, where: str | Path, name: str) -> None:
         self.source = f"afspm://{Path(where).as_posix()}"
         self._open = partial(connect, where, name)
+        # a scope blocks: its calls must not run in the event loop
         self._thread = ThreadPoolExecutor(1, "afspm")
         self._scope: Scope | None = None
         self._running: Future[Any] | None = None
 
     async def call(self, ask: Callable[[Scope], T]) -> T:
-        """Return what the scope answers. A task that is cancelled meanwhile interrupts the call."""
+        """Call the scope in its thread and return the result. Cancelling the task interrupts the call."""
         self._running = asked = self._thread.submit(self._ask, ask)
         try:
             return await asyncio.wrap_future(asked)
@@ -65,16 +66,17 @@ class _PlanSession:
             raise
 
     def interrupt(self) -> None:
-        """End the call that is under way: a measurement is stopped."""
+        """End the current call, which stops a measurement."""
         if self._scope is not None and self._running is not None and not self._running.done():
             self._scope.interrupt()
 
     def _ask(self, ask: Callable[[Scope], T]) -> T:
+        # connected on first use, in the thread that uses it
         if self._scope is None:
             self._scope = self._open()
         try:
             return ask(self._scope)
-        except KeyboardInterrupt:  # which would end the event loop
+        except KeyboardInterrupt:  # it would end the event loop
             raise InterruptedError("the measurement was stopped") from None
 
 
@@ -85,7 +87,7 @@ class _ParameterBackend(SignalBackend[float]):
         super().__init__(float)
         self._session = session
         self._parameter = parameter
-        self._told: Callback[Reading[float]] | None = None
+        self._callback: Callback[Reading[float]] | None = None
         self._reading = Reading(value=np.nan, timestamp=0.0)
 
     def source(self, name: str, read: bool) -> str:
@@ -113,19 +115,19 @@ class _ParameterBackend(SignalBackend[float]):
         return await self.get_value()
 
     def set_callback(self, callback: Callback[Reading[float]] | None) -> None:
-        self._told = callback
+        self._callback = callback
         if callback is not None:
             callback(self._reading)
 
-    def _take(self, told: Reading[Value]) -> Reading[float]:
-        self._reading = Reading(value=float(told["value"]), timestamp=told["timestamp"])
-        if self._told is not None:
-            self._told(self._reading)
+    def _take(self, reading: Reading[Value]) -> Reading[float]:
+        self._reading = Reading(value=float(reading["value"]), timestamp=reading["timestamp"])
+        if self._callback is not None:
+            self._callback(self._reading)
         return self._reading
 
 
 class _Measurement(StandardReadable, Triggerable):
-    """Something that is measured where its signals say, with an array for each channel or variable."""
+    """A measurement at the place of its signals, with an array for each channel or variable."""
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
         self._session = session
@@ -138,11 +140,11 @@ class _Measurement(StandardReadable, Triggerable):
         return described | {f"{self.name}-{field}": key for field, key in self._keys.items()}
 
     async def read(self) -> dict[str, Reading[Any]]:
-        told: dict[str, Reading[Any]] = await super().read()
-        return told | {f"{self.name}-{field}": reading for field, reading in self._readings.items()}
+        readings: dict[str, Reading[Any]] = await super().read()
+        return readings | {f"{self.name}-{field}": reading for field, reading in self._readings.items()}
 
     async def _measured(self, ask: Callable[[Scope], T]) -> T | None:
-        """Return what was measured; None: the plan was aborted, and the measurement stopped."""
+        # None: the plan was aborted, and the measurement stopped
         self._keys, self._readings = {}, {}
         try:
             return await self._session.call(ask)
@@ -167,7 +169,8 @@ class _Measurement(StandardReadable, Triggerable):
 class ScanDevice(_Measurement):
     """A scan: `trigger` takes it, and reading it gives all channels, [y, x] with both ascending.
 
-    Signals `center_x`, `center_y`, `size_x`, `size_y` (m) and `angle` (rad) say where, `rows` and `columns` how fine.
+    Signals `center_x`, `center_y`, `size_x`, `size_y` (m) and `angle` (rad) set the region, `rows` and `columns` its
+    pixels.
     """
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
@@ -221,9 +224,9 @@ class Microscope(StandardReadable):
 
     Args:
         where: the folder of the run, of all runs, or the experiment file, as for `afspm.connect`.
-        parameters: generic names of those that are to be signals: "tip-bias-voltage" becomes `tip_bias_voltage`. All
-            are in SI units.
-        client: what others see as the holder of control.
+        parameters: generic names of the parameters that become signals: "tip-bias-voltage" becomes `tip_bias_voltage`.
+            All are in SI units.
+        client: the name of the holder of control, as the experiment shows it.
 
     Attributes:
         scan: a `ScanDevice`; spectrum: a `SpectrumDevice`.
@@ -248,7 +251,7 @@ class Microscope(StandardReadable):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """Stop what is being measured, and give control back."""
+        """Stop the current measurement, and release control."""
         self._session.interrupt()
         await self._session.call(lambda _: self._held.close())
 

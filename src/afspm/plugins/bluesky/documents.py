@@ -1,7 +1,8 @@
-"""A run as documents of Bluesky's event model: start, and a descriptor with events for what was measured alike, stop.
+"""A run as documents of Bluesky's event model: start, descriptors with their events, stop.
 
-Values stay in the files of the record, to which StreamResource and StreamDatum point. Identifiers follow from the run,
-so that the same run always gives the same documents.
+Each group of measurements with equal arrays has one descriptor. Values stay in the files of the record, to which
+StreamResource and StreamDatum point. Identifiers follow from the run, so that the same run always gives the same
+documents.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ def tables(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]) -
 
 
 def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
-    """Yield nothing: the files of the record are what the documents point to."""
+    """Yield nothing: the documents point to the files of the record."""
     yield from ()
 
 
 def documents(run: Run, scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]) -> Iterator[Document]:
-    """Yield the documents of a run, in the order in which they came about."""
+    """Yield the documents of a run, in the order of their times."""
     rows: list[ScanRow | SpectrumRow] = sorted([*scans, *spectra], key=lambda row: row.time_ns)
     began_ns = rows[0].began_ns or rows[0].time_ns if rows else run.newest_ns
     start = _uid(run, "start")
@@ -78,7 +79,7 @@ def _stop(run: Run, start: str, counts: Mapping[str, int]) -> dict[str, object]:
 
 
 def _alike(row: ScanRow | SpectrumRow) -> tuple[object, ...]:
-    """Return what measurements of one stream have in common: their arrays are of one shape."""
+    # the arrays of one stream must have the same shape
     if isinstance(row, ScanRow):
         return "scan", row.channels, row.shape
     return "spectrum", row.kind, row.names, row.points
@@ -99,7 +100,7 @@ class _Stream:
         return _uid(self.run, self.name)
 
     def _arrays(self) -> Iterator[tuple[str, str, str, list[int]]]:
-        """Yield the field in the file, the name, unit and shape of each array."""
+        # (field in the file, name, unit, shape)
         row = self.first
         if isinstance(row, ScanRow):
             names = [name for name, _ in row.channels]

@@ -1,11 +1,24 @@
-"""Drift: register two scans, track over time, map between tip and sample coordinates.
+"""Drift: register two scans, follow drift over time, map between tip and sample coordinates.
 
-Estimators, trackers and what stands beside them are pure. `scheduler/` is the coordinate frame of the Drift Compensated
-Scheduler with its worker, `study/` simulates many nights, and the other modules are components and commands.
+Theory of operation
+-------------------
 
-The sign, once and for all: drift D(t) is the displacement of the sample under the tip since the start, so a feature at
-`x_sample` is found at `x_tip = x_sample + D(t)`; the mapping M_tot from tip to sample coordinates is the translation by
--D(t) (paper, "Drift Correction Algorithm").
+An *estimator* registers a scan with a reference scan and returns the displacement with its covariance
+(`registration`). A *tracker* keeps references, combines registrations over time, and predicts where the sample will be
+(`tracking`). `mapping` holds the mapping between tip and sample coordinates.
+
+| folder | content |
+| --- | --- |
+| `estimators/`, `trackers/`, and the modules beside them | pure decisions |
+| `scheduler/` | the coordinate frame of the Drift Compensated Scheduler, with its worker |
+| `study/` | simulated nights over a grid of settings |
+| `figures/` | figures from a record of drift |
+
+The other modules are components and commands.
+
+Sign: drift D(t) is the displacement of the sample under the tip since the start. A feature at `x_sample` is found at
+`x_tip = x_sample + D(t)`; the mapping M_tot from tip to sample coordinates is the translation by -D(t) (paper, "Drift
+Correction Algorithm").
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`afspm drift`: what drift did in scans that were taken long ago, and which settings follow it best."""
+"""`afspm drift`: follow drift in recorded scans, and study settings in simulated nights."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FILES = "files"
 
 
 class FilesUnlessNamed(TyperGroup):
-    """`afspm drift a.sxm b.sxm` means `afspm drift files a.sxm b.sxm`."""
+    """A command group in which `afspm drift a.sxm` means `afspm drift files a.sxm`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in self.commands and args[0] not in ctx.help_option_names:
@@ -59,9 +59,9 @@ def files(
 ) -> None:
     """Follow drift in recorded scans.
 
-    Prints a table, and writes it (drift.csv), figures, and the scans laid on top of each other over their common area
-    (drift_stack.nc). Files that can't be read are named, and the rest goes on. An estimator or tracker of your own,
-    module.Class, is looked for in this folder, too.
+    Prints a table and writes it (drift.csv), with figures and a stack of the aligned scans over their common area
+    (drift_stack.nc). Unreadable files are named and left out. Your own estimator or tracker, module.Class, may be in
+    the current folder.
     """
     _one_thread_a_process()
     from afspm.experiment.class_loader import importing_from
@@ -88,7 +88,7 @@ def study(
     ] = "",
     jobs: Jobs = None,
 ) -> None:
-    """Simulate many nights over a grid of settings, and say which are best and whether the defaults hold."""
+    """Simulate many nights over a grid of settings, rank the settings, and check whether the defaults hold."""
     _one_thread_a_process()
     from afspm.experiment.class_loader import importing_from
     from afspm.plugins.drift import study_commands as drift_study
@@ -98,7 +98,7 @@ def study(
 
 
 def _one_thread_a_process() -> None:
-    """Registration works on small arrays, and there is a process for each core: threads of the linear algebra would
-    only wait for each other. Must come before numpy is loaded; processes started from here inherit it."""
+    # Registration works on small arrays with one process per core: threads of the linear algebra would only compete.
+    # The variables count before numpy is loaded, and child processes inherit them.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(name, "1")

@@ -1,9 +1,10 @@
-"""`DriftPictures`: what drift did in the night, and how well it was followed, as figures."""
+"""`DriftTable` and `DriftPictures`: the drift of a night as a table, and as figures."""
 
 from __future__ import annotations
 
 import csv
 import importlib
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -12,42 +13,103 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, overload
 
 import numpy as np
 
+from afspm.basics.clock import iso_utc
 from afspm.basics.errors import AfspmError, FileError
 from afspm.basics.formatting import counted
-from afspm.plugins.drift.drift_table import DriftTable
+from afspm.client.component import Component
+from afspm.components.line_file import LineFile, csv_line
+from afspm.model import RegistrationOutcome
+from afspm.model.drift_mapping import drift_at
+from afspm.plugins.drift.record import COLUMNS as RECORD
 
 if TYPE_CHECKING:
     from afspm.plugins.drift.figures.album import RunPart
     from afspm.plugins.drift.record import DriftRecord
     from afspm.plugins.drift.registration import DriftScan, Registration
 
+COLUMNS = ("datetime", "filename", "offset_x", "offset_y", "rate_x", "rate_y", "units", *RECORD, "lost", "correcting")
 _ALBUM = "afspm.plugins.drift.figures.album"
+
+
+class DriftTable(Component):
+    """Writes `drift_correction.csv`: for each scan the offset between tip and sample coordinates, and its rate.
+
+    The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads the
+    table. `outcome` is how the position of a scan was determined: registered, coarse, or by dead reckoning (refused,
+    failed, new); the variances belong to it. After a kill and restart, header and rows are still written only once.
+
+    Args:
+        file: its name in the run folder.
+    """
+
+    listens: ClassVar = ("DriftMapping",)
+
+    def __init__(self, file: str = "drift_correction.csv") -> None:
+        self.file = file
+
+    def on_start(self) -> None:
+        self._table = LineFile(Path(self.run_dir) / self.file, ",".join(COLUMNS))
+        self._written = {tuple(row[:2]) for row in csv.reader(self._table.lines())}
+
+    def on_drift_mapping(self, message: Any) -> None:
+        row = drift_row(message)
+        if tuple(row[:2]) in self._written:
+            return  # replayed after a restart
+        self._table.append([csv_line(row)])
+        self._written.add(tuple(row[:2]))
+
+
+def drift_row(message: Any) -> list[str]:
+    """Return the row of a DriftMapping, in the order of `COLUMNS`."""
+    time_ns = message.timestamp.ToNanoseconds()
+    drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
+    xx, xy, _, yy = message.covariance or (math.nan,) * 4  # empty before the first registration
+    rate = message.rate or (math.nan,) * 2
+    outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
+    numbers = (*message.center, drift_x, drift_y, xx, yy, xy, *rate)
+    return [
+        iso_utc(time_ns),
+        message.filename,
+        *(_text(value) for value in (-drift_x, -drift_y, *rate)),
+        "m; m/s",
+        message.filename,
+        f"{time_ns * 1e-9:.6f}",
+        *(_text(value) for value in numbers),
+        *("yes" if message.matched else "no", message.reason, outcome.label, str(message.failures)),
+        *("yes" if flag else "no" for flag in (message.lost, message.correcting)),
+    ]
+
+
+def _text(value: float) -> str:
+    return f"{value + 0.0:.9g}"  # never -0
 
 
 @dataclass(frozen=True)
 class TabledScan:
-    """A scan of the table: its file, and whether components had sample coordinates at its time."""
+    """A scan in the table: its file, and whether components used sample coordinates at its time."""
 
     file: str
     correcting: bool
 
 
-def parts(told: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
-    """Name, start and stop of the scans without and with correction. The one that was taken while correction was
-    switched on, and may have been asked for before, is in neither."""
-    first_on = next((k for k, one in enumerate(told) if one.correcting), len(told))
-    found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(told))]
+def parts(tabled: Sequence[TabledScan]) -> list[tuple[str, int, int]]:
+    """Return name, start and stop of the scans without and with correction.
+
+    The first scan with correction is in neither part: it may have been requested before correction was switched on.
+    """
+    first_on = next((k for k, one in enumerate(tabled) if one.correcting), len(tabled))
+    found = [("off", 0, first_on), ("on", first_on + 1 if first_on else 0, len(tabled))]
     return [part for part in found if part[2] > part[1]]
 
 
-class _AsSaved(Sequence["DriftScan"]):
+class _SavedScans(Sequence["DriftScan"]):
     # scans are read at each access: a night's worth may not fit into memory
 
-    def __init__(self, told: Sequence[TabledScan], read: Callable[[TabledScan], DriftScan]) -> None:
-        self._told, self._read = told, read
+    def __init__(self, tabled: Sequence[TabledScan], read: Callable[[TabledScan], DriftScan]) -> None:
+        self._tabled, self._read = tabled, read
 
     def __len__(self) -> int:
-        return len(self._told)
+        return len(self._tabled)
 
     @overload
     def __getitem__(self, which: int) -> DriftScan: ...
@@ -57,23 +119,22 @@ class _AsSaved(Sequence["DriftScan"]):
 
     def __getitem__(self, which: int | slice) -> DriftScan | Sequence[DriftScan]:
         if isinstance(which, slice):
-            return _AsSaved(self._told[which], self._read)
-        return self._read(self._told[which])
+            return _SavedScans(self._tabled[which], self._read)
+        return self._read(self._tabled[which])
 
 
 class DriftPictures(DriftTable):
-    """Writes the table of `DriftTable`, and when the experiment ends draws the figures of drift in the run folder.
+    """Writes the table of `DriftTable`, and draws the figures of drift in the run folder when the experiment ends.
 
-    While the experiment goes on, it compares each scan with the first by itself, once for the scans before correction
-    was switched on and once for those after: what is left of drift then, estimated apart from what the scheduler
-    follows. Where the microscope is simulated, the true errors are drawn too. It reads the files that the microscope
-    saves.
+    During the experiment each scan is compared with the first scan of its part, without and with correction. This
+    estimates the remaining drift independently of the scheduler's tracker. For a simulated microscope the true errors
+    are drawn, too. Scans are read from the files that the microscope saves.
 
     Args:
-        channel: of the scans that are compared.
-        estimator: that compares them.
-        features: an estimator of matched features, for the figure of those; by default "brief" where `afspm[features]`
-            is installed.
+        channel: of the compared scans.
+        estimator: for the comparison.
+        features: an estimator that matches features, for the figure of matches; by default "brief" where
+            `afspm[features]` is installed.
         title: above the figure of the offset.
         file: the table's name in the run folder.
     """
@@ -94,77 +155,82 @@ class DriftPictures(DriftTable):
         if features is not None:
             from afspm.plugins.drift import estimators
 
-            estimators.estimator(features)  # refused now, and not at the end of the night
+            estimators.estimator(features)  # an unknown name is refused now, not at the end of the night
         self.channel, self.estimator, self.features, self.title = channel, estimator, features, title
         self._pairs: dict[tuple[str, str], Registration] = {}
-        self._drawing_is_loaded = self._has_told = False
+        self._drawing_is_loaded = self._has_logged = False
 
     def on_start(self) -> None:
         super().on_start()
-        told = self._told()
-        self._heard = {one.file: one for one in told}  # not only in the table, which may have to wait for room
-        self._again = deque((told[start], one) for _, start, stop in parts(told) for one in told[start + 1 : stop])
+        tabled = self._tabled_scans()
+        # the table alone is not enough: on a full disk its rows wait
+        self._known_scans = {one.file: one for one in tabled}
+        self._to_repeat = deque(
+            (tabled[start], one) for _, start, stop in parts(tabled) for one in tabled[start + 1 : stop]
+        )
 
     def on_tick(self) -> None:
         if not self._drawing_is_loaded:
-            importlib.import_module(_ALBUM)  # now, when there is time: at the end all must be quick
+            importlib.import_module(_ALBUM)  # loading takes seconds: now, since the end must be quick
         self._drawing_is_loaded = True
-        if self._again:
-            self._compared(*self._again.popleft())  # before a restart it was, and at the end there is no time for it
+        if self._to_repeat:
+            # comparisons made before a restart are repeated now, since the end must be quick
+            self._compared(*self._to_repeat.popleft())
 
     def on_drift_mapping(self, message: Any) -> None:
         super().on_drift_mapping(message)
-        self._heard.setdefault(message.filename, TabledScan(message.filename, message.correcting))
-        told, newest = list(self._heard.values()), list(self._heard).index(message.filename)
-        for _, start, stop in parts(told):
+        self._known_scans.setdefault(message.filename, TabledScan(message.filename, message.correcting))
+        tabled, newest = list(self._known_scans.values()), list(self._known_scans).index(message.filename)
+        for _, start, stop in parts(tabled):
             if start < newest < stop:
-                self._compared(told[start], told[newest])
+                self._compared(tabled[start], tabled[newest])
 
     def on_end(self) -> None:
-        told = self._told()
-        if len(told) < 2:
-            self.log.info("drift of %s, no pictures", counted(len(told), "scan"))
+        tabled = self._tabled_scans()
+        if len(tabled) < 2:
+            self.log.info("drift of %s, no pictures", counted(len(tabled), "scan"))
         else:
-            self._draw(told)
+            self._draw(tabled)
 
-    def _draw(self, told: list[TabledScan]) -> None:
+    def _draw(self, tabled: list[TabledScan]) -> None:
         from afspm.plugins.drift.figures import album
         from afspm.plugins.drift.record import DriftRecord
         from afspm.plugins.drift.simulated_truth import true_drift
 
         folder = Path(self.run_dir)
-        readable = {number: scan for number, one in enumerate(told) if (scan := self._frame_of(one)) is not None}
+        readable = {
+            number: scan for number, one in enumerate(tabled) if (scan := self._without_values(one)) is not None
+        }
         if len(readable) < 2:
-            self.log.error("no pictures: only %d of %d scans can be read", len(readable), len(told))
+            self.log.error("no pictures: only %d of %d scans can be read", len(readable), len(tabled))
             return
         record = DriftRecord.read(folder / self.file).chosen(list(readable))
-        told, frames = [told[number] for number in readable], list(readable.values())
-        scans = _AsSaved(told, self._scan)
+        tabled, frames = [tabled[number] for number in readable], list(readable.values())
+        scans = _SavedScans(tabled, self._scan)
         run = album.DriftRun(
             scans=scans,
             record=record,
-            parts=self._parts(told, record, frames),
-            matched=self._matched(told, scans),
+            parts=self._parts(tabled, record, frames),
+            matched=self._matched(tabled, scans),
             truth_m=true_drift(folder, frames) if self.simulated else None,
         )
         title = f"{self.title} (simulated)".strip() if self.simulated else self.title
         for path in album.write(run, folder, title=title):
             self.log.info("drawn: %s", path)
 
-    def _parts(self, told: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[RunPart]:
-        """With what was estimated off-line."""
+    def _parts(self, tabled: list[TabledScan], record: DriftRecord, frames: list[DriftScan]) -> list[RunPart]:
         from afspm.plugins.drift.figures.album import RunPart
         from afspm.plugins.drift.offline import against_first
 
         made = []
-        for name, start, stop in parts(told):
-            pairs = [self._compared(told[start], one) for one in told[start + 1 : stop]]
+        for name, start, stop in parts(tabled):
+            pairs = [self._compared(tabled[start], one) for one in tabled[start + 1 : stop]]
             estimates = against_first(record[start:stop], frames[start:stop], pairs)
             made.append(RunPart(name, f"correction {name}", start, stop, estimates))
         return made
 
-    def _matched(self, told: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
-        """The first scan and the last without correction that has features in common with it: drift is seen best."""
+    def _matched(self, tabled: list[TabledScan], scans: Sequence[DriftScan]) -> tuple[int, int, Registration] | None:
+        # drift shows best between the first scan and the last one without correction that shares features with it
         from afspm.plugins.drift.estimators import estimator
 
         try:
@@ -172,7 +238,7 @@ class DriftPictures(DriftTable):
         except AfspmError as error:
             self.log.info("no picture of features: %s", error)
             return None
-        without = [k for k, one in enumerate(told) if not one.correcting] or list(range(len(told)))
+        without = [k for k, one in enumerate(tabled) if not one.correcting] or list(range(len(tabled)))
         for second in reversed(without[1:]):
             found = by.register(scans[without[0]], scans[second])
             if found.accepted:
@@ -180,7 +246,7 @@ class DriftPictures(DriftTable):
         return None
 
     def _compared(self, first: TabledScan, other: TabledScan) -> Registration:
-        """Of two scans, which are compared only once."""
+        # each pair is registered once: a registration takes too long to repeat at the end
         from afspm.plugins.drift.estimators import estimator
         from afspm.plugins.drift.registration import Registration
 
@@ -190,39 +256,37 @@ class DriftPictures(DriftTable):
                 comparing = estimator(self.estimator, lambda failure: self.log.error("%s", failure))
                 self._pairs[pair] = comparing.register(self._scan(first), self._scan(other))
             except FileError as error:
-                self._tell(error)
+                self._log_once(error)
                 self._pairs[pair] = Registration.refused(str(error))
         return self._pairs[pair]
 
-    def _frame_of(self, told: TabledScan) -> DriftScan | None:
-        """Where and when it was taken, without the values, of a night's worth of which there may be too many to be
-        kept; None: it can't be had."""
+    def _without_values(self, tabled: TabledScan) -> DriftScan | None:
+        # place and time without the values: the values of a whole night may not fit into memory
         try:
-            scan = self._scan(told)
+            scan = self._scan(tabled)
             return replace(scan, values=np.broadcast_to(np.nan, scan.values.shape))
         except (AfspmError, OSError) as error:
-            self._tell(error)
+            self._log_once(error)
             return None
 
-    def _tell(self, error: Exception) -> None:
-        """Once in a night: of a channel that is not there each scan would say the same."""
-        if not self._has_told:
+    def _log_once(self, error: Exception) -> None:
+        # once a night: a missing channel would be reported for each scan
+        if not self._has_logged:
             self.log.error("a scan is left out of the pictures: %s", error)
-        self._has_told = True
+        self._has_logged = True
 
-    def _scan(self, told: TabledScan) -> DriftScan:
-        """As the microscope saved it, in tip coordinates."""
+    def _scan(self, tabled: TabledScan) -> DriftScan:
+        # as the microscope saved it, in tip coordinates
         from afspm.plugins.drift.study.scan_series import drift_scan
         from afspm.storage.formats import read
 
-        content = read(told.file)
+        content = read(tabled.file)
         for scan in content.scans:
             if scan.channel == self.channel:
                 return drift_scan(scan, content)
-        raise FileError(f"has no channel {self.channel!r}", where=told.file)
+        raise FileError(f"has no channel {self.channel!r}", where=tabled.file)
 
-    def _told(self) -> list[TabledScan]:
-        """Return the scans of the table."""
+    def _tabled_scans(self) -> list[TabledScan]:
         path = Path(self.run_dir) / self.file
         if not path.exists():
             return []

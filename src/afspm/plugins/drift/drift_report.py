@@ -1,4 +1,4 @@
-"""Drift against time, for the report of a run without a component that draws it."""
+"""Draws drift against time in the report of a run that has no `DriftPictures`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from afspm.record.run import Run
 
 
 def draw(run: Run, title: str) -> None:
-    """Draw the figure into the folder of a run with two scans in sample coordinates or more."""
+    """Draw the drift into the run folder, if at least two scans have sample coordinates."""
     if not is_ours(run.folder, OWN_OFFSET, OFFSET) or len(record := drift_of(run)) < 2:
         return
     from afspm.plugins.drift.figures import style

@@ -1,4 +1,4 @@
-"""`afspm drift FILE…`, what it does: read, follow on all cores while bars grow, print, write."""
+"""The work of `afspm drift FILE…`: read, follow on all cores with progress bars, print, write."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Analysis:
 
     Attributes:
         record: of the tracker.
-        pairs: the first scan with each later one.
-        estimates: those, as a record.
+        pairs: registrations of the first scan with each later one.
+        estimates: the pairs as a record.
     """
 
     record: DriftRecord
@@ -58,29 +58,29 @@ def run(paths: Sequence[Path], channel: str, by: str, following: str, output: Pa
     """Analyse files, print the table and write the results.
 
     Raises:
-        InvalidValue: nothing in it that can be followed. ConfigError: no such estimator or tracker.
+        InvalidValue: no file can be followed. ConfigError: no such estimator or tracker.
     """
     console, aside = Console(file=sys.stdout, highlight=False), Console(stderr=True, highlight=False)
     contents, unreadable = read_all(paths)
-    for told in unreadable:
-        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    for reason in unreadable:
+        aside.print(f"left out: {reason}", markup=False, soft_wrap=True)
     if not contents:
         raise InvalidValue("there is nothing to follow: no file was read", hint="name scans, or folders of them")
     found = series(contents, channel)
-    for told in found.left_out:
-        aside.print(f"left out: {told}", markup=False, soft_wrap=True)
+    for reason in found.left_out:
+        aside.print(f"left out: {reason}", markup=False, soft_wrap=True)
     begun = day_and_time(round(found.scans[0].mid_s * NS_PER_S), UTC, seconds=False)
     console.print(f"{counted(len(found.scans), 'scan')} of {found.channel} from {begun} on", markup=False)
     analysis = analysed(found.scans, by, following, jobs, aside)
     console.print(as_table(analysis.record))
     console.print(analysis.record.summary())
-    truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # of one simulated run
+    truth_m = true_drift(paths[0], found.scans) if len(paths) == 1 else None  # only a single run has one truth
     for path in written(found, analysis, truth_m, output, aside):
         console.print(str(path), markup=False, soft_wrap=True)
 
 
 def read_all(paths: Sequence[Path]) -> tuple[list[FileContent], list[str]]:
-    """Return the content of files and folders, and what could not be read."""
+    """Return the contents of files and folders, and an error text for each unreadable file."""
     contents: list[FileContent] = []
     unreadable: list[str] = []
     for path in _files(paths):
@@ -99,7 +99,7 @@ def _files(paths: Sequence[Path]) -> Iterator[Path]:
         folder = path / _SCANS_OF_A_RUN if (path / _SCANS_OF_A_RUN).is_dir() else path
         found = sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix.lower() in suffixes())
         of_the_controller = [file for file in found if file.suffix != RECORDED]
-        # the record has the same scans once more, where drift was compensated in sample coordinates
+        # the record contains the same scans again, with places in sample coordinates where drift was corrected
         yield from of_the_controller if (path / JOURNAL_FILE).exists() and of_the_controller else found
 
 
@@ -109,7 +109,7 @@ def register_pair(by: str, reference: DriftScan, scan: DriftScan) -> Registratio
 
 
 def analysed(scans: Sequence[DriftScan], by: str, following: str, jobs: int | None, console: Console) -> Analysis:
-    """Follow the scans in this process, while others compare each with the first."""
+    """Follow the scans in this process, while other processes register each with the first."""
     tracking = tracker(following, estimator(by))
     wanted = processes(jobs, sum(scan.values.size for scan in scans))
     others = 1 if wanted == 1 else max(wanted - 1, 2)  # processes that compare; 1 is this one
@@ -156,7 +156,11 @@ def as_table(record: DriftRecord) -> Table:
 
 
 def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path, console: Console) -> Iterator[Path]:
-    """Write all that can be; what can't is said."""
+    """Write the results and yield their files; print the reason if there is no stack.
+
+    Raises:
+        FileError: the folder or a file can't be written.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -178,6 +182,6 @@ def written(found: Series, analysis: Analysis, truth: Array | None, folder: Path
 
 
 def _stack(found: Series, record: DriftRecord) -> Stack:
-    """Return the stack of the scans that were matched: where the others lie is a guess."""
+    # only registered scans: the position of the others is a prediction
     which = np.flatnonzero(record.matched)
     return corrected([found.scans[k] for k in which], record.drift_m[which], record.rate_then_m_s[which])

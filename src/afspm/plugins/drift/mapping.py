@@ -1,5 +1,7 @@
-"""M_tot: from tip to sample coordinates, as a homogeneous matrix (paper, supporting information, "Drift Correction
-Algorithm")."""
+"""M_tot: from tip to sample coordinates, as a homogeneous matrix.
+
+Source: paper, supporting information, "Drift Correction Algorithm".
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,7 @@ class Mapping:
         matrix: 3 x 3, lengths in m, last row 0 0 1.
 
     Raises:
-        InvalidValue: not such a matrix, or one that can't be inverted.
+        InvalidValue: the matrix has another form, or can't be inverted.
     """
 
     matrix: Array
@@ -42,7 +44,7 @@ class Mapping:
 
     @classmethod
     def identity(cls) -> Mapping:
-        """Return the mapping at the start: both coordinate systems are the same."""
+        """Return the mapping at the start, when both coordinate systems are equal."""
         return cls(np.eye(3))
 
     @classmethod
@@ -95,9 +97,6 @@ class Mapping:
 
         A rectangle stays a rectangle: its centre is mapped, and it turns and grows by the nearest similarity. Shear is
         left out, because a microscope scans rectangles.
-
-        A rectangle stays one: its centre is mapped, it turns and grows by the nearest similarity, and what shear there
-        is besides is left out (a microscope scans rectangles).
         """
         return self._mapped(region, Frame.SAMPLE)
 
@@ -116,8 +115,7 @@ class Mapping:
 
 
 def unlike_drift(linear: Array) -> str:
-    """Return why a finite 2 x 2 part is impossible for a sample between two scans, for a person; empty if it is
-    possible."""
+    """Return why no sample changes by this finite 2 x 2 part between two scans; empty if it may."""
     if np.linalg.det(linear) <= 0.0:
         return f"mirrored or flat: {linear.tolist()}"
     stretches = np.linalg.svd(linear, compute_uv=False)

@@ -1,4 +1,4 @@
-"""Parts of drift correction by name: ready-made ones, and users' own as "module.Name"."""
+"""Parts of drift correction by name: afspm's, and a user's own as "module.Name"."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
 
     Args:
         what: "estimator" or "tracker".
-        spec: a name that a package declares or "module.Name", or a table with that as its `class` and the settings of
-            it (only `class` names code).
+        spec: a name that a package declares or "module.Name"; or a table with such a name as its `class` and with the
+            settings (only `class` names code).
         default: where the table has no class.
         arguments: given before the settings.
 
     Raises:
-        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+        ConfigError: no such name, class or setting, a meaningless setting, or a missing library.
     """
     settings = {"class": spec} if isinstance(spec, str) else dict(spec)
     name = settings.pop("class", default)
@@ -38,7 +38,7 @@ def named(what: str, spec: str | PlainMapping, default: str, *arguments: object)
     except AfspmError as error:
         where = f"{name}: {error.where}" if error.where else name
         raise ConfigError(error.what, where=where, hint=error.hint) from error
-    except Exception as error:  # anybody's constructor
+    except Exception as error:  # the constructor may be a user's own code, and raise anything
         raise ConfigError(f"the {what} {name} can't be made with these settings: {error}") from error
 
 
@@ -68,7 +68,7 @@ def _check_settings(what: str, name: str, class_: type[object], settings: PlainM
     # settings are checked before the constructor runs, so that a typo gives its own error
     try:
         parameters = list(inspect.signature(class_).parameters.values())[given:]
-    except ValueError:  # a class of C code without a signature
+    except ValueError:  # C extensions may have no signature
         return
     if any(p.kind is p.VAR_KEYWORD for p in parameters):
         return

@@ -1,4 +1,4 @@
-"""Drift of scans that were taken long ago: followed by a tracker, and each compared with the first on its own."""
+"""Drift in recorded scans: followed by a tracker, and measured from the first scan to each later one."""
 
 from __future__ import annotations
 
@@ -27,13 +27,10 @@ def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:
 
 
 def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequence[Registration]) -> DriftRecord:
-    """Return the displacements from the first scan to each later one, each by itself, as a record.
+    """Return the displacements from the first scan to each later one, from their pair alone, as a record.
 
     A registration holds in the middle of the overlap, which was not taken in the middle of either scan. The drift in
     between is subtracted, with the rates of the tracker.
-
-    A registration speaks of the middle of what two scans share, which was not taken in the middle of either: the way
-    that the sample went in between is taken off, with the rates of the tracker.
 
     Args:
         record: of the tracker.
@@ -72,11 +69,11 @@ def spread_pairs(record: DriftRecord, apart_s: float, count: int) -> list[tuple[
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Pictures of one piece of the sample.
+    """Aligned images of one area of the sample.
 
     Attributes:
         values: [scan, y, x]; NaN where nothing was measured.
-        region: of all, in sample coordinates: those of the tip at drift zero.
+        region: of all images, in sample coordinates: tip coordinates at zero drift.
         time_s: (n,) middle of each scan.
         keys: the names of the scans.
     """
@@ -120,15 +117,12 @@ def corrected(scans: Sequence[DriftScan], drift_m: Array, rate_m_s: Array | None
     A scan is taken row after row while the sample moves, so the place of a row on the sample depends on its time. The
     rate undoes this, in scans whose row direction is known.
 
-    A scan is taken row after row while the sample moves on, so where a row lies on the sample depends on its time: this
-    is undone with the rate, in scans that say in which direction their rows were taken.
-
     Args:
         drift_m: (n, 2) displacement of the sample at the middle of each scan.
-        rate_m_s: (n, 2) its velocity then; None: as if it had stood still during each scan.
+        rate_m_s: (n, 2) its velocity then; None: the sample stood still during each scan.
 
     Raises:
-        InvalidValue: the scans have no common area, or not all have the same angle.
+        InvalidValue: the scans have no common area, or different angles.
     """
     from scipy.ndimage import map_coordinates
 
@@ -151,7 +145,7 @@ def common_area(scans: Sequence[DriftScan], drift_m: Array) -> tuple[Region, tup
     """Return the rectangle on the sample that all scans show, in sample coordinates, and its pixels (ny, nx).
 
     Raises:
-        InvalidValue: there is none, or not all scans have the same angle.
+        InvalidValue: there is none, or the scans have different angles.
     """
     angle = scans[0].region.angle_rad
     if any(abs(math.remainder(scan.region.angle_rad - angle, math.tau)) > 1e-6 for scan in scans):

@@ -1,4 +1,4 @@
-"""Overlap of regions and ratio of resolutions: the criteria for comparing pairs and for taking a scan again.
+"""Overlap of regions and ratio of resolutions: the criteria for comparing pairs and for rescans.
 
 Both after the paper, "Overarching workflow": intersection_ratio, sr_norm, f'.
 """
@@ -16,11 +16,9 @@ Array = NDArray[np.float64]
 
 
 def intersection_m(first: Region, second: Region) -> Array:
-    """Return the polygon that two turned rectangles share.
+    """Return the polygon that two rotated rectangles share.
 
     Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex polygons.
-
-    Clips one against each side of the other (Sutherland and Hodgman 1974), which is exact for convex ones.
 
     Returns:
         Its corners (n, 2), counter-clockwise; none where at most a border is shared.
@@ -30,7 +28,7 @@ def intersection_m(first: Region, second: Region) -> Array:
     """
     if first.frame is not second.frame:
         raise InvalidValue(f"a region in {first.frame.value} and one in {second.frame.value} coordinates can't overlap")
-    # About one centre, in units of one size: far from the origin the digits of the corners would be used up.
+    # About one centre, in units of one size: far from the origin the corners would lose digits.
     origin, unit = np.array(first.center_m), max(*first.size_m, *second.size_m)
     corners: list[XY] = ((first.corners_m() - origin) / unit).tolist()
     sides: list[XY] = ((second.corners_m() - origin) / unit).tolist()
@@ -47,14 +45,13 @@ def intersection_area_m2(first: Region, second: Region) -> float:
 
 
 def intersection_ratio(first: Region, second: Region) -> float:
-    """Return the share of the smaller region that both have in common. Raises InvalidValue as `intersection_m` does."""
+    """Return the shared area as a share of the smaller region. Raises InvalidValue as `intersection_m` does."""
     smaller_m2 = min(region.size_m[0] * region.size_m[1] for region in (first, second))
     return min(intersection_area_m2(first, second) / smaller_m2, 1.0)
 
 
 def intersection_center_m(first: Region, second: Region) -> Array | None:
-    """Return the centre of mass (2,) of the shared area, None without one. Raises InvalidValue as `intersection_m`
-    does."""
+    """Return the centre of mass (2,) of the shared area, None without one. Raises InvalidValue as `intersection_m`."""
     polygon = intersection_m(first, second)
     if not len(polygon):
         return None
@@ -69,7 +66,7 @@ def overlap_center_m(reference: Region, scan: Region, displacement_m: ArrayLike)
     """Return the middle (2,) of the area that both scans show, in the coordinates of the reference.
 
     Features of the reference are `displacement_m` further in the scan. None without an overlap. Raises InvalidValue as
-    `intersection_m`.
+    `intersection_m` does.
     """
     x_m, y_m = np.asarray(displacement_m, dtype=np.float64)
     center = intersection_center_m(_moved(reference, x_m, y_m), scan)
@@ -94,7 +91,7 @@ def sr_norm(first: Region, first_shape: tuple[int, int], second: Region, second_
         first_shape, second_shape: pixels (ny, nx).
 
     Returns:
-        Above 0, and 1 for the same.
+        Above 0, and 1 for equal resolutions.
     """
     per_m = [
         np.array([nx / region.size_m[0], ny / region.size_m[1]])
@@ -137,8 +134,7 @@ F_RESCAN = 0.75
 
 
 def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN) -> str:
-    """Return why a scan is to be taken again by the paper's rule, f' = intersection_ratio(r', r) below f_rescan; empty
-    if not.
+    """Return the reason for a rescan by the paper's rule, f' = intersection_ratio(r', r) below f_rescan; else "".
 
     Raises:
         InvalidValue: a region that is not in sample coordinates.
@@ -151,23 +147,20 @@ def too_little_shared(asked: Region, scanned: Region, f_rescan: float = F_RESCAN
 
 
 def too_far_off(asked: Region, scanned: Region, sd_m: float, tolerance_m: float) -> str:
-    """Return why a scan is to be taken again: its furthest corner may be further off than tolerated; empty if not.
+    """Return the reason for a rescan if the furthest corner may be off by more than the tolerance; else "".
 
     The paper's rule lets a scan be off by an eighth of its size. Here the user sets the tolerance, and the uncertainty
     counts: |residual| + 2 sd > tolerance.
 
-    The paper's rule lets a scan be off by an eighth of its size. Here the user says how much it may be, and what is
-    uncertain counts: |residual| + 2 sd > tolerance.
-
     Args:
-        sd_m: standard deviation of the position that was found, `update.after.sd_m`.
+        sd_m: standard deviation of the estimated position, `update.after.sd_m`.
 
     Raises:
         InvalidValue: a region that is not in sample coordinates, or a tolerance that is not above zero.
     """
     _in_sample(asked, scanned)
     if not tolerance_m > 0.0:
-        raise InvalidValue(f"a tolerance of {tolerance_m} m", hint="above zero")
+        raise InvalidValue(f"the tolerance must be above zero, and is {tolerance_m * 1e9:g} nm")
     off_m = float(np.linalg.norm(asked.corners_m() - scanned.corners_m(), axis=1).max())
     if off_m + 2.0 * sd_m <= tolerance_m:
         return ""

@@ -1,4 +1,4 @@
-"""The table of a run: what drift did, scan by scan. Made by on-line runs and off-line analysis alike, kept as CSV."""
+"""The drift of a run, scan by scan, as a table in CSV; from runs and off-line analysis alike."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class DriftRecord:
         keys: the name of each scan.
         time_s: (n,) middle of each scan.
         center_m: (n, 2) centre of its region.
-        drift_m: (n, 2) displacement of the sample under the tip since the start, known after the scan.
-        covariance_m2: (n, 2, 2) of it.
+        drift_m: (n, 2) displacement of the sample under the tip since the start, as known after the scan.
+        covariance_m2: (n, 2, 2) of the drift.
         rate_m_s: (n, 2) velocity of the sample then; zero after the first scan, when it is unknown.
-        matched: (n,) whether the scan could be registered; where not, the drift is predicted.
-        reasons: why it could not, for a person.
-        outcomes: how the position of each scan is known.
-        failures: the number of errors of the estimator over each scan.
+        matched: (n,) whether the scan was registered; the drift of the others is predicted.
+        reasons: why a scan was not registered, for a person.
+        outcomes: how the position of each scan was determined.
+        failures: the number of errors of the estimator with each scan.
     """
 
     keys: tuple[str, ...]
@@ -56,11 +56,10 @@ class DriftRecord:
         return len(self.keys)
 
     def __getitem__(self, part: slice) -> DriftRecord:
-        """Return some of the scans."""
         return self.chosen(range(len(self.keys))[part])
 
     def chosen(self, which: Sequence[int]) -> DriftRecord:
-        """Return the scans of some numbers."""
+        """Return the record of the scans with these indices."""
         at = list(which)
         return DriftRecord(
             tuple(self.keys[k] for k in at), self.time_s[at], self.center_m[at], self.drift_m[at],
@@ -69,7 +68,7 @@ class DriftRecord:
         )  # fmt: skip
 
     def summary(self) -> str:
-        """Return how many scans were registered, for people."""
+        """Return the number of registered scans as a text."""
         return registration_summary(self.outcomes)
 
     @property
@@ -79,7 +78,7 @@ class DriftRecord:
 
     @property
     def rate_then_m_s(self) -> Array:
-        """Velocity during each scan, (n, 2); the first scan has that of the second if it knows none."""
+        """Velocity during each scan, (n, 2); an unknown first velocity is replaced by the second."""
         rates = self.rate_m_s.copy()
         if len(rates) > 1 and not rates[0].any():
             rates[0] = rates[1]
@@ -87,14 +86,14 @@ class DriftRecord:
 
     @property
     def misplacement_m(self) -> Array:
-        """Displacement of the features from their place in the first scan, (n, 2), which correction left over."""
+        """Displacement of the features from their place in the first scan, (n, 2), that correction left over."""
         followed = self.center_m - self.center_m[:1]
         misplaced: Array = self.drift_m - self.drift_m[:1] - followed
         return misplaced
 
     @classmethod
     def of(cls, scans: Sequence[DriftScan], updates: Sequence[Update]) -> DriftRecord:
-        """Make the record from a tracker's updates of the scans."""
+        """Return the record of a tracker's updates."""
         after = [update.after for update in updates]
         return cls(
             keys=tuple(scan.key for scan in scans),
@@ -129,16 +128,16 @@ class DriftRecord:
         for k, key in enumerate(self.keys):
             (xx, xy), (_, yy) = self.covariance_m2[k]
             numbers = (*self.center_m[k], *self.drift_m[k], xx, yy, xy, *self.rate_m_s[k])
-            told = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
+            fields = [f"{self.time_s[k]:.6f}", *(f"{number:.9g}" for number in numbers)]
             how = (self.outcomes[k].label, str(self.failures[k]))
-            yield [key, *told, "yes" if self.matched[k] else "no", self.reasons[k], *how]
+            yield [key, *fields, "yes" if self.matched[k] else "no", self.reasons[k], *how]
 
     @classmethod
     def read(cls, path: Path) -> DriftRecord:
-        """Read a file that `write` wrote; further columns are ignored.
+        """Read a file of `write`; further columns are ignored.
 
         Raises:
-            FileError: missing, or not such a table.
+            FileError: missing, or another kind of table.
         """
         try:
             with path.open(newline="", encoding="utf-8") as file:

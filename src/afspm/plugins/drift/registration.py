@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class DriftScan:
-    """One channel of a scan as drift sees it.
+    """One channel of a scan, as estimators and trackers use it.
 
     Attributes:
         values: [y, x], both ascending; NaN where nothing was measured.
@@ -38,7 +38,9 @@ class DriftScan:
         if self.values.ndim != 2 or min(self.values.shape) < 2:
             raise InvalidValue(f"a scan of shape {self.values.shape} can't be registered", hint="2 x 2 pixels at least")
         if not (np.isfinite((self.start_s, self.end_s)).all() and self.end_s >= self.start_s):
-            raise InvalidValue(f"a scan from {self.start_s} s to {self.end_s} s can't be")
+            raise InvalidValue(
+                f"a scan needs finite times with the start before the end, not {self.start_s} s and {self.end_s} s"
+            )
 
     @property
     def mid_s(self) -> float:
@@ -62,10 +64,10 @@ class Prior:
 
     Attributes:
         mean_m: (2,) expected displacement.
-        covariance_m2: (2, 2) of it.
-        velocity_difference_m_s: (2,) expected drift velocity during the scan minus that during the reference: it shears
-            one against the other.
-        velocity_sd_m_s: standard deviation of each component of it; None: not known, so any shear is possible.
+        covariance_m2: (2, 2) of the displacement.
+        velocity_difference_m_s: (2,) expected drift velocity during the scan minus drift velocity during the reference;
+            it shears one against the other.
+        velocity_sd_m_s: standard deviation of each of its components; None: not known, so any shear is possible.
     """
 
     mean_m: Array
@@ -79,7 +81,7 @@ class Matches:
     """Feature pairs, for drawings. Positions (n, 2) are (x, y) in tip coordinates, m.
 
     Attributes:
-        inlier: (n,) whether the estimate rests on the pair.
+        inlier: (n,) whether the estimate uses the pair.
     """
 
     reference_m: Array
@@ -89,7 +91,7 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class LinearSeen:
-    """The linear part from the scans alone; `Registration.linear` may be pulled towards the likely.
+    """The linear part from the scans alone; `Registration.linear` may be pulled towards its prior.
 
     Attributes:
         linear: (2, 2).
@@ -108,17 +110,17 @@ class Registration:
     tip coordinates.
 
     Attributes:
-        accepted: whether it may be used; if not, the numbers are the best guess, or NaN where there is none.
+        accepted: whether the result may be used; if not, the numbers are the best guess, or NaN where there is none.
         reason: why it was refused, for a person; empty if it was accepted.
         displacement_m: (2,) at `center_m`.
-        covariance_m2: (2, 2) of it.
-        linear: (2, 2) what rotation, scale and shear there is besides, zero for a pure translation.
+        covariance_m2: (2, 2) of the displacement.
+        linear: (2, 2) rotation, scale and shear; zero for a pure translation.
         center_m: (2,) where the displacement holds, in tip coordinates of the reference: the middle of the overlap.
         quality: figures of merit by name (overlap, correlation, …), for a person and for studies.
         matches: of estimators that match features.
-        linear_seen: of estimators that know how uncertain the linear part is.
-        failure: the error of an estimator that raised, or gave no usable result; empty if there was none. An error says
-            nothing about the scans. The result is accepted nevertheless where a coarse estimate took its place; its
+        linear_seen: of estimators that know the uncertainty of the linear part.
+        failure: the error of an estimator that raised, or gave no usable result; empty without an error. An error means
+            nothing about the scans. The result is accepted nevertheless if a coarse estimate took its place; its
             linear part is then unknown.
     """
 
@@ -149,12 +151,12 @@ class Registration:
 
     @classmethod
     def failed(cls, failure: str) -> Registration:
-        """Return the result of an estimator that raised, or whose result is unusable."""
+        """Return the result of an estimator that raised, or gave no usable result."""
         return replace(cls.refused(failure), failure=failure)
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """Return what became of the pair."""
+        """How the position is determined, as far as this pair matters."""
         if self.accepted:
             return RegistrationOutcome.COARSE if self.failure else RegistrationOutcome.REGISTERED
         return RegistrationOutcome.FAILED if self.failure else RegistrationOutcome.REFUSED
@@ -169,7 +171,7 @@ class Estimator(Protocol):
     """Registers two scans of the same channel. Keeps no state between calls."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """Return the place of the features of `reference` in `scan`.
+        """Return the displacement of the features of `reference` in `scan`.
 
         Never raises for the content of scans: pairs that can't be registered (no values, constant, no common features,
         ambiguous) are refused with the reason.

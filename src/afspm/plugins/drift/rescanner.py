@@ -1,4 +1,4 @@
-"""`Rescanner`: takes the scans again that the Drift Compensated Scheduler asks for (paper, "Overarching Workflow")."""
+"""`Rescanner`: takes the rescans that the Drift Compensated Scheduler requests (paper, "Overarching Workflow")."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.model import Problem, Region, RescanKind, ScanParameters, names
 
-WANTED, TOLD = "DriftRescan", "DriftMapping"
+WANTED, MAPPINGS = "DriftRescan", "DriftMapping"
 FLAGGED_WITHIN_S = 5.0
 BACK_WITHIN_S = 60.0
-_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
+_DIRECTION_BEFORE, _FRAME_BEFORE = "direction_before", "frame_before"
 Pixels = tuple[int, int] | None
 
 _IN_WORDS = {
@@ -25,47 +25,50 @@ _IN_WORDS = {
 
 
 class Rescanner(Component):
-    """Takes a region again on a `DriftRescan`: as it was, in the other direction, or wider.
+    """Scans a region again on a `DriftRescan`: unchanged, in the other direction, or wider.
 
-    Meanwhile thermal-drift is flagged, so that nobody else scans. It tries a few times. A scan that still lies too far
-    off is then told, and the experiment goes on; where the sample is not found again a person is needed, for which it
-    flags device-malfunction.
+    Meanwhile thermal-drift is flagged, so that no other component scans. After some attempts without success it logs an
+    error and the experiment goes on. If the sample is not found again, it flags device-malfunction and a person is
+    needed.
 
     Args:
         attempts: scans for one request; in the other direction there is one.
-        widen: by how much each search is wider than the one before it.
-        most_pixels: of a side of a search, whose pixels are those of the scans before as far as this allows.
-        problem: what it solves.
+        widen: factor from each search region to the next.
+        most_pixels: largest side of a search in pixels; up to this bound the pixel size stays.
+        problem: the problem that it solves.
     """
 
     solves: ClassVar = ("thermal-drift",)
     flags: ClassVar = ("thermal-drift", "device-malfunction")
-    listens: ClassVar = (WANTED, TOLD)
+    listens: ClassVar = (WANTED, MAPPINGS)
     needs_actions = (names.START_SCAN,)
 
     def __init__(
         self, attempts: int = 3, widen: float = 2.0, most_pixels: int = 512, problem: str = "thermal-drift"
     ) -> None:
         if attempts < 1 or not widen > 1.0 or most_pixels < 2:
-            raise ConfigError(f"attempts = {attempts}, widen = {widen}, most_pixels = {most_pixels} can't be")
+            raise ConfigError(
+                "attempts must be at least 1, widen above 1, most_pixels at least 2; they are "
+                f"{attempts}, {widen}, {most_pixels}"
+            )
         self.attempts, self.widen, self.most_pixels = attempts, widen, most_pixels
         self.problem = problem
 
     def run(self) -> None:
-        with self.scope.events(WANTED) as wanted, self.scope.events(TOLD, timeout_s=0.0) as told:
-            self._put_back_at_last()
+        with self.scope.events(WANTED) as wanted, self.scope.events(MAPPINGS, timeout_s=0.0) as mappings:
+            self._restore_after_lost_control()
             for event in wanted:
                 if event.message.timestamp.ToNanoseconds() <= int(self.memory.get("done_ns", -1)):
-                    continue  # of a scan of ours, or from before a restart
+                    continue  # answers a rescan of this component, or is from before a restart
                 try:
-                    self._obey(event.message, told)
+                    self._rescan(event.message, mappings)
                 except ControlLost as lost:
                     self.log.info("the rescan was given up: %s", lost.what)
-                self._put_back_at_last()
+                self._restore_after_lost_control()
                 self.memory["done_ns"] = self.clock.now_ns()
                 self.memory.save()
 
-    def _obey(self, message: Any, told: Events) -> None:
+    def _rescan(self, message: Any, mappings: Events) -> None:
         parameters: ScanParameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
         if not isinstance(parameters.region, Region):
             self.log.error("a request for a rescan names no region: %s", message.reason)
@@ -77,15 +80,15 @@ class Rescanner(Component):
         with self.scope.control(solving=self.problem):
             optional = message.kind == RescanKind.OPPOSITE
             try:
-                found = self._take(message, parameters, told)
+                found = self._scan_as_requested(message, parameters, mappings)
             except Refused as refused:
                 level = logging.INFO if optional else logging.ERROR
-                self.log.log(level, "it can't be scanned again: %s", refused.reason)
+                self.log.log(level, "the rescan was refused: %s", refused.reason)
                 found = False
             if not found and optional:
                 self.log.info("the velocity of drift stays unknown until the second scan")
             elif not found and message.kind == RescanKind.SEARCH:
-                # before the other flag is gone: nobody is to go on in between
+                # before the other flag is cleared, so that no component scans in between
                 self.log.critical(
                     "the sample can't be found again; nothing is scanned until a person clears the problem"
                 )
@@ -94,53 +97,53 @@ class Rescanner(Component):
                 self.log.error("%d rescans did not help; the experiment goes on, please check it", self.attempts)
             self.scope.clear(self.problem)
 
-    def _take(self, message: Any, parameters: ScanParameters, told: Events) -> bool:
-        # until the scan is as requested; changed settings are then restored
+    def _scan_as_requested(self, message: Any, parameters: ScanParameters, mappings: Events) -> bool:
+        # changed settings are restored after success and failure alike
         region, shape = parameters.region, parameters.shape
         assert isinstance(region, Region)
         assert shape is None or isinstance(shape, tuple)
         try:
-            self._turn(message)
+            self._set_direction(message)
             if message.kind == RescanKind.SEARCH:
-                self._note_before(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
+                self._save_setting(_FRAME_BEFORE, [*region.center_m, *region.size_m, region.angle_rad, shape])
             for attempt in range(1 if message.kind == RescanKind.OPPOSITE else self.attempts):
-                self._forget(told)
+                self._drop_waiting(mappings)
                 if message.kind == RescanKind.SEARCH:
                     self._search(region, shape, attempt + 1)
                 else:
                     self.scope.scan(region, shape=shape)
-                if self._is_as_asked(message.kind, told):
+                if self._is_accepted(message.kind, mappings):
                     return True
             return False
         finally:
-            self._put_back()
+            self._restore_settings()
 
-    def _turn(self, message: Any) -> None:
+    def _set_direction(self, message: Any) -> None:
         if message.HasField("upwards"):
-            self._note_before(_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
+            self._save_setting(_DIRECTION_BEFORE, str(self.scope.get(names.SCAN_DIRECTION)))
             self.scope.set(names.SCAN_DIRECTION, names.UP if message.upwards else names.DOWN)
 
-    def _note_before(self, name: str, value: object) -> None:
-        # the settings are saved, so that a life after a kill restores them, too
+    def _save_setting(self, name: str, value: object) -> None:
+        # saved, so that settings are also restored after a kill
         self.memory.setdefault(name, value)
         self.memory.save()
 
-    def _put_back(self) -> None:
-        if (direction := self.memory.get(_BEFORE)) is not None:
+    def _restore_settings(self) -> None:
+        if (direction := self.memory.get(_DIRECTION_BEFORE)) is not None:
             self.scope.set(names.SCAN_DIRECTION, direction)
-            self.memory.pop(_BEFORE)
+            self.memory.pop(_DIRECTION_BEFORE)
         if (frame := self.memory.get(_FRAME_BEFORE)) is not None:
-            self._set_back(*frame)
+            self._restore_region(*frame)
             self.memory.pop(_FRAME_BEFORE)
         self.memory.save()
 
-    def _put_back_at_last(self) -> None:
-        # control was lost before the settings were restored: another component has cleared the drift
-        if _BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
+    def _restore_after_lost_control(self) -> None:
+        # control may be lost before the restoration, when another component clears the drift
+        if _DIRECTION_BEFORE not in self.memory and _FRAME_BEFORE not in self.memory:
             return
         try:
             with self.scope.control(timeout_s=BACK_WITHIN_S):
-                self._put_back()
+                self._restore_settings()
         except (ControlLost, Refused) as error:
             self.log.warning("direction and region of the scans before could not be set again: %s", error.what)
 
@@ -153,7 +156,9 @@ class Rescanner(Component):
             except Refused as refused:
                 if fewer == 0:
                     raise
-                self.log.warning("no region of %.3g nm: %s", wider.size_m[0] * 1e9, refused.reason)
+                self.log.warning(
+                    "a region of %.3g nm was refused, trying a smaller one: %s", wider.size_m[0] * 1e9, refused.reason
+                )
             else:
                 return
 
@@ -166,26 +171,28 @@ class Rescanner(Component):
         rows, columns = (min(round((n - 1) * factor) + 1, max(self.most_pixels, n)) for n in shape)
         return wider, (rows, columns)
 
-    def _set_back(self, x: float, y: float, width: float, height: float, angle: float, shape: list[int] | None) -> None:
+    def _restore_region(
+        self, x: float, y: float, width: float, height: float, angle: float, shape: list[int] | None
+    ) -> None:
         rows_columns = None if shape is None else (shape[0], shape[1])
         try:
             self.scope.set_scan_region(Region((x, y), (width, height), angle), shape=rows_columns)
         except Refused as refused:
             self.log.warning("the region of the scans before could not be set again: %s", refused.reason)
 
-    def _is_as_asked(self, kind: int, told: Events) -> bool:
-        # by the drift mapping published right before the scan
+    def _is_accepted(self, kind: int, mappings: Events) -> bool:
+        # the mapping of a scan is published right before it
         mapping = None
-        for event in told:
+        for event in mappings:
             mapping = event.message
         if mapping is None:
             self.log.warning("the scheduler reported no drift for the scan")
             return False
-        is_enough = kind in (RescanKind.OPPOSITE, RescanKind.SEARCH)  # for these the place need not be exact
+        is_enough = kind in (RescanKind.OPPOSITE, RescanKind.SEARCH)  # these need not be exactly at the place
         return bool(mapping.matched and not mapping.lost and (is_enough or not mapping.rescan))
 
-    def _forget(self, told: Events) -> None:
-        for _ in told:
+    def _drop_waiting(self, mappings: Events) -> None:
+        for _ in mappings:
             pass
 
     def _is_flagged(self) -> bool:

@@ -1,11 +1,11 @@
-"""The shear that drift makes in an image while it is taken, and the velocity that two opposite frames tell.
+"""The shear of an image by drift while it is taken, and the drift velocity from two opposite frames.
 
 Rows are taken one after the other, so a feature at `p` when half of the scan is done is found at
 x = p + v a e.(x - c), with c the centre, e the direction of the slow axis and a the time per length along it, negative
 when scanning down. Two scans with a_1 and a_2 are then related by 1 + A = (1 - a_2 v e')^-1 (1 - a_1 v e'), that is
 A e = v (a_2 - a_1) / (1 - a_2 v.e): an up frame and a down frame differ by a shear and a stretch of 2 v for each height
-per duration, at any drift in between. The shear gives a velocity without a lattice's ambiguity, the displacement
-between their middles a more precise one.
+per duration, at any drift in between. The velocity from the shear is free of a lattice's ambiguity; the velocity from
+the displacement between their middles is more precise.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from afspm.plugins.drift.registration import DriftScan, Estimator, Prior, Regist
 
 Array = NDArray[np.float64]
 
-_SAFETY = 2.0  # of the standard deviation of the shear, which is derived from that of the displacement
-_CONTRADICTION = 16.0  # chi2 of both routes' difference
+_SAFETY = 2.0  # on the standard deviation of the shear, since it is derived from the displacement's
+_CONTRADICTION = 16.0  # chi2 of the difference between both routes
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,12 +33,12 @@ class DriftVelocity:
     Attributes:
         accepted: whether it may be used.
         reason: why not, for a person.
-        velocity_m_s: (2,); NaN where nothing could be found.
-        covariance: (2, 2) of it, (m/s)².
+        velocity_m_s: (2,); NaN where none was found.
+        covariance: (2, 2) of the velocity, (m/s)².
         time_s: the middle of the two scans, for which it holds.
-        by_shear_m_s, by_displacement_m_s: (2,) what each route says by itself.
+        by_shear_m_s, by_displacement_m_s: (2,) the velocity by each route alone.
         by_shear_covariance: (2, 2) of the former.
-        registration: what it rests on, or what was refused.
+        registration: the registration used, or the refused one.
     """
 
     accepted: bool
@@ -82,7 +82,7 @@ def delay_per_length_s_m(scan: DriftScan) -> float | None:
 
 
 def row_delay_s(scan: DriftScan, position_m: Array) -> float | None:
-    """Return how long after its middle a scan passes a position (tip coordinates); None if its direction is unknown."""
+    """Return the delay from a scan's middle to its pass over a position (tip coordinates); None: direction unknown."""
     a = delay_per_length_s_m(scan)
     return None if a is None else a * float(slow_axis(scan) @ (position_m - np.array(scan.region.center_m)))
 
@@ -93,16 +93,13 @@ def velocity_by_shear(reference: DriftScan, scan: DriftScan, found: Registration
     Features are assumed to be spread evenly over the image: the slope over a height h is then known to sqrt(12) / h of
     the uncertainty of the displacement.
 
-    Its covariance takes what is in the image as spread evenly over it: a slope over a height h is then known to
-    sqrt(12) / h of what the displacement is known to.
-
     Returns:
-        None where both were sheared alike, a direction is not known, or nothing was found but coarsely.
+        None where both were sheared alike, a direction is not known, or the registration is coarse.
     """
     first, second = delay_per_length_s_m(reference), delay_per_length_s_m(scan)
     if first is None or second is None or not np.isfinite(found.covariance_m2).all():
         return None
-    if found.failure:  # a coarse estimate knows no shear
+    if found.failure:  # a coarse estimate has no shear
         return None
     difference = second - first
     if abs(difference) < 0.1 * max(abs(first), abs(second)):
@@ -126,10 +123,6 @@ def velocity_from_up_down(up: DriftScan, down: DriftScan, estimator: Estimator) 
     Both are first registered freely. If that is refused, or if displacement and shear contradict each other (another
     site of a lattice, a picture with little shear), the velocity of either route is a guess. Both scans are freed from
     that drift and registered again with a prior from it, and the remaining displacement and shear must agree.
-
-    Registers them freely. If that is refused, or displacement and shear contradict each other (another site of a
-    lattice, a picture in which shear hardly shows), what either says is taken as a guess: both scans are freed from
-    that drift and registered again where it lets expect them to be, and what is left of both has to agree.
     """
     first, second = sorted((up, down), key=lambda scan: scan.mid_s)
     time_s = (first.mid_s + second.mid_s) / 2
@@ -168,20 +161,20 @@ def _freed(scan: DriftScan, velocity_m_s: Array) -> DriftScan:
     x, y = (float(v) for v in velocity_m_s)
     try:
         values = undistorted(scan.values, scan.region, (x, y), scan.duration_s, upwards=scan.upwards is not False)
-    except InvalidValue:  # as fast as the scan: no guess
+    except InvalidValue:  # the sample moves as fast as the scan
         return scan
     return replace(scan, values=values)
 
 
 def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_s: Array) -> DriftVelocity:
-    # Both routes of a registration, combined if they agree. `freed_m_s` is the drift already taken out of the scans.
+    # Combines both routes of a registration if they agree. `freed_m_s` is the drift already removed from the scans.
     time_s = (first.mid_s + second.mid_s) / 2
     sheared = velocity_by_shear(first, second, found)
     if not found.accepted or sheared is None:
         return DriftVelocity.refused(found.reason or "no shear between the scans can be found", time_s, found)
     by_shear, shear_covariance = sheared[0] + freed_m_s, sheared[1]
     between_s, middles_s = _between_s(first, second, found), second.mid_s - first.mid_s
-    # rows that are freed are all as they were at the middle, but for what the guess was wrong by
+    # freed rows are as at the middle, except for the error of the guess
     by_displacement = (found.displacement_m + freed_m_s * (between_s - middles_s)) / between_s
     covariance = found.covariance_m2 / between_s**2
     difference, both = by_displacement - by_shear, covariance + shear_covariance
@@ -203,7 +196,7 @@ def _combined(first: DriftScan, second: DriftScan, found: Registration, freed_m_
 
 
 def _between_s(first: DriftScan, second: DriftScan, found: Registration) -> float:
-    # from the passage of the overlap in the first scan to that in the second
+    # from the rows of the overlap in the first scan to its rows in the second
     there_m = found.center_m + found.displacement_m
     late_s, later_s = row_delay_s(first, found.center_m) or 0.0, row_delay_s(second, there_m) or 0.0
     return second.mid_s + later_s - first.mid_s - late_s

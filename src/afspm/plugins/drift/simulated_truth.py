@@ -1,4 +1,4 @@
-"""The true drift of a simulated run, from the `truth.jsonl` that the simulator leaves."""
+"""The true drift of a simulated run, from the simulator's file `truth.jsonl`."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ TRUTH_FILE = "truth.jsonl"
 
 
 def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
-    """Return by how much the sample was displaced (n, 2) at the centre of each scan, since the first; None if unknown.
+    """Return the displacement of the sample (n, 2) at the centre of each scan since the first; None if unknown.
 
-    It includes what rotation and expansion of the sample displace there. Tip coordinates go along with what the
-    controller follows by itself, which is known at the ends of each scan.
+    It includes the displacement by rotation and expansion of the sample. The drift that the controller itself
+    compensates is subtracted: tip coordinates move with it. It is known at the ends of each scan.
 
     Raises:
-        FileError: there is such a file, but it is not one of a simulated run.
+        FileError: there is such a file, but not of a simulated run.
     """
     path = run_dir / TRUTH_FILE
     if not path.exists() or not scans:
@@ -45,8 +45,7 @@ def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
 
 
 def _read(path: Path) -> tuple[Plain, Array]:
-    """The entry of the moment when the simulated microscope was switched on; and what the controller had followed of
-    the drift, (n, 3): time, x, y."""
+    # the entry of the simulator's start, and the drift that the controller compensated by then, (n, 3): time, x, y
     start: Plain | None = None
     followed: list[tuple[float, float, float]] = [(0.0, 0.0, 0.0)]
     with path.open(encoding="utf-8") as file:
@@ -54,12 +53,12 @@ def _read(path: Path) -> tuple[Plain, Array]:
             try:
                 entry: Plain = json.loads(line)
             except ValueError:
-                continue  # cut off by a kill
+                continue  # a line cut off by a kill
             if entry["event"] == "start" and start is None:
                 start = entry
             scan = entry.get("scan")
             if isinstance(scan, dict) and "compensated_start_m" in scan:
                 followed += [(scan[f"{at}_s"], *scan[f"compensated_{at}_m"][:2]) for at in ("start", "end")]
     if start is None:
-        raise ValueError("it has no beginning")
+        raise ValueError("the entry of the simulator's start is missing")
     return start, np.array(sorted(followed), dtype=np.float64)

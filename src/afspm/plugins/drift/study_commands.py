@@ -1,4 +1,4 @@
-"""`afspm drift study`, what it does: nights, while a bar grows, and a table of what they say."""
+"""The work of `afspm drift study`: simulate nights with a progress bar, and print a table of the results."""
 
 from __future__ import annotations
 
@@ -42,7 +42,6 @@ refused, again: scans that could not be registered, and that were taken again.""
 
 
 def metrics_of(settings: NightSettings, seed: int) -> Mapping[str, float]:
-    """Simulate a night, in a worker, and return its metrics."""
     return night(settings, seed).metrics()
 
 
@@ -74,7 +73,7 @@ def _shown(outcomes: Iterator[TaskOutcome], total: int) -> Iterator[TaskOutcome]
 
 
 def show(rows: Sequence[Summary], console: Console) -> None:
-    """The table, what it means, and what it says of the defaults."""
+    """Print the table, its legend, the failed nights, and the verdict on the defaults."""
     table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("settings", overflow="fold", min_width=14)
     for name in ("n", COLUMNS[BY], "quartiles", *(name for key, name in COLUMNS.items() if key != BY)):
@@ -121,5 +120,5 @@ def _verdict(rows: Sequence[Summary]) -> str:
         return "The defaults did not come to the end of a night"
     if default.is_best:
         return "The defaults are the best."
-    told = f"they are {default.median:.3g} nm off, the best ({best.label}) {_spread(best)} nm."
-    return f"The defaults hold: {told}" if default.holds else f"The defaults do not hold: {told}"
+    figures = f"they are {default.median:.3g} nm off, the best ({best.label}) {_spread(best)} nm."
+    return f"The defaults hold: {figures}" if default.holds else f"The defaults do not hold: {figures}"

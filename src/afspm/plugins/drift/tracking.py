@@ -1,4 +1,4 @@
-"""The interface of all trackers, and what passes through it."""
+"""The interface of all trackers, and the data that passes through it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afspm.plugins.drift.registration import DriftScan, Registration
 Array = NDArray[np.float64]
 
 FORECAST_VERSION = 2
-"""Of all kinds of forecast as plain data."""
+"""Version of all forecasts as plain data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +30,7 @@ class Prediction:
         mapping: from tip to sample coordinates.
         covariance_m2: (2, 2) of the translation of the mapping.
         rate_m_s: (2,) velocity of the sample in tip coordinates.
-        rate_covariance: (2, 2) of it, (m/s)².
+        rate_covariance: (2, 2) of the rate, (m/s)².
     """
 
     time_s: float
@@ -62,12 +62,12 @@ class Update:
     """The result of one scan.
 
     Attributes:
-        key: the scan's.
+        key: of the scan.
         before: the prediction for the middle of the scan.
-        after: the knowledge of the same time with the scan.
+        after: the estimate for the same time with the scan.
         matched: whether any reference could be registered with it (the first scan of all counts as matched).
         reason: why not, or why only coarsely, for a person.
-        lost: the tracker does not know any more where it is.
+        lost: the tracker no longer knows where the sample is.
         registrations: by the key of the reference.
         forecast: from the knowledge with the scan.
     """
@@ -84,7 +84,7 @@ class Update:
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """Return how the position of the scan is known."""
+        """How the position of the scan was determined."""
         found = self.registrations.values()
         if self.matched:
             accepted = [one for one in found if one.accepted]
@@ -97,11 +97,7 @@ class Update:
 
 
 def require_newer(scan: DriftScan, newest_s: float | None) -> None:
-    """Raise for a scan out of order.
-
-    Raises:
-        InvalidValue: it is older than the newest one.
-    """
+    """Raise InvalidValue for a scan older than the newest one."""
     if newest_s is not None and scan.mid_s < newest_s:
         late = f"the middle of scan {scan.key!r} is at {scan.mid_s:g} s, and {newest_s:g} s was reached already"
         raise InvalidValue(late, hint="give a tracker its scans in the order of time")
@@ -124,5 +120,5 @@ class Tracker(Protocol):
         ...
 
     def restore(self, state: PlainMapping) -> None:
-        """Restore a state that `state` returned."""
+        """Restore the result of `state`."""
         ...

@@ -1,4 +1,4 @@
-"""Files of the published implementation: the names of its classes and settings here, and what has no counterpart."""
+"""Files of the published implementation: afspm's names for its classes and settings, and those without counterpart."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MEANINGLESS: Final = (
 )  # fmt: skip
 """Settings that only say how Python is to decode or to name packets: decoding is the wire's, naming is [cache]'s."""
 CHANNEL: Final = "Height"
-"""The channel of the simulated microscope that stands for the one that a published picture was given."""
+"""The simulated microscope's channel, in place of the channel of a published picture."""
 
 Becomes = Callable[[object, Table], Settings]
 
@@ -50,8 +50,8 @@ class PublishedSetting:
     """One setting of a published class.
 
     Attributes:
-        becomes: our settings, with dots where one is within a table, from its value and the table that it is in.
-        why: for one that becomes nothing: how it is done here.
+        becomes: returns afspm's settings, with dots for tables, from the value and the table that contains it.
+        why: for a setting without counterpart: how afspm does it.
     """
 
     becomes: Becomes
@@ -60,7 +60,7 @@ class PublishedSetting:
 
 @dataclass(frozen=True)
 class PublishedClass:
-    """A published class that is one of ours under another name."""
+    """A published class with a counterpart in afspm."""
 
     ours: str
     settings: Mapping[str, PublishedSetting] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class PublishedClass:
 
 
 def wire_of(table: object) -> str:
-    """Return the name of the published intermediary or function that a value is, without its module; empty: none."""
+    """Return the name of the published intermediary or function in a value, without its module; empty: none."""
     name = table.get("class") if isinstance(table, Mapping) else None
     if not isinstance(name, str) or not name.startswith(WIRES):
         return ""
@@ -77,10 +77,10 @@ def wire_of(table: object) -> str:
 
 
 def converted(value: object, channels: Mapping[str, str]) -> Any:
-    """Replace within a value intermediaries by ours, and calls of published functions by the envelope that they return.
+    """Convert intermediaries within a value, and replace calls of published functions by the envelope that they return.
 
     Args:
-        channels: those of the file that have another name here.
+        channels: new names of the file's channels.
     """
     if isinstance(value, list):
         return [converted(item, channels) for item in value]
@@ -99,7 +99,7 @@ def converted(value: object, channels: Mapping[str, str]) -> Any:
 
 
 def _combined(table: Table) -> Settings:
-    """Several subscribers as one."""
+    # several subscribers become one
     urls: list[object] = []
     topics: list[object] = []
     for one in table.get("subs", ()):
@@ -111,7 +111,7 @@ def _combined(table: Table) -> Settings:
 
 
 def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
-    """Return the table of a published function with the names that its channels have here; others as they are."""
+    """Return the table of a published function with its channels renamed; others stay."""
     renamed = dict(table)
     match wire_of(renamed):
         case "create_roi_scan_envelope" if "channel" in renamed:
@@ -122,7 +122,7 @@ def with_channels(table: Table, channels: Mapping[str, str]) -> Settings:
 
 
 def cache_section(logic: object) -> Settings:
-    """Return [cache] as a published logic of the cache has it. A number among the sizes is in nm, as in envelopes."""
+    """Return [cache] for a published logic of the cache. A number among the sizes is in nm, as in envelopes."""
     if wire_of(logic) not in CACHE_LOGIC or not isinstance(logic, Mapping):
         return {}
     count = logic.get("default_scan_history")
@@ -144,7 +144,8 @@ def cache_section(logic: object) -> Settings:
 def envelope(table: Table) -> object:
     """Return the envelope that a published function makes: create_spec_envelope, or create_roi_scan_envelope.
 
-    A size without a unit is in nm, as in the envelopes themselves. What makes no envelope is returned as it is.
+    A size without a unit is in nm, as in the envelopes themselves. A table that makes no envelope is returned
+    unchanged.
     """
     if wire_of(table) == "create_spec_envelope":
         return default_envelope(PacketHeader("Spec1d", kind=str(table.get("type", ""))))
@@ -161,13 +162,13 @@ def length_m(value: str | float) -> float:
 
 
 def renamed_channels(components: Mapping[str, Table]) -> dict[str, str]:
-    """Return the channels that a file gives to simulated pictures, each with its name here."""
+    """Return the channels that a file gives to simulated pictures, each with its afspm name."""
     pictures = (table for table in components.values() if last(table) in _PICTURES)
     return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
 
 
 def class_of(table: Table) -> PublishedClass | None:
-    """Return what a component's class is here; None where the class is not a published one of these."""
+    """Return the counterpart of a component's class; None for a class that is not in the tables."""
     name, path = last(table), str(table.get("class", ""))
     if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
         return None
@@ -181,7 +182,7 @@ def class_of(table: Table) -> PublishedClass | None:
 
 
 def without_counterpart(path: str) -> str:
-    """Return what to write instead of a published class that has no counterpart; empty for all others."""
+    """Return the advice for a published class without counterpart; empty for all others."""
     return INSTEAD.get(path.rpartition(".")[2], "") if path.startswith(COMPONENTS) else ""
 
 
@@ -214,7 +215,7 @@ def _gone(why: str, *names: str) -> dict[str, PublishedSetting]:
 
 
 def _paper(ours: str) -> PublishedSetting:
-    """Return a setting of the paper's tracker, whose queue is what the published scheduler caches."""
+    # the paper's queue holds the scans that the published scheduler caches
 
     def becomes(value: object, table: Table) -> Settings:
         settings = {"drift.tracker.class": "paper", f"drift.tracker.{ours}": value}
@@ -231,7 +232,7 @@ def _within(value: object, *keys: str) -> object:
 
 
 def _estimator(value: Any, table: Table) -> Settings:
-    """Return the published drift model: descriptor and transform, by names of enumerations."""
+    # the published drift model names descriptor and transform by its enumerations
     given = {"descriptor_type": "BRIEF", "transform_type": "TRANSLATION", "fitting": "RANSAC"}
     given |= {key: item for key, item in dict(value).items() if key != "class"}
     known = {key: str(given.pop(key)).rpartition(".")[2].lower() for key in ("descriptor_type", "transform_type")}
@@ -253,7 +254,7 @@ def _oldest(value: object, table: Table) -> Settings:
 
 
 def _client(address: Callable[[Table], str]) -> Becomes:
-    """The table of a client that the published translator was given: where the controller is, and its timeout."""
+    # the published translator gets a client object: its table has the controller's address and timeout
 
     def becomes(value: object, table: Table) -> Settings:
         if not isinstance(value, Mapping):
@@ -282,7 +283,7 @@ def _width(value: Any, table: Table) -> Settings:
 
 
 def _speed(value: Any, table: Table) -> Settings:
-    """The speed at which a scan over the width of the picture takes that long: each line forth and back."""
+    # the published setting is the time of a scan over the width of the picture, each line forth and back
     size, unit = table.get("physical_size"), str(table.get("physical_units", "nm"))
     width_m = units.si(f"{size[0]} {unit}", "m") if isinstance(size, list) else _WIDTH_M
     return {"initial.scan-speed": f"{2 * _LINES * width_m / float(value) * 1e6:.6g} um/s"}
@@ -295,7 +296,7 @@ def _velocity(value: Any, table: Table) -> Settings:
 
 
 _LINES, _WIDTH_M = 128, 1e-6
-"""Of a scan that nothing was set for."""
+"""Of a scan with default settings."""
 _PICTURES: Final = ("ImageTranslator", "DriftImageTranslator")
 _EVERY: Final[dict[str, PublishedSetting]] = {
     **_gone("a process waits for its next message and never sleeps", "loop_sleep_s", "poll_timeout_ms"),
@@ -374,7 +375,7 @@ CLASSES: Final[dict[str, PublishedClass]] = {
     "GxsmTranslator": PublishedClass("Gxsm", _EVERY | _HANDLERS | _GXSM),
     "NanonisTranslator": PublishedClass("Nanonis", _EVERY | _HANDLERS | _NANONIS),
 }
-"""By the name of the class, in whichever module of the published implementation it was."""
+"""By the name of the class, without its module, which varied between versions."""
 
 _OWN = "derive a class of your own from afspm.Component, with on_scan, on_state … or a `run`"
 _TRANSLATOR = 'derive a class of your own from afspm.translator.Driver: "afspm new driver"'
@@ -384,11 +385,11 @@ INSTEAD: Final[dict[str, str]] = {
     **dict.fromkeys(("AfspmComponent", "AfspmComponentBase", "AfspmComponentUI"), _OWN),
     **dict.fromkeys(("MicroscopeTranslator", "ConfigTranslator", "MapTranslator", "SXMTranslator"), _TRANSLATOR),
 }
-"""What to write instead of a published class that calls code written against the published implementation."""
+"""Advice for published classes that call code written for the published implementation."""
 
 
 def convert(tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-    """Return the components of a file as ours; the intermediaries and [cache] of `parts` become ours as well."""
+    """Return the components of a file in afspm's form, and convert intermediaries and [cache] of `parts` in place."""
     channels = renamed_channels(tables)
     conversion = _Conversion(channels, parts, document)
     for table in tables.values():
@@ -403,7 +404,7 @@ def convert(tables: dict[str, Settings], parts: ExperimentParts, document: Docum
 
 
 def _kept_inside(table: Table, channels: Mapping[str, str]) -> Settings:
-    """An intermediary as ours; a call of a function, which is its result where it is named, keeps its table."""
+    # a function call keeps its table: its result stands where the call is named
     whole = converted(table, channels)
     return whole if isinstance(whole, dict) else with_channels(table, channels)
 
@@ -414,14 +415,14 @@ def _wires_of(table: Table) -> Settings:
 
 @dataclass(frozen=True)
 class _Conversion:
-    """Makes the components of one file ours, and notes what became of its lines."""
+    """Converts the components of one file, and notes the result for each of its lines."""
 
     channels: Mapping[str, str]
     parts: ExperimentParts
     document: Document
 
     def add_cache(self, table: Table) -> None:
-        """Put what the cache of a scheduler is told into [cache], where that says nothing."""
+        """Copy a scheduler's cache settings into [cache], where [cache] does not set them."""
         logic = _within(table, "pubsubcache", "update_cache_kwargs", "cache_logic")
         if isinstance(logic, Mapping) and isinstance(histories := logic.get("proto_with_history_list"), Mapping):
             logic = {**logic, "proto_with_history_list": with_channels(histories, self.channels)}
@@ -432,7 +433,7 @@ class _Conversion:
             given.update({key: value for key, value in (("history", history), ("rules", rules)) if value})
 
     def note_intermediary(self, name: str, table: Table) -> None:
-        """Note what became of an intermediary table."""
+        """Note the result of an intermediary table."""
         kind = wire_of(table)
         if kind in ENVELOPES:
             self.parts.became[(name,)] = f"the envelope {toml(envelope(with_channels(table, self.channels)))}"
@@ -440,10 +441,10 @@ class _Conversion:
             self.parts.became[(name,)] = "[cache]"
 
     def component(self, name: str, table: Settings, written: Table) -> Settings | None:
-        """Return a component as ours; None: it has no process of its own here.
+        """Return a component in afspm's form; None: it has no process of its own in afspm.
 
         Args:
-            written: the same before its intermediaries became ours.
+            written: the component before its intermediaries were converted.
         """
         here, path = (name, "class"), table.get("class")
         if not isinstance(path, str):
@@ -469,7 +470,7 @@ class _Conversion:
         return {**settings, "class": ours.ours}
 
     def drop_rescanners(self, ours: dict[str, Settings]) -> None:
-        """Leave out a rescanner where no scheduler says what is to be scanned again."""
+        """Leave out a rescanner if no drift scheduler would request rescans."""
         if any(table.get("class") == "DriftCompensatedScheduler" for table in ours.values()):
             return
         for name in [name for name in ours if self.parts.became.get((name, "class")) == 'class = "Rescanner"']:

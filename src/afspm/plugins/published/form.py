@@ -1,4 +1,4 @@
-"""The form of the files of the published implementation, as the entry point `afspm.forms` names it."""
+"""The form of the files of the published implementation, for the entry point `afspm.forms`."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class PublishedForm:
     """See `experiment.forms.FileForm`."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-        """Return the components of a file as ours."""
+        """Return the components of a file in afspm's form."""
         return convert(tables, parts, document)
 
     def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-        """Return for each line of the file where it is, what it sets, and what has become of it."""
+        """Return for each line of the file its place, its setting, and its result."""
         from afspm.plugins.published.short_form import explained  # not needed to run a file
 
         return explained(resolved)

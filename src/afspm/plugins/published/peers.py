@@ -1,4 +1,4 @@
-"""Components of the published implementation in an experiment of ours, and our microscope for their scheduler."""
+"""Components of the published implementation in an afspm experiment, and afspm's microscope for their scheduler."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afspm.basics.launch import Launch
 from afspm.model import ControlRequest, ControlResponse, Packet, Response, ScopeState
 from afspm.model.events import PERSON
 from afspm.plugins.published import version_1
-from afspm.plugins.published.pacing import Pacing
+from afspm.plugins.published.version_1 import Pacing
 from afspm.transport.control_client import ControlClient
 from afspm.transport.frames import receive_frames, send_frames, send_packet
 from afspm.transport.late_joiners import PublishedHistory
@@ -34,38 +34,38 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 SETTLED_S: Final = 0.05
-"""After a subscription others of the same peer follow: it is replayed to once all are there, since it drops what is
-older than the newest that it has had, whatever the envelope."""
+"""Real time from a subscription to its replay. A peer subscribes several times in a row, and drops packets older than
+the newest that it received under any envelope, so the replay waits for all its subscriptions."""
 LINGER_S: Final = 1.0
-"""Real time after the end of the experiment in which answers still go out."""
+"""Real time after the end of the experiment for last answers."""
 MOST_EXTRA: Final = 50
-"""Subscriptions to messages that version 1 does not have."""
+"""Largest number of subscriptions to messages unknown to version 1."""
 _PROBLEM_REQUESTS = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
 _NO_PROBLEM = b"\0"
 _NAMELESS = b"a client without a name: set the socket's identity to the component's name"
 
 
 class PublishedPeers:
-    """Lets components of the published implementation take part: they find here the scheduler that they know.
+    """Lets components of the published implementation join, by playing the scheduler that they expect.
 
-    Each is to our scheduler a client of its own, by its own name.
+    The afspm scheduler sees each of them as a client with its own name.
 
     Args:
         serve: the address that their control clients connect to.
         publish: the address that their subscribers connect to.
-        as_translator: stand for the translator instead: for their scheduler, or their suite of tests. Packets then have
-            a translator's envelopes, and this process takes control before each command.
+        as_translator: play the translator instead, for their scheduler or their test suite. Packets then have a
+            translator's envelopes, and this process takes control before each command.
     """
 
     opens_plain: ClassVar[bool] = True
-    """Programs without keys can command the microscope by it: the experiment file has to allow that."""
+    """Programs without keys can command the microscope through it, so the experiment file has to allow it."""
 
     def __init__(self, serve: str, publish: str, *, as_translator: bool = False) -> None:
         self._serve, self._publish = serve, publish
         self._as_translator = as_translator
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or the parent lets go."""
+        """Run until the experiment ends or the parent is gone."""
         port = _PeersPort(context, self._serve, self._publish, as_translator=self._as_translator)
         context.when_stopping(lambda: port.wake_up(ParentGone()))
         try:
@@ -82,17 +82,17 @@ class PublishedPeers:
 
 
 class _PeerClient:
-    """One client of our scheduler, for one peer; or, in place of a translator, for all peers.
+    """One client of the afspm scheduler for one peer; or, in place of a translator, for all peers.
 
     Attributes:
-        asked: requests without an answer, by id: the peer's identity, the number, and what was sent.
-        admitted: the scheduler has answered in this name; else a failure is about the name itself.
+        asked: requests without an answer, by id: the peer's identity, the number, and the frames sent.
+        admitted: the scheduler has answered under this name before; until then a failure concerns the name itself.
         leaves: the peer is gone, and its last request is not answered yet.
     """
 
     def __init__(self, bridge: _PeersPort, name: str) -> None:
         self._bridge = bridge
-        # closed with all that it holds when the peer goes: by that the scheduler knows of it
+        # closed when the peer goes: the scheduler notices a client's end by its connection
         self.network = Network.from_launch(bridge.launch.name, bridge.launch.keys)
         address = bridge.launch.sockets.control
         if address is None:
@@ -105,7 +105,7 @@ class _PeerClient:
     def ask(self, identity: bytes, frames: list[bytes], *, takes_control: bool) -> None:
         sent: list[list[bytes]] = []
         if takes_control:
-            # refused while another client is in control; then the command is refused as well, and says so
+            # refused while another client is in control; then the command is refused, too, with the reason
             control_id = self._bridge.next_id(self.name)
             sent.append([bytes([ControlRequest.REQUEST_CTRL]), _NO_PROBLEM, control_id.encode()])
         request_id = self._bridge.next_id(self.name)
@@ -156,20 +156,20 @@ class _PeersPort(BasePort[Incoming]):
         self._listen(version_1.TOPICS)
 
     def next_id(self, name: str) -> str:
-        """Return an id for a request in a name, not used before."""
+        """Return an unused id for a request under a name."""
         return f"{name}/{self._session}/{next(self._numbers)}"
 
     def due_in_s(self) -> float | None:
-        """Return how long to wait for messages at most."""
+        """Return the longest time to wait for messages; None: no limit."""
         due_s = min(self._outlet.due_s, self._ends_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment has ended, and answers have had time to go out."""
+        """Return whether the experiment has ended, and the time for last answers, too."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def publish_due(self) -> None:
-        """Replay to late joiners, then publish what is due."""
+        """Replay to late joiners, then publish due packets."""
         self._outlet.publish_due()
 
     def answer(self, client: _PeerClient, identity: bytes, asked: int, response: Response) -> None:
@@ -186,11 +186,11 @@ class _PeersPort(BasePort[Incoming]):
         super().close()
         self._outside.close()
 
-    # --- what comes from outside ---
+    # --- from outside ---
 
     def _requests(self) -> list[Incoming]:
         while frames := receive_frames(self._router):
-            # drained after the message was received: so an earlier connection of this descriptor is forgotten
+            # drained after the message was received, so that an earlier connection of this descriptor is forgotten
             gone = self._changes()
             identity, content = frames[0].bytes, [frame.bytes for frame in frames[1:]]
             if content[:1] != [b""]:
@@ -227,13 +227,14 @@ class _PeersPort(BasePort[Incoming]):
         if client is not None:
             client.leaves = False  # it is back
         else:
+            # a client for each peer, so that the scheduler arbitrates control between them
             client = self._clients[key] = _PeerClient(self, self._name_inside(identity))
             self._poller.register(client.link.socket, client.receive)
             self._poller.register(client.link.monitor.socket, client.follow)
         return client
 
     def _name_inside(self, identity: bytes) -> str:
-        """The name by which the scheduler knows a peer; with keys, this process acts for it."""
+        # with keys, this process acts for the peer as for a person
         if self._as_translator:
             return self.launch.name
         name = identity.decode("utf-8", "replace")
@@ -247,7 +248,7 @@ class _PeersPort(BasePort[Incoming]):
         return []
 
     def _changes(self) -> set[int]:
-        """Take in which connections went, and return their descriptors."""
+        # returns the descriptors of connections that were lost
         gone: set[int] = set()
         for kind, descriptor in self._monitor.drain():
             self._disconnected(descriptor)
@@ -260,7 +261,7 @@ class _PeersPort(BasePort[Incoming]):
         if client is None or identity in self._identities.values():
             return  # it has a newer connection
         if client.asked:
-            client.leaves = True  # its last request is carried out all the same
+            client.leaves = True  # its last request is still carried out
         else:
             self._leave(client)
 
@@ -273,7 +274,7 @@ class _PeersPort(BasePort[Incoming]):
 
     def _subscriptions(self) -> list[Incoming]:
         for prefix in self._outlet.subscriptions():
-            # a message that version 1 does not have comes to a peer that asks for it by its name
+            # a peer gets messages unknown to version 1 if it subscribes by their names
             if prefix == wire.KILL.decode() or prefix.startswith(tuple(self._listened)):
                 continue
             if len(self._listened) < MOST_EXTRA:
@@ -282,7 +283,7 @@ class _PeersPort(BasePort[Incoming]):
                 self.warnings.warning(f"a subscription to {prefix!r} is one too many")
         return []
 
-    # --- what comes from inside ---
+    # --- from inside ---
 
     def _listen(self, prefixes: Sequence[str]) -> None:
         self._listened += prefixes
@@ -292,7 +293,7 @@ class _PeersPort(BasePort[Incoming]):
             self._poller.register(subscriber.monitor.socket, subscriber.follow)
 
     def take(self, incoming: Incoming) -> None:
-        """Process what our scheduler publishes."""
+        """Process a packet or the end from the afspm scheduler."""
         match incoming:
             case PacketReceived(packet, _):
                 self._take_packet(packet)
@@ -308,7 +309,7 @@ class _PeersPort(BasePort[Incoming]):
                 state = wire.decode(message, packet.payload).state
             elif message == CONTROL_STATE.name:
                 if self._as_translator:
-                    return  # the scheduler outside has one of its own
+                    return  # the scheduler outside publishes its own
                 packet = self._with_names_outside(packet)
         except WireError as error:
             self.warnings.warning(f"dropped a packet of the scheduler: {error}")
@@ -317,20 +318,20 @@ class _PeersPort(BasePort[Incoming]):
         self._outlet.pacing.put(Packet(envelope, packet.payload, packet.time_ns), message, state)
 
     def _with_names_outside(self, packet: Packet) -> Packet:
-        """A peer in control finds the name that it knows itself by."""
+        # a peer compares the holder of control with its own name
         prefix = f"{self.launch.name}{PERSON}"
-        told = wire.decode(CONTROL_STATE.name, packet.payload)
-        if told.holder is None or not told.holder.startswith(prefix):
+        control = wire.decode(CONTROL_STATE.name, packet.payload)
+        if control.holder is None or not control.holder.startswith(prefix):
             return packet
-        payload = wire.encode(replace(told, holder=told.holder.removeprefix(prefix)))[1]
+        payload = wire.encode(replace(control, holder=control.holder.removeprefix(prefix)))[1]
         return Packet(packet.envelope, payload, packet.time_ns)
 
 
 class _Outlet:
-    """Publishes to SUB sockets: paced, and first what was published before.
+    """Publishes to SUB sockets: first a replay to late joiners, then paced packets.
 
     Attributes:
-        pacing: takes what is to be published.
+        pacing: the queue of packets to publish.
     """
 
     def __init__(
@@ -338,7 +339,7 @@ class _Outlet:
     ) -> None:
         self.pacing = Pacing()
         self._history, self._clock, self._warnings = history, clock, warnings
-        self._joined: set[str] = set()  # prefixes of late joiners that are to be replayed to
+        self._joined: set[str] = set()  # prefixes of late joiners that wait for a replay
         self._replay_s = math.inf
         self.socket = outside.socket(zmq.XPUB)
         self.socket.setsockopt(zmq.XPUB_MANUAL, 1)
@@ -347,23 +348,23 @@ class _Outlet:
 
     @property
     def due_s(self) -> float:
-        """When something goes out; infinity: nothing waits."""
+        """Time of the next publication; infinity: nothing waits."""
         return min(self.pacing.due_s, self._replay_s)
 
     def subscriptions(self) -> list[str]:
-        """Take in who subscribed; return the prefixes that are meant."""
+        """Process new subscriptions; return the prefixes that they mean."""
         meant: list[str] = []
         while frames := receive_frames(self.socket):
             kind, subscription = frames[0].bytes[:1], frames[0].bytes[1:]
             if kind != b"\1":
-                continue  # a SUB socket drops by itself what it does not want any more
+                continue  # an ended subscription: the SUB socket itself drops the packets
             try:
                 prefixes = version_1.topics_meant(subscription.decode())
             except UnicodeDecodeError:
                 self._warnings.warning("dropped a subscription that is no text")
                 continue
             for prefix in prefixes:
-                # in this mode a subscription is for the one peer whose message was received last
+                # XPUB_MANUAL: the subscription applies to the peer whose message was received last
                 self.socket.setsockopt(zmq.SUBSCRIBE, prefix.encode())
             meant += prefixes
         if meant:
@@ -373,7 +374,7 @@ class _Outlet:
         return meant
 
     def publish_due(self) -> None:
-        """Replay to late joiners, then publish what is due."""
+        """Replay to late joiners, then publish due packets."""
         now_s = self._clock.monotonic_s()
         if now_s >= self._replay_s:
             prefixes, self._joined, self._replay_s = tuple(self._joined), set(), math.inf
@@ -383,7 +384,7 @@ class _Outlet:
             self._publish(packet)
 
     def end(self) -> None:
-        """Publish all that waits, and that the experiment has ended."""
+        """Publish all waiting packets, and the end of the experiment."""
         for packet in self.pacing.take_all():
             self._publish(packet)
         self.socket.send(wire.KILL)
@@ -396,7 +397,7 @@ class _Outlet:
 
 
 class _Receiver:
-    """Hands what one subscriber receives to the bridge."""
+    """Hands messages of one subscriber to the bridge."""
 
     def __init__(self, bridge: _PeersPort, subscriber: Subscriber) -> None:
         self._bridge, self._subscriber = bridge, subscriber

@@ -1,4 +1,4 @@
-"""Our components under a scheduler of the published implementation."""
+"""Components of afspm under a scheduler of the published implementation."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ CACHE_WITHIN_S: Final = 2.0
 """Real time in which a scheduler of version 1 has sent its cache. It does not say when it is done."""
 LINGER_S: Final = 1.0
 MOST_ANSWERS: Final = 256
-"""Answers remembered of each client, for requests that are repeated."""
+"""Remembered answers per client, for repeated requests."""
 
 
 class PublishedScheduler:
-    """Stands for a scheduler of the published implementation, which decides who is in control.
+    """Stands for a scheduler of the published implementation, which arbitrates control.
 
     Args:
         serve: the address of its router.
@@ -57,12 +57,12 @@ class PublishedScheduler:
             raise ConfigError(
                 "a scheduler of the published implementation enforces no limits",
                 where="limits",
-                hint="leave [limits] away, or let our Scheduler arbitrate and their programs join by PublishedPeers",
+                hint="leave out [limits]; or use afspm's Scheduler, and let their programs join by PublishedPeers",
             )
         self._serve, self._publish = serve, publish
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or the parent lets go."""
+        """Run until the experiment ends or the parent is gone."""
         stopping = threading.Event()
         port = _SchedulerPort(context, self._serve, self._publish)
 
@@ -84,8 +84,8 @@ class _ClientOutside:
     """The connection of one client to their scheduler.
 
     Attributes:
-        connection: the newest by which the client has asked.
-        asked: requests sent and not answered, oldest first: a REQ socket has one at a time.
+        connection: the newest connection of the client.
+        asked: requests without an answer, oldest first: a REQ socket has one at a time.
         answers: to the latest requests, by id.
     """
 
@@ -103,7 +103,7 @@ class _ClientOutside:
         self._is_sent = False
 
     def ask(self, request: Request) -> None:
-        """Send a request once those before it are answered; one that is repeated gets the answer that it had."""
+        """Send a request once earlier ones are answered; repeat the known answer to a repeated one."""
         if request.id and request.id in self.answers:
             self._bridge.reply(self, self.answers[request.id])
         elif not request.id or all(request.id != one.id for one in self.asked):
@@ -127,7 +127,7 @@ class _ClientOutside:
     def follow(self) -> list[Incoming]:
         for event in self.monitor.drain():
             was_sent, self._is_open, self._is_sent = self._is_sent, event.kind == CONNECTED, False
-            if was_sent:  # asked again it might be done twice
+            if was_sent:  # repeated, it might be carried out twice
                 why = "the connection to the scheduler was lost before it answered"
                 detail = ResponseDetail.OUTCOME_UNKNOWN
                 self._is_sent = True
@@ -160,7 +160,7 @@ class _ClientOutside:
 
 
 class _SchedulerPort(BasePort[Incoming]):
-    """All sockets of the process: outside those of a client for each of ours, inside those of a scheduler."""
+    """All sockets of the process: outside one for each client of afspm, inside the sockets of a scheduler."""
 
     def __init__(self, context: ProcessContext, serve: str, publish: str) -> None:
         launch = context.launch
@@ -178,7 +178,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._ends_s = math.inf
         self._outside = version_1.outside(launch)
         self._sub = self._outside.socket(zmq.SUB)
-        self._sub.setsockopt(zmq.SUBSCRIBE, b"")  # one: their scheduler takes in one subscription a loop
+        self._sub.setsockopt(zmq.SUBSCRIBE, b"")  # a single one: their scheduler processes one subscription per loop
         self._monitor = Monitor(self._outside, self._sub, CONNECTED)
         self._opens_s = math.inf
         self._outside.connect(self._sub, publish)
@@ -186,16 +186,16 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.register(self._monitor.socket, self._connected)
 
     def due_in_s(self) -> float | None:
-        """Return how long to wait for messages at most."""
+        """Return the longest time to wait for messages; None: no limit."""
         due_s = min(self._ends_s, self._opens_s)
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment has ended, and answers have had time to go out."""
+        """Return whether the experiment has ended, and the time for last answers, too."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def open_when_cached(self) -> None:
-        """Let our components in, once their scheduler has had time to send its cache."""
+        """Let afspm's components in, once their scheduler has had time to send its cache."""
         if self._clock.monotonic_s() >= self._opens_s and self.launch.sockets.serve is not None:
             self._opens_s = math.inf
             self._router = Router(self._network, self.launch.sockets.serve, self._warnings, self._clock)
@@ -203,15 +203,15 @@ class _SchedulerPort(BasePort[Incoming]):
             self._poller.register(self._router.monitor.socket, self._requests)
 
     def known_answer(self, request: Request) -> Response | None:
-        """Return the answer to a request that would end their scheduler; None: it is asked."""
+        """Return the answer to a request that would end their scheduler; None: it may be sent."""
         if not version_1.has_request(request.kind):
             return version_1.unknown_request(request.kind, "scheduler", request.id)
         if request.kind == ControlRequest.RMV_EXP_PRBLM and request.subject not in self._flagged | self._unpublished:
-            return Response(int(ControlResponse.SUCCESS))  # it ends over a problem that is not set
+            return Response(int(ControlResponse.SUCCESS))  # their scheduler ends if the problem is not set
         return None
 
     def note(self, request: Request, response: Response) -> None:
-        """Remember which problems are flagged."""
+        """Remember flagged problems."""
         if response.ok and request.kind == ControlRequest.ADD_EXP_PRBLM:
             self._unpublished.add(int(request.subject))
         elif response.ok and request.kind == ControlRequest.RMV_EXP_PRBLM:
@@ -229,7 +229,7 @@ class _SchedulerPort(BasePort[Incoming]):
         super().close()
         self._outside.close()
 
-    # --- our components ---
+    # --- inside: components ---
 
     def _requests(self) -> list[Incoming]:
         if self._router is not None:
@@ -247,7 +247,7 @@ class _SchedulerPort(BasePort[Incoming]):
                 name = self._names.pop(connection, "")
                 client = self._clients.get(name)
                 if client is not None and client.connection == connection:
-                    # closed: their scheduler knows no other sign by which a client is gone
+                    # closed: their scheduler notices a client's end only by its connection
                     self._forget(name)
 
     def _asked(self, connection: int, name: str, user: str | None, frames: list[bytes]) -> None:
@@ -286,7 +286,7 @@ class _SchedulerPort(BasePort[Incoming]):
         self._poller.forget(client.monitor.socket)
         client.close()
 
-    # --- their scheduler ---
+    # --- outside: their scheduler ---
 
     def _connected(self) -> list[Incoming]:
         if self._monitor.drain() and self._router is None:

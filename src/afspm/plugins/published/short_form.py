@@ -1,4 +1,4 @@
-"""The short form of a file of the published implementation, and what each of its lines has become."""
+"""The short form of a file of the published implementation, and the result of each of its lines."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ _FILLED_IN: Final = "filled in: processes on one computer find each other"
 
 
 def explained(resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-    """Return for each line of the file where it is, what it sets, and what has become of it."""
+    """Return for each line of the file its place, its setting, and its result."""
     return [(resolved.document.place(*path), _shown(path), became) for path, became in _lines(resolved)]
 
 
 def short(resolved: ResolvedExperiment) -> str:
-    """Return the experiment in the short form: components with their settings, and what is not usual.
+    """Return the experiment in the short form: components with their settings, and sections unlike the defaults.
 
-    A component that has no counterpart is the one that may stand for it, where that can be told from its settings,
-    else a comment that says what to write.
+    A component without counterpart becomes its substitute, where the settings determine one, else a comment with
+    advice.
     """
     parts = resolved.parts
     kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}
@@ -65,7 +65,7 @@ def _lines(resolved: ResolvedExperiment) -> Iterator[tuple[tuple[str, ...], str]
 
 
 def _addresses(resolved: ResolvedExperiment) -> set[str]:
-    """Return every address between processes of the experiment, as the tables of the wiring say it."""
+    # addresses stand in the net of processes, and in the tables of intermediaries
     found = {slot.address for slot in resolved.net.slots.values()}
     for table in resolved.parts.intermediaries.values():
         if wire_of(table) is not None:
@@ -110,7 +110,7 @@ def _table(part: ExperimentPart, resolved: ResolvedExperiment) -> Settings:
 
 
 def _remote(wires: WiringKeys, role: Role) -> Settings:
-    """The addresses that other computers reach or are on: they can't be left out."""
+    # addresses of other computers can't be left out
     places = {
         "publisher": wires.publish,
         "control_server" if role is Role.TRANSLATOR else "router": wires.serve,
@@ -141,7 +141,7 @@ def _sections(resolved: ResolvedExperiment) -> dict[str, Settings]:
 
 
 def _instead(name: str, table: Table) -> str:
-    """Return a component without counterpart: as a series of scans where its data say which, else a comment."""
+    # a series of scans where the data name its region, else a comment
     called = table.get("get_next_params") or table.get("message_received_method") or table.get("per_loop_method") or ""
     was = f"# [{name}] was {last(table)}{f', which called {called}' if called else ''}."
     series = _series(table)
@@ -151,7 +151,7 @@ def _instead(name: str, table: Table) -> str:
 
 
 def _series(table: Table) -> Settings | None:
-    """ScanSeries, where what the function is given says one region, and how long to wait after each scan."""
+    # possible if the function's arguments give one region, and the pause after each scan
     given = table.get("next_params_kwargs")
     data = next((one for one in given.values() if isinstance(one, Mapping)), {}) if isinstance(given, Mapping) else {}
     match data:
@@ -178,6 +178,6 @@ def _series(table: Table) -> Settings | None:
 
 
 def _middle(origin: float, length: float, unit: str) -> str:
-    """The middle of a side that begins at `origin`: regions are told by their centre here."""
+    # published regions have an origin, afspm's a centre
     units.si(f"{length} {unit}", "m")
     return f"{origin + length / 2:g} {unit}"

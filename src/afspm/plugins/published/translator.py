@@ -1,4 +1,4 @@
-"""A translator of the published implementation under our scheduler."""
+"""A translator of the published implementation under an afspm scheduler."""
 
 from __future__ import annotations
 
@@ -52,16 +52,16 @@ if TYPE_CHECKING:
 STOPPED_WITHIN_S: Final = 2.0
 """Real time that their translator has to stop its measurement when the experiment ends."""
 _STOPS: Final = {ScopeState.SCANNING: STOP_SCAN, ScopeState.SPEC: STOP_SPEC}
-_OWN = b"own"  # stands where the numbers of requests do
+_OWN = b"own"  # the id of this process's own requests, which clients' requests don't have
 
 
 class PublishedTranslator:
-    """Stands for a translator of the published implementation, which is to speak to our scheduler.
+    """Stands for a translator of the published implementation, for an afspm scheduler.
 
     Args:
         serve: the address of its control server.
         publish: the address of its publisher.
-        program: starts it, with our launch line on its standard input; both addresses are then found in that.
+        program: starts it, with afspm's launch line, which contains both addresses, on its standard input.
         spectra_by_variable: it sends the values of a spectrum variable after variable, as the published ones for
             Nanonis and Asylum do.
     """
@@ -81,7 +81,7 @@ class PublishedTranslator:
         self._by_variable = spectra_by_variable
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends, the parent lets go, or the program that was started has ended."""
+        """Run until the experiment ends, the parent is gone, or the started program has ended."""
         stop = _Stop()
         context.when_stopping(stop.set)
         if not self._program:
@@ -93,7 +93,7 @@ class PublishedTranslator:
         return child.returncode or ExitCode.CRASHED if stop.child_ended else code
 
     def _run(self, context: ProcessContext, stop: _Stop, serve: str, publish: str) -> int:
-        """While their translator is not connected, ours is not there: our scheduler sees that."""
+        # inside, the translator exists only while theirs is connected, so that the scheduler sees a loss
         launch = context.launch
         memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
         while not stop.is_set and _is_connected(context.launch, serve, stop):
@@ -109,13 +109,13 @@ class PublishedTranslator:
 
 
 class SimulatedPublishedTranslator(PublishedTranslator):
-    """A translator of the published implementation whose microscope is simulated for certain."""
+    """A translator of the published implementation whose microscope is certainly simulated."""
 
     simulated: ClassVar[bool] = True
 
 
 class _Stop:
-    """The wish to end, from the parent or by the end of the program that was started."""
+    """A request to end: from the parent, or by the end of the started program."""
 
     def __init__(self) -> None:
         self.is_set = self.child_ended = False
@@ -138,7 +138,7 @@ class _Stop:
 def _started(
     program: Sequence[str], context: ProcessContext, sockets: Sockets, stop: _Stop
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run a program under the guard that also runs commands of other languages, while in the block."""
+    # under the guard that also runs commands in other languages
     own = (sys.executable,) if program[0] == "python" else program[:1]
     line = replace(context.launch, class_="", settings={}, sockets=sockets, keys=None).to_json()
     child = subprocess.Popen([*python_command(GUARD), "--", *own, *program[1:]], stdin=subprocess.PIPE)
@@ -161,7 +161,7 @@ def by_point(payload: bytes) -> bytes:
 
 
 def _is_connected(launch: Launch, address: str, stop: _Stop) -> bool:
-    """Wait until a program listens at an address; False: the wish to end came first."""
+    # waits for a listener at the address; False: a request to end came first
     network = version_1.outside(launch)
     try:
         socket = network.socket(zmq.DEALER)
@@ -197,14 +197,16 @@ class _TranslatorPort(ZmqServerPort):
         self._commander = b""
         self._in_hand: Request | None = None
         self._number = 0
-        self._memory = memory  # outlives a restart: a request that their side may have carried out is not sent again
+        self._memory = (
+            memory  # saved: after a restart, a request that their side may have carried out is not sent again
+        )
         self._outcomes = RequestOutcomes(memory.setdefault("requests", {}), all_or_nothing=False)
         self._state = ScopeState.UNDEFINED
         self._ends_s = math.inf
         self._is_lost = False
         self._outside = version_1.outside(launch)
         self._dealer = self._outside.socket(zmq.DEALER)
-        self._dealer.setsockopt(zmq.IMMEDIATE, 1)  # nothing waits for a translator that is gone
+        self._dealer.setsockopt(zmq.IMMEDIATE, 1)  # no request is queued for a translator that is gone
         self._dealer_monitor = Monitor(self._outside, self._dealer, DISCONNECTED)
         self._sub = self._outside.socket(zmq.SUB)
         self._sub.setsockopt(zmq.SUBSCRIBE, b"")
@@ -215,7 +217,7 @@ class _TranslatorPort(ZmqServerPort):
         self._poller.register(self._sub, self._packets)
 
     def run(self, stop: _Stop) -> bool:
-        """Run until the end of the experiment (True), the wish to end, or the loss of their translator."""
+        """Run until the end of the experiment (True), a request to end, or the loss of their translator."""
         stop.bridge = self
         try:
             while not (stop.is_set or self._is_lost):
@@ -233,7 +235,7 @@ class _TranslatorPort(ZmqServerPort):
         super().close()
         self._outside.close()
 
-    # --- our scheduler ---
+    # --- inside: the scheduler ---
 
     def _take(self, arrived: RequestReceived) -> None:
         before, epoch = self._commander, Epoch.decode(arrived.epoch)
@@ -272,7 +274,7 @@ class _TranslatorPort(ZmqServerPort):
         self.reply(wire.encode_response(response))
 
     def _end(self) -> None:
-        """Stop what it measures: it goes on until it is stopped by hand, but not with its scan."""
+        # their translator goes on, to be stopped by hand; its running scan must not
         self._answer(Response(int(ControlResponse.SUCCESS)))
         self._ends_s = self._clock.monotonic_s()
         if stop := _STOPS.get(self._state):
@@ -280,7 +282,7 @@ class _TranslatorPort(ZmqServerPort):
             frames = version_1.request_frames(Request(int(ControlRequest.ACTION), stop))
             send_frames(self._dealer, [_OWN, b"", *frames])
 
-    # --- their translator ---
+    # --- outside: their translator ---
 
     def _answers(self) -> list[Served]:
         while frames := receive_frames(self._dealer):

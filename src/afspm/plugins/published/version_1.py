@@ -1,11 +1,16 @@
-"""Version 1 of the protocol: what its programs can read. All else ends them."""
+"""Version 1 of the protocol: the messages that its programs can read, and the pace at which they can follow.
+
+Any other envelope or request number ends them.
+"""
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import Final
 
 from afspm.basics.launch import Launch
-from afspm.model import ControlRequest, ControlResponse, Request, Response
+from afspm.model import ControlRequest, ControlResponse, Packet, Request, Response, ScopeState
 from afspm.transport.network import Network
 from afspm.wire import KILL, encode_response, encode_subject
 from afspm.wire.messages import (
@@ -32,6 +37,12 @@ TOPICS: Final = (
     POINTS.name,
 )
 """The messages that a cache of version 1 knows."""
+PAUSE_S: Final = 0.4
+"""Real time; the published implementation polls every 0.38 s."""
+MOST_WAITING: Final = 1000
+"""Packets; an experiment that runs faster than real time produces more than can be spaced."""
+_PASSING = (ScopeState.MOVING, ScopeState.INTERRUPTED)
+_SETTINGS = (SCAN_PARAMETERS.name, FEEDBACK.name, PROBE_POSITION.name)
 _WITHOUT_OBJECT = (ControlRequest.RELEASE_CTRL, ControlRequest.END_EXPERIMENT)
 
 
@@ -46,7 +57,7 @@ def has_request(number: int) -> bool:
 
 
 def request_frames(request: Request) -> list[bytes]:
-    """Return a request in the frames of version 1: number, and the object of a request that has one, be it empty."""
+    """Return a request in the frames of version 1: its number, and its object (possibly empty) if it takes one."""
     number = bytes([request.kind])
     return [number] if request.kind in _WITHOUT_OBJECT else [number, request.payload or encode_subject(request.subject)]
 
@@ -55,8 +66,8 @@ def answer_frames(asked: int, response: Response, *, reason: bool = False) -> li
     """Return a response in the frames of version 1: number and object.
 
     Args:
-        asked: the number of the request; the answer to REQ_PARAM always has an object, be it empty.
-        reason: add the reason as a third frame, for a person who looks at what came.
+        asked: the number of the request; the answer to REQ_PARAM always has an object, possibly empty.
+        reason: add the reason as a third frame, for debugging.
     """
     if reason:
         return encode_response(response)[:3]
@@ -65,13 +76,13 @@ def answer_frames(asked: int, response: Response, *, reason: bool = False) -> li
 
 
 def unknown_request(number: int, whose: str, request_id: str) -> Response:
-    """Return the answer to a request that is not sent outside, where its number would end the peer."""
+    """Return the answer to a request whose number would end the peer, so that it is not sent outside."""
     reason = f"the {whose} is of version 1 of the protocol, which has no request {number}"
     return Response(int(ControlResponse.CMD_NOT_SUPPORTED), b"", reason, request_id)
 
 
 def topics_meant(prefix: str) -> list[str]:
-    """Return the prefixes that a subscription of version 1 means: a common beginning stands for messages it knows.
+    """Return the prefixes that a subscription of version 1 means: a common beginning stands for the messages it knows.
 
     >>> topics_meant("Scan")
     ['Scan2d', 'ScanParameters2d']
@@ -79,3 +90,66 @@ def topics_meant(prefix: str) -> list[str]:
     (['Scan2d_2'], ['JournalEntries'])
     """
     return [name for name in (*TOPICS, KILL.decode()) if name.startswith(prefix)] or [prefix]
+
+
+class Pacing:
+    """Delays packets for peers that process one message per poll and see only the last state; keeps their order.
+
+    Scans go out `PAUSE_S` apart. The state after SS_MOVING or SS_INTERRUPTED goes out `PAUSE_S` after it, and after the
+    last settings in between. Above `MOST_WAITING` packets the oldest go out at once.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: deque[tuple[Packet, str, ScopeState | None]] = deque()
+        self._held_until_s = -math.inf
+        self._scan_s = self._passing_s = -math.inf
+        self._passes = False
+
+    def put(self, packet: Packet, message: str, state: ScopeState | None) -> None:
+        """Add a packet.
+
+        Args:
+            message: its kind.
+            state: the state in a ScopeStateMsg; None for others.
+        """
+        self._waiting.append((packet, message, state))
+
+    def hold(self, until_s: float) -> None:
+        """Hold all packets until then: a late joiner still has to get earlier ones."""
+        self._held_until_s = max(self._held_until_s, until_s)
+
+    def take(self, now_s: float) -> list[Packet]:
+        """Return the packets that are due, oldest first."""
+        due: list[Packet] = []
+        while self._waiting and (len(self._waiting) > MOST_WAITING or self.due_s <= now_s):
+            packet, message, state = self._waiting.popleft()
+            self._went_out(message, state, now_s)
+            due.append(packet)
+        return due
+
+    def take_all(self) -> list[Packet]:
+        """Return all packets, at the end of the experiment."""
+        rest = [packet for packet, _, _ in self._waiting]
+        self._waiting.clear()
+        return rest
+
+    @property
+    def due_s(self) -> float:
+        """Time of the next packet; infinity: none waits."""
+        if not self._waiting:
+            return math.inf
+        _, message, state = self._waiting[0]
+        after_s = -math.inf
+        if message == SCAN.name:
+            after_s = self._scan_s
+        elif state is not None and self._passes:
+            after_s = self._passing_s
+        return max(self._held_until_s, after_s + PAUSE_S)
+
+    def _went_out(self, message: str, state: ScopeState | None, now_s: float) -> None:
+        if message == SCAN.name:
+            self._scan_s = now_s
+        elif state is not None:
+            self._passes, self._passing_s = state in _PASSING, now_s
+        elif self._passes and message in _SETTINGS:
+            self._passing_s = now_s

@@ -1,4 +1,4 @@
-"""The run's folder: what was before this dashboard was started, scans that left the memory, and the limits."""
+"""The run's folder: measurements before the start of this component, scans no longer in memory, and the limits."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ KEPT = 6
 
 
 class Archive:
-    """Reads what the recorder has written into the run's folder. From any thread.
+    """Reads the recorder's files in the run's folder. From any thread.
 
     Args:
-        folder: of the run; None where it is on another computer.
+        folder: of the run; None if it is on another computer.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -36,19 +36,19 @@ class Archive:
         self._read: OrderedDict[FrameKey, ChannelFrame] = OrderedDict()
 
     def past(self, problems: ProblemNames) -> Overview | None:
-        """Return what the run has come to so far, without what was logged; None if there is no record of it yet."""
-        if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has only that of another run
+        """Return the overview of the run so far, without log lines; None if there is no record of it yet."""
+        if self._folder is None or not (self._folder / JOURNAL_FILE).is_file():  # a replay has no journal of its own
             return None
         try:
             with open_run(self._folder) as run:
-                # of all others the scheduler has kept enough for a late joiner
+                # of other messages the scheduler's cache is enough
                 return run.overview([one.name for one in wire.declared() if one.in_past], problems)
         except (AfspmError, ImportError) as error:
             self._log.debug("the earlier part of the run can't be read: %s", error)
             return None
 
     def frame(self, time_ns: int, channel: str) -> ChannelFrame | None:
-        """Return a finished channel by its time; None if it is not in the record, or there is none."""
+        """Return a finished channel by its time; None if the record does not contain it, or there is no record."""
         if self._folder is None:
             return None
         key = (time_ns, channel)
@@ -68,7 +68,7 @@ class Archive:
             return frame
 
     def spectrum(self, time_ns: int) -> Spectrum | None:
-        """Return a spectrum by its time; None if it is not in the record, or there is none."""
+        """Return a spectrum by its time; None if the record does not contain it, or there is no record."""
         if self._folder is None:
             return None
         try:
@@ -86,11 +86,11 @@ def allowed_region(folder: Path) -> Region | None:
         box = _section(folder, "limits").get("region")
         return None if box is None else _region(box)
     except (ValueError, KeyError, TypeError, AttributeError, AfspmError):
-        return None  # it is only drawn: the scheduler, which enforces it, has read it by itself
+        return None  # only for the map: the scheduler reads and enforces the limits itself
 
 
 def adjustable_parameters(folder: Path) -> tuple[str, ...]:
-    """Return what [control] adjustable of the expanded experiment file offers; the scheduler decides about it."""
+    """Return [control] adjustable of the expanded experiment file; the scheduler decides about its use."""
     offered = _section(folder, "control").get("adjustable", ())
     return tuple(map(str, offered)) if isinstance(offered, list) else ()
 
@@ -118,6 +118,6 @@ def _find(folder: Path, time_ns: int, channel: str) -> ChannelFrame | None:
 
 
 def _frame(scan: Scan, time_ns: int) -> ChannelFrame:
-    """Return a frame with a number below all of what comes now, and the same for the same scan."""
+    # negative, unlike the numbers of live frames, and always the same for the same scan
     number = -1 - (hash((time_ns, scan.channel)) & (2**52 - 1))
     return ChannelFrame(number, scan.channel, scan.unit, scan.region, scan.values, time_ns, None, scan.shape[0])

@@ -1,4 +1,4 @@
-"""The interface between server and application, and the check of where a request comes from."""
+"""The interface between server and application, and the check of a request's origin."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ AsgiApp = Callable[[Message, Receive, Send], Awaitable[None]]
 def wrong_origin(
     headers: Mapping[str, str], *, only_here: bool, what: str = "dashboard", allowed: Collection[str] = ()
 ) -> str | None:
-    """Return why a request is not answered, by its Host and Origin; None: it may be.
+    """Return the reason for refusing a request, from its Host and Origin; None if it is allowed.
 
-    A page of somebody else that is open in the same browser must not be able to steer a microscope, nor one that gave
-    its own name our address.
+    Another site's page open in the same browser must not steer a microscope, nor a page whose name resolves to this
+    server's address (DNS rebinding).
 
     Args:
         only_here: the server listens on loopback only.
-        what: is asked, for the reason.
-        allowed: origins of other pages that may ask.
+        what: the name of the server, for the reason.
+        allowed: origins of other pages that may send requests.
     """
     host, origin = headers.get("host", ""), headers.get("origin")
     asked = _parts(f"//{host}")

@@ -1,9 +1,9 @@
-"""`afspm dashboard`: the page of an experiment that runs already, here or on another computer; and of `afspm run`."""
+"""`afspm dashboard`: the page of a running experiment, here or on another computer; and the page of `afspm run`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,9 +13,13 @@ from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.cli.arguments import MEANWHILE, RUNS, Where, opt
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from afspm.experiment import Experiment
+    from afspm.plugins.web.dashboard import Dashboard
     from afspm.plugins.web.dashboard.recorded import RecordedSettings
     from afspm.supervisor.resume import ResumableRun
+    from afspm.transport.port import Port
 
 NAME_OF_CLASS = "Dashboard"
 
@@ -38,12 +42,12 @@ def dashboard(
         bool, typer.Option("--make-password", help="Ask for a name and a password, print their line, and end.")
     ] = False,
 ) -> None:
-    """Show an experiment in the browser: steer one that runs, look through one that has ended.
+    """Show an experiment in the browser: steer a running one, or look through one that has ended.
 
-    It joins the run as a notebook would: the experiment does not notice when it comes and goes. When it ends, the page
-    stays, with a slider through the night, until Ctrl-C; so it is shown for a run that has ended. With an experiment
-    file of which nothing was started here it connects to where the file says that the scheduler is. A password for
-    those who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
+    The page joins a running experiment as a notebook would; the experiment does not depend on it. When the experiment
+    ends, the page stays until Ctrl-C, with a slider through the night; a run that has ended is shown in the same way.
+    If the experiment runs on another computer, name its experiment file: the page connects to the scheduler's address
+    in it. A password for viewers who only look may be in the environment: AFSPM_DASHBOARD_PASSWORD.
     """
     from afspm.record.run_lock import goes_on
 
@@ -57,7 +61,7 @@ def dashboard(
     folder = _run_here(where)
     if folder is None:
         raise typer.Exit(_start_part(where))
-    typer.echo(f"opening the page of {folder.name} …")  # before what takes seconds to load
+    typer.echo(f"opening the page of {folder.name} …")  # loading the page takes seconds
     if goes_on(folder):
         raise typer.Exit(_join(folder, settings))
     _serve_recorded(folder, settings)
@@ -67,13 +71,14 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
     """Show a run that has ended until Ctrl-C.
 
     Args:
-        name: of the dashboard that it had, with its settings.
+        name: of its dashboard, with these settings.
     """
     import subprocess
     import sys
 
     line = f"{_recorded(folder, name, settings).to_json()}\n"
     command = [sys.executable, "-P", "-m", "afspm.plugins.web.dashboard.recorded"]
+    # a process of its own: the page of a running experiment may already have used this process's NiceGUI
     with subprocess.Popen(command, stdin=subprocess.PIPE, text=True, encoding="utf-8") as process:
         assert process.stdin is not None
         process.stdin.write(line)
@@ -84,7 +89,7 @@ def stay(folder: Path, name: str, settings: PlainMapping) -> None:
 
 
 def page_of(experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
-    """Return name and settings of a dashboard among the processes that were started here; None: there is none."""
+    """Return name and settings of a dashboard among the processes started here; None: there is none."""
     for process in experiment.resolved.processes.values():
         if process.class_path.rpartition(".")[2] == NAME_OF_CLASS and process.name in started:
             return process.name, process.settings
@@ -100,7 +105,7 @@ def with_page(files: list[Path]) -> Experiment:
 
 
 def resumed_with_page(found: ResumableRun) -> ResumableRun:
-    """Return the run that is to go on, with a dashboard if it has none."""
+    """Return the run to resume, with a dashboard if it has none."""
     return found if _has_dashboard(found.experiment) else found.with_overlay(_overlay())
 
 
@@ -111,7 +116,6 @@ def _has_dashboard(experiment: Experiment) -> bool:
 
 
 def _overlay() -> Path:
-    """Return the file that is laid over an experiment to give it a dashboard."""
     from afspm.plugins.web import dashboard
 
     return Path(dashboard.__file__).with_name("assets") / "dashboard.toml"
@@ -126,7 +130,7 @@ def _print_password() -> None:
 
 
 def _people_in(file: Path) -> dict[str, str]:
-    """Return the names and hashes in a file of `--people`, with or without a leading `people.`."""
+    # keys may begin with `people.`, as `--make-password` prints them
     import tomllib
 
     from afspm.basics.errors import ConfigError
@@ -144,7 +148,7 @@ def _people_in(file: Path) -> dict[str, str]:
 
 
 def _run_here(where: Path) -> Path | None:
-    """Return the folder of the run that is meant; None: the file is of one that was started elsewhere."""
+    # None: an experiment file without a run here; its run was started on another computer
     from afspm.basics.errors import FileError
     from afspm.client.connect import find_run
 
@@ -165,21 +169,81 @@ def _join(folder: Path, settings: Plain) -> int:
     from afspm.cli.joining import looking
     from afspm.experiment.process_starts import DASHBOARD
     from afspm.plugins.web.dashboard import Dashboard
-    from afspm.plugins.web.dashboard.joining import join, url_in
     from afspm.record.run_json import read_run_json
 
-    url = url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
+    url = _url_in(read_run_json(folder).get("processes"), folder, DASHBOARD)
     if url is not None:
         typer.echo(f"this run has a dashboard already: {url}")
         return 0
     require(Dashboard)
     with looking(folder):
-        pass  # somebody is there
+        pass  # raises if the scheduler does not answer
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-    code = join(folder, Dashboard(**settings), DASHBOARD)
+    code = _run_as_guest(folder, Dashboard(**settings), DASHBOARD)
     if code == ExitCode.ENDED:
         stay(folder, DASHBOARD, settings)
     return 0 if code in (ExitCode.ENDED, ExitCode.DONE, ExitCode.ORPHAN) else 1
+
+
+def _url_in(processes: object, folder: Path, name: str) -> str | None:
+    from afspm.basics.errors import FileError
+    from afspm.record.run_json import STATE_DIR
+    from afspm.storage.memory import Memory
+
+    if not isinstance(processes, dict) or name not in processes:
+        return None
+    try:
+        url = Memory(folder / STATE_DIR / f"{name}.json").get("url")
+    except FileError:
+        return None
+    return url if isinstance(url, str) else None
+
+
+def _run_as_guest(folder: Path, dashboard: Dashboard, name: str) -> int:
+    # returns a component's exit code; the name needs the role `operate` to command the microscope in MANUAL
+    import dataclasses
+    import logging
+
+    from afspm.basics.clock import ExperimentClock
+    from afspm.client.connect import guest_of
+    from afspm.record.run_json import STATE_DIR
+    from afspm.transport.process.context import ProcessActivity, ProcessContext, new_session
+    from afspm.transport.zmq_port import open_port
+    from afspm.wire.message_types import register_all
+
+    launch = guest_of(folder, name)
+    register_all(launch.messages)
+    launch = dataclasses.replace(launch, run_dir=str(folder), state_dir=str(folder / STATE_DIR))
+    clock = ExperimentClock.from_dict(launch.clock)
+    port = open_port(launch, clock)
+    context = ProcessContext(
+        launch,
+        clock,
+        open_port=lambda: port,
+        log=logging.getLogger(f"afspm.{name}"),
+        activity=ProcessActivity(clock),
+        session=new_session(launch.run),
+    )
+    with _ended_by_ctrl_c(port):
+        return dashboard.run_process(context)
+
+
+@contextmanager
+def _ended_by_ctrl_c(port: Port) -> Iterator[None]:
+    # a dashboard that joins has no parent process: a signal stands for the parent's end
+    import signal
+
+    from afspm.transport.port import ParentGone
+
+    def end(_number: int, _frame: FrameType | None) -> None:
+        port.wake_up(ParentGone())
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _serve_recorded(folder: Path, settings: Plain) -> None:
@@ -200,7 +264,7 @@ def _recorded(folder: Path, name: str, settings: PlainMapping) -> RecordedSettin
 
 
 def _start_part(file: Path) -> int:
-    """Run the dashboard of an experiment whose scheduler runs elsewhere, as `afspm run --only` would start it."""
+    # the scheduler runs elsewhere, so the dashboard is started as `afspm run --only` would start it
     import sys
 
     from afspm.basics.errors import ConfigError

@@ -21,16 +21,16 @@ if TYPE_CHECKING:
 
 
 class WebComponent(Component):
-    """Keeps what was published, and serves it. It asks for nothing by itself: all others have the processor first.
+    """Keeps published messages and serves them. Other processes have the processor first.
 
     Attributes:
-        served: the name of what is served, in log lines and errors.
+        served: name of the server, in log lines and errors.
         usual_port: if none is given.
         stalled_s: as of `WebServer`.
 
     Args:
         host: the address to listen at.
-        port: 0 for any that is free; None: the usual one, or any if that is taken. A restart takes the same one.
+        port: 0 for any free port; None: the usual one, or any if that is taken. A restart takes the same one.
         certificate, certificate_key: PEM files, for https.
 
     Raises:
@@ -42,7 +42,7 @@ class WebComponent(Component):
     has_people = True
     listens = ("",)
     stalled_s: ClassVar[float] = STALLED_S
-    longest_step_s = 60.0  # the first import of everything, on a busy computer
+    longest_step_s = 60.0  # on a busy computer the first import takes long
 
     def __init__(self, host: str, port: int | None, certificate: Path | None, certificate_key: Path | None) -> None:
         if (certificate is None) != (certificate_key is None):
@@ -67,21 +67,21 @@ class WebComponent(Component):
         return Path(folder) / f"{self.name}.{ending}" if folder else None
 
     def open_port(self) -> socket.socket:
-        """Return the socket to serve at: the port of the last start, where a client looks for us, before any other."""
+        """Return the listening socket: at the port of the last start, which clients know, if that is free."""
         before = self.memory.get("port")
         earlier = (before,) if isinstance(before, int) else ()
         usual = earlier if self._port == 0 else (*earlier, self.usual_port)
         return listening(self._host, self._port or None, usual, what=self.served)
 
     def watch_run(self) -> tuple[Archive, Watch]:
-        """Return the record of the run so far, and what is published from now on."""
+        """Return the record of the run so far, and the watch that receives later messages."""
         archive = Archive(self.run_dir if self._context.launch.run_dir else None)
         problems = self._context.problems
         watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
         return archive, watch
 
     def serve(self, app: AsgiApp, bound: socket.socket, *, most_requests: int | None = None) -> None:
-        """Start to serve, and note where."""
+        """Start to serve, and note the URL."""
         self._server = WebServer(
             app, bound, self._certificate, self._certificate_key,
             most_requests=most_requests, stalled_s=self.stalled_s,
@@ -94,5 +94,5 @@ class WebComponent(Component):
         self.log.info("the %s is at %s", self.served, url)
 
     def packet_time_ns(self) -> int:
-        """Return when the message in hand was published."""
+        """Return the publication time of the current message."""
         return self.packet.time_ns if self.packet and self.packet.time_ns is not None else self.clock.now_ns()

@@ -1,4 +1,4 @@
-"""The newest picture of each channel, growing or finished, and as many before as a bounded memory takes."""
+"""The newest picture of each channel, growing or finished, and earlier ones within a memory bound."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ FrameKey = tuple[int, str]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class ChannelFrame:
-    """One channel of a scan, as far as it has come.
+    """One channel of a scan, with the rows measured so far.
 
     Attributes:
-        number: higher than that of every frame of any channel before.
-        values: [y, x], y ascending, as published; NaN in rows that have not come yet.
-        time_ns: when it was finished; None while it grows.
-        began_ns: the time that its lines carry; None if it came in one piece.
-        rows: how many have come.
-        newest_row: index of the one that came last; None where it is finished.
+        number: higher than the number of every earlier frame of any channel.
+        values: [y, x], y ascending, as published; NaN in rows that have not arrived yet.
+        time_ns: the end; None while it grows.
+        began_ns: the time that its lines carry; None if it arrived in one piece.
+        rows: number of rows that have arrived.
+        newest_row: index of the last of them; None for a finished frame.
     """
 
     number: int
@@ -44,6 +44,7 @@ class ChannelFrame:
     def complete(self) -> bool:
         return self.time_ns is not None
 
+    # by number, for the cache of pictures: arrays have no truth value
     def __eq__(self, other: object) -> bool:
         return isinstance(other, ChannelFrame) and self.number == other.number
 
@@ -52,10 +53,10 @@ class ChannelFrame:
 
 
 class FrameStore:
-    """Keeps frames, of which pictures are made. Not for several threads at once.
+    """Keeps frames for pictures. Not for several threads at once.
 
     Args:
-        memory_bytes: of finished frames that are kept, beside the newest of each channel; of growing ones, too.
+        memory_bytes: bound for finished frames besides the newest of each channel, and for growing ones.
     """
 
     def __init__(self, memory_bytes: int = MEMORY_BYTES) -> None:
@@ -72,13 +73,17 @@ class FrameStore:
         return tuple(self._newest)
 
     def take_scan(self, scan: Scan, time_ns: int) -> None:
-        """Add a finished channel; `time_ns` is the packet's, for scans that say none. Without values it is none."""
+        """Add a finished channel. A scan without values is ignored.
+
+        Args:
+            time_ns: the packet's time, for scans without a time of their own.
+        """
         if not scan.values.size:
             return
         before = self._newest.get(scan.channel)
         time_ns = scan.time_ns or time_ns
         if before is not None and before.time_ns is not None and time_ns <= before.time_ns:
-            return  # a replay: what is there is newer
+            return  # a replay of an older scan
         self._came.pop(scan.channel, None)
         began_ns = before.began_ns if before is not None and not before.complete else None
         frame = ChannelFrame(
@@ -91,7 +96,7 @@ class FrameStore:
             self.kept_bytes -= self._kept.popitem(last=False)[1].values.nbytes
 
     def take_lines(self, lines: ScanLines) -> None:
-        """Add lines of a running scan; those of one that is finished already are passed over."""
+        """Add lines of a running scan; lines of a finished scan are ignored."""
         before = self._newest.get(lines.channel)
         if before is not None and before.complete and self._is_over(before, lines):
             return
@@ -101,11 +106,13 @@ class FrameStore:
             and before.began_ns == lines.began_ns
             and before.values.shape == lines.shape
         )
+        # a growing frame already has its memory
         if not grows and not self._has_room(lines):
             return
         picture = lines.into(before.values if grows and before is not None else None)
         came = self._came[lines.channel] if grows else np.zeros(lines.shape[0], np.bool_)
         last = lines.first_row + len(lines.values)
+        # a row above is already there: the scan runs downwards
         downwards = last < len(came) and bool(came[last])
         came[lines.first_row : last] = True
         self._came[lines.channel] = came
@@ -115,7 +122,7 @@ class FrameStore:
         ))  # fmt: skip
 
     def newest(self, channel: str | None = None) -> ChannelFrame | None:
-        """Return the newest frame of a channel (None: of the one seen first); a growing one is a copy as it is now."""
+        """Return the newest frame of a channel (None: the channel seen first); a growing one is copied."""
         frame = self._of(channel)
         return frame if frame is None or frame.complete else replace(frame, values=frame.values.copy())
 
@@ -125,14 +132,14 @@ class FrameStore:
         return (0, False) if frame is None else (frame.number, frame.complete)
 
     def kept(self, time_ns: int, channel: str) -> ChannelFrame | None:
-        """Return a finished frame from before; None if it is not kept here any more."""
+        """Return an earlier finished frame; None if it is no longer kept here."""
         return self._kept.get((time_ns, channel))
 
     def _of(self, channel: str | None) -> ChannelFrame | None:
         return next(iter(self._newest.values()), None) if channel is None else self._newest.get(channel)
 
     def _has_room(self, lines: ScanLines) -> bool:
-        """Return whether the scan that these lines announce fits: a few lines may be said to be of millions."""
+        # a few lines may announce a scan of millions of lines
         rows, columns = lines.shape
         others = (one for one in self._newest.values() if not one.complete and one.channel != lines.channel)
         return 8 * rows * columns + sum(one.values.nbytes for one in others) <= self._memory_bytes
@@ -157,5 +164,5 @@ class FrameStore:
 
 
 def number_or_none(value: float) -> float | None:
-    """Return a number as JSON has it, which knows no NaN."""
+    """Return a number for JSON, which has no NaN."""
     return value if math.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""Names and passwords of those who may look at an experiment, or steer it, over HTTP."""
+"""Names and passwords of persons who may look at an experiment, or steer it, over HTTP."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ from collections.abc import Callable, Mapping
 from afspm.basics.errors import ConfigError
 
 LONGEST_NAME = 40
+# some hundredths of a second per password: slow for guessing, quick enough for a request
 _COST = {"n": 2**14, "r": 8, "p": 1}
 _NAME = re.compile(r"[\w][\w .'-]*", re.UNICODE)
 _TRIES, _TRIES_WITHIN_S = 5, 60.0
 AGAIN_S = 3.0
-"""Real time between two tries that are looked at, after too many wrong ones. To refuse all would lock out the owner of
-the right password: anyone on the same computer could be wrong five times a minute in the same name."""
+"""Real time between two checked tries, after too many wrong ones. To refuse all would lock out the owner of the right
+password: any program on the same computer could try five wrong ones a minute under the same name."""
+# bounded: addresses and wrong names are chosen by clients
 _MOST_REMEMBERED = 1000
 
 
 def hashed(password: str) -> str:
-    """Return a password as it may be written down: "scrypt:<salt>:<hash>"."""
+    """Return a password's salted hash for a file: "scrypt:<salt>:<hash>"."""
     salt = os.urandom(16)
     return f"scrypt:{_text(salt)}:{_text(_scrypt(password, salt))}"
 
 
 def matches(password: str, kept: str) -> bool:
-    """Return whether a password is the one of `kept`, a result of `hashed`."""
+    """Return whether a password belongs to `kept`, a result of `hashed`."""
     _, salt, digest = kept.split(":")
     return hmac.compare_digest(_scrypt(password, base64.b64decode(salt)), base64.b64decode(digest))
 
 
 def is_hash(text: str) -> bool:
-    """Return whether a text is what `hashed` makes."""
+    """Return whether a text has the form of `hashed`."""
     return re.fullmatch(r"scrypt:[A-Za-z0-9+/=]{24}:[A-Za-z0-9+/=]{44,88}", text) is not None
 
 
@@ -52,31 +54,31 @@ def is_loopback(host: str) -> bool:
 
 
 def check_name(name: str) -> str:
-    """Return the name of a person as it may stand in the record; empty if it may not."""
+    """Return a person's name in the form for the record; empty if it is not allowed."""
     name = " ".join(name.split())
     return name if len(name) <= LONGEST_NAME and _NAME.fullmatch(name) else ""
 
 
 class Passwords:
-    """Decides whom a server lets look, and whom it believes a name.
+    """Decides whether a viewer may look, and whether a name is believed.
 
-    On loopback without passwords everybody may look, and any name is believed. Where there is a common password, only
-    those who know it may look. Where there are persons, only they have names, each with a password of the own.
+    On loopback without passwords every viewer may look, and any name is believed. With a common password, a viewer
+    needs it to look. With persons, only they have names, each with a password.
 
     Args:
-        host: the address that is listened at.
+        host: the address to listen at.
         password_hash: of the common password, see `hashed`.
         people: the hash of each person's password.
-        now_s: the time in real seconds, for how often an address may try.
+        now_s: the time in real seconds, for the rate of tries.
 
     Raises:
-        ConfigError: a hash or a name is none.
+        ConfigError: a malformed hash or name.
     """
 
     def __init__(self, host: str, password_hash: str, people: Mapping[str, str], now_s: Callable[[], float]) -> None:
         for person, kept in {"": password_hash, **people}.items():
             _require_hash(person, kept)
-        # "" is the name of those who only look
+        # "" is the name for the common password
         self._hashes = {**people, "": password_hash}
         self._local = is_loopback(host)
         self._now_s = now_s
@@ -96,23 +98,24 @@ class Passwords:
 
     @property
     def lets_look(self) -> bool:
-        """True if everybody may look."""
+        """True if every viewer may look."""
         return self._local and not self._hashes[""]
 
     def wait_s(self, person: str, address: str) -> float:
-        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        """Return the real seconds until another password of this person is checked from this address; 0: now."""
         with self._lock:
             tries = self._tries.get(self._prover(person, address))
             return 0.0 if tries is None else tries.wait_s(self._now_s())
 
     def proves(self, person: str, password: str, address: str) -> bool:
-        """Return whether a password is that of a person; False also if it is not looked at yet (see `wait_s`).
+        """Return whether a password is right; False also if it is not checked yet (see `wait_s`).
 
-        It takes some hundredths of a second. A password that was right before, from the same address, is right at
-        once, however often others were wrong there.
+        It takes some hundredths of a second. A password that was right before, from the same address, is accepted at
+        once, after any number of wrong tries there.
         """
         if self.is_open or (not person and self.lets_look):
             return True
+        # a fast hash, only in memory: it recognises a password that scrypt has accepted before
         shown = hashlib.sha256(f"{address}\0{person}\0{password}".encode()).digest()
         prover = self._prover(person, address)
         with self._lock:
@@ -121,9 +124,9 @@ class Passwords:
                 return True
             if not self._may_try(prover):
                 return False
-        # for a name that nobody has it takes as long as for the others
-        kept = self._hashes.get(person) or _NOBODYS
-        if not matches(password, kept) or kept is _NOBODYS:
+        # an unknown name takes as long as a known one
+        kept = self._hashes.get(person) or _UNKNOWN
+        if not matches(password, kept) or kept is _UNKNOWN:
             return False
         with self._lock:
             self._tries.pop(prover, None)
@@ -133,17 +136,17 @@ class Passwords:
         return True
 
     def proof_of(self, person: str) -> str:
-        """Return what stands for a person's password: with another one it is another."""
+        """Return a text derived from a person's password, which changes with it."""
         if self.is_open:
             return ""
         return hashlib.sha256(self._hashes.get(person, "nobody").encode()).hexdigest()
 
     def _prover(self, person: str, address: str) -> _Prover:
-        # wrong passwords slow down neither other persons at the same address, nor the same person elsewhere
+        # wrong passwords slow down neither other persons at this address, nor this person elsewhere
         return address, person if person in self._hashes else None
 
     def _may_try(self, prover: _Prover) -> bool:
-        # a try counts as wrong until its password is found to be right: many may come at once
+        # a try counts as wrong until it is checked: many may arrive at once
         tries = self._tries.setdefault(prover, _Tries())
         self._tries.move_to_end(prover)
         if len(self._tries) > _MOST_REMEMBERED:
@@ -156,7 +159,7 @@ class Passwords:
 
 
 _Prover = tuple[str, str | None]
-"""An address, and the person whose password is shown there; None: a name that nobody has."""
+"""An address, and the person whose password is tried there; None: an unknown name."""
 
 
 class _Tries:
@@ -196,4 +199,5 @@ def _text(data: bytes) -> str:
     return base64.b64encode(data).decode()
 
 
-_NOBODYS = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"
+# no password has this hash; checking against it takes the same time as for a known name
+_UNKNOWN = f"scrypt:{_text(bytes(16))}:{_text(bytes(32))}"

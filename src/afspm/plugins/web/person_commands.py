@@ -1,4 +1,4 @@
-"""Requests of one person to the scheduler, which may refuse them. Dashboard and gateway ask by these."""
+"""Requests of one person to the scheduler, which may refuse them; used by dashboard and gateway."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from afspm.model.geometry import XY
 from afspm.plugins.web.watch import Watch
 from afspm.record.overview import Overview
 
-ANSWER_S = 20.0  # real time that an answer may take
-FREE_S = 60.0  # that the microscope may take to get to a place
-SETTLED_S = 2.0  # what was set is published by then, if it changed anything
+ANSWER_S = 20.0  # real time for an answer
+FREE_S = 60.0  # real time for the microscope to reach a place
+SETTLED_S = 2.0  # a changed setting is published within this time
 
 
 class PersonCommands:
-    """The requests of one person, for one thread. Each returns the response, also where that is a refusal."""
+    """The requests of one person, for one thread. Each returns the response, also a refusal."""
 
     def __init__(self, link: ExperimentLink, watch: Watch) -> None:
         self._link = link
@@ -48,31 +48,26 @@ class PersonCommands:
         return self._ask(ControlRequest.REQUEST_CTRL, problem)
 
     def renew(self, lease_s: float) -> Response:
-        """Keep control for so long (real) without another command or renewal."""
+        """Keep control for this time (real) without another command or renewal."""
         return self._ask(LEASE_REQUEST, lease_s)
 
     def release_control(self) -> Response:
-        """Give control back."""
         return self._ask(ControlRequest.RELEASE_CTRL)
 
     def set_mode(self, mode: ControlMode) -> Response:
-        """Set MANUAL or AUTOMATED."""
         return self._ask(ControlRequest.SET_CONTROL_MODE, int(mode))
 
     def end(self) -> Response:
-        """End the experiment for everybody."""
+        """End the experiment for everyone."""
         return self._ask(ControlRequest.END_EXPERIMENT)
 
     def flag(self, problem: int) -> Response:
-        """Raise a problem."""
         return self._ask(ControlRequest.ADD_EXP_PRBLM, problem)
 
     def clear(self, problem: int) -> Response:
-        """Remove the flag of a problem."""
         return self._ask(ControlRequest.RMV_EXP_PRBLM, problem)
 
     def restart(self, process: str) -> Response:
-        """Have a process ended and started anew."""
         return self._ask(RESTART_REQUEST, process)
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> Response:
@@ -85,7 +80,6 @@ class PersonCommands:
     # --- the microscope ---
 
     def get(self, parameter: str) -> Response:
-        """Ask for the value of a parameter."""
         return self._ask(ControlRequest.PARAM, Parameter(parameter))
 
     def set(self, parameter: str, value: Value, unit: str | None = None) -> Response:
@@ -93,15 +87,14 @@ class PersonCommands:
         return self._ask(ControlRequest.PARAM, to_parameter(parameter, value, unit))
 
     def supports(self, action: str) -> Response:
-        """Ask whether the microscope has an action."""
         return self._ask(ControlRequest.ACTION_SUPPORT, action)
 
     def act(self, action: str) -> Response:
-        """Have the microscope do something by its name."""
+        """Start an action of the microscope by its name."""
         return self._ask(ControlRequest.ACTION, action)
 
     def prepare_scan(self, region: Region | None, shape: tuple[int, int] | None) -> Response | None:
-        """Set where the next scan is taken, and wait until that is published. Returns a refusal; None: it is set."""
+        """Set the place of the next scan, and wait for its publication. Returns a refusal; None: it is set."""
         if region is None and shape is None:
             return None
         wanted = ScanParameters(region, shape)
@@ -112,7 +105,7 @@ class PersonCommands:
         return None
 
     def prepare_spectrum(self, at_m: XY | None) -> Response | None:
-        """Move the probe to (x, y), and wait until that is published. Returns a refusal; None: it stands there."""
+        """Move the probe to (x, y), and wait for its publication. Returns a refusal; None: it is there."""
         if at_m is None:
             return None
         response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
@@ -125,7 +118,7 @@ class PersonCommands:
         """Ask for an action, again and again while the microscope is not free.
 
         Args:
-            next_id: returns the id of the next attempt, under which it is done once, however often it is asked for.
+            next_id: returns the id of the next attempt, under which it is executed once even if it is repeated.
         """
         until_s = self._link.clock.monotonic_s() + FREE_S
         while True:
@@ -138,23 +131,22 @@ class PersonCommands:
             self._watch.wait_for(lambda _, n=seen: self._watch.changes != n, 1.0)  # type: ignore[misc]
 
     def stop(self) -> Response:
-        """Stop the scan or spectrum that runs."""
+        """Stop the running scan or spectrum."""
         return self.act(names.STOP_SPEC if self.measures_spectrum else names.STOP_SCAN)
 
     @property
     def measures_spectrum(self) -> bool:
-        """True while the microscope measures a spectrum."""
         with self._watch.reading() as overview:
             return overview.status is not None and overview.status.state is ScopeState.SPEC
 
     # --- within ---
 
     def _ask(self, kind: int, subject: object = None, request_id: str = "") -> Response:
-        self._link.pump(0.0)  # what has come of the connection since we asked last
+        self._link.pump(0.0)  # processes changes of the connection since the last request
         return self._link.request(kind, subject, request_id=request_id, until_s=self._link.until(ANSWER_S))
 
     def _settle(self, done: Callable[[Overview], bool]) -> None:
-        """Wait until what was set is published; it is not where nothing changed."""
+        # an unchanged value is not published, so the wait is bounded
         self._watch.wait_for(done, SETTLED_S)
 
 

@@ -20,7 +20,7 @@ from afspm.transport.port import ParentGone
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import ZmqPort
 
-MOST_PERSONS = 32
+MOST_PERSONS = 32  # each takes a thread and a connection
 T = TypeVar("T")
 
 
@@ -35,15 +35,16 @@ class _Person:
     def close(self) -> None:
         if self.port is not None:
             self.port.wake_up(ParentGone())
+            # in its own thread: a ZeroMQ socket may be used by one thread only
             self.thread.submit(self.port.close)
         self.thread.shutdown(wait=False)
 
 
 class Persons:
-    """Asks the scheduler for persons, each in the own name, one thing after the other for each. From any thread.
+    """Sends requests of persons to the scheduler, each under the person's name and in order. From any thread.
 
     Args:
-        launch: the line that the component was started with; persons reach the scheduler as it does, with its keys.
+        launch: of the component; persons reach the scheduler by its addresses, with its keys.
     """
 
     def __init__(self, launch: Launch, clock: Clock, watch: Watch) -> None:
@@ -54,10 +55,11 @@ class Persons:
         self._persons: OrderedDict[str, _Person] = OrderedDict()
 
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
-        """Have an action carried out in the name of a person."""
+        """Carry out an action in the name of a person, in the person's thread."""
         with self._lock:
             one = self._persons.get(person)
             if one is None:
+                # the longest idle one goes; its next request connects again
                 while len(self._persons) >= MOST_PERSONS:
                     self._persons.popitem(last=False)[1].close()
                 one = self._persons[person] = _Person(ThreadPoolExecutor(1, thread_name_prefix="person"))
@@ -65,11 +67,11 @@ class Persons:
             return one.thread.submit(self._carry_out, person, one, action)
 
     def name_of(self, person: str) -> str:
-        """Return whom the scheduler knows a person as."""
+        """Return the scheduler's name for a person."""
         return f"{self._launch.name}{PERSON}{person}"
 
     def close(self) -> None:
-        """End all connections; what is under way ends without an answer."""
+        """End all connections; pending actions end without an answer."""
         with self._lock:
             persons, self._persons = list(self._persons.values()), OrderedDict()
         for one in persons:

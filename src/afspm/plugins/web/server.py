@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 USUAL_PORT = 8080
 _STOPPED_S = 3.0
 STALLED_S = 60.0
-"""Real time after which a client is disconnected that takes nothing of an answer, or sends no more of a body."""
+"""Real time after which a client is disconnected that reads nothing of an answer, or sends nothing of a body."""
 HEAD_S = 10.0
-"""Real time that a client has for the head of a request: before that is there, no password can be asked for."""
+"""Real time for the head of a request: without it no password can be checked."""
 MOST_HEAD_BYTES = 64 << 10
 MOST_UNFINISHED = 200
 """Connections without a finished TLS handshake, or without a request; with one more, the oldest is closed."""
@@ -34,8 +34,8 @@ def listening(
     """Return a socket that listens at `host`.
 
     Args:
-        port: None: the first of `wanted` that is free, or any.
-        what: listens, for the error.
+        port: None: the first free one of `wanted`, or any.
+        what: name of the server, for the error.
 
     Raises:
         ConfigError: no such address, or the port is taken.
@@ -56,7 +56,7 @@ def _bound(host: str, port: int) -> socket.socket:
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     bound = socket.socket(family, kind, protocol)
     try:
-        if hasattr(socket, "SO_EXCLUSIVEADDRUSE"):  # Windows, where the other option would let two have it
+        if hasattr(socket, "SO_EXCLUSIVEADDRUSE"):  # Windows, where SO_REUSEADDR would let two processes share the port
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
         else:
             bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -69,7 +69,7 @@ def _bound(host: str, port: int) -> socket.socket:
 
 
 def url_of(host: str, port: int, *, encrypted: bool) -> str:
-    """Return where the page is found, from other computers too if it listens at all addresses of this one."""
+    """Return the page's URL, valid on other computers, too, if the server listens at all addresses."""
     with contextlib.suppress(ValueError):  # a name
         if ipaddress.ip_address(host).is_unspecified:
             host = socket.gethostname()
@@ -79,9 +79,9 @@ def url_of(host: str, port: int, *, encrypted: bool) -> str:
 class _TlsListener(socket.socket):
     """A listening socket that ends connections whose TLS handshake takes too long, or is the oldest of too many.
 
-    The server learns of a connection only when its handshake is done, and asyncio waits a minute for that: a client
-    that never begins would use up the files that the process may open. (On Windows, whose event loop accepts
-    connections by itself, asyncio's minute remains.)
+    The server learns of a connection only after its handshake, and asyncio waits a minute for that: a client that never
+    begins would use up the process's file descriptors. (On Windows, whose event loop accepts connections by itself,
+    asyncio's minute remains.)
     """
 
     def __init__(self, bound: socket.socket, within_s: float) -> None:
@@ -97,7 +97,7 @@ class _TlsListener(socket.socket):
         self._unfinished[descriptor] = connection
         asyncio.get_running_loop().call_later(self._within_s, self._end, descriptor, connection)
         if len(self._unfinished) > MOST_UNFINISHED:
-            self._end(*next(iter(self._unfinished.items())))  # handshakes of honest clients last for milliseconds
+            self._end(*next(iter(self._unfinished.items())))  # a handshake usually takes milliseconds
         return connection, address
 
     def finished(self, descriptor: int) -> None:
@@ -112,10 +112,10 @@ class _TlsListener(socket.socket):
 
 
 def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -> type[asyncio.Protocol]:
-    """Return uvicorn's protocol, which disconnects clients that stall: they would keep their connections for ever."""
+    # uvicorn keeps a stalled client's connection for ever; this protocol disconnects it
     import h11
 
-    # the one that is written in Python: it bounds the head of a request, which its C sibling takes in without end
+    # h11, not httptools: only h11 bounds the head of a request
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     waiting: dict[ImpatientProtocol, None] = {}
@@ -154,7 +154,7 @@ def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -
             super().resume_writing()
 
         def _await(self, state: object) -> None:
-            # IDLE: the rest of a head; SEND_BODY: that of a body; None: nothing
+            # waits for: IDLE, the rest of a head; SEND_BODY, the rest of a body; None, nothing
             self._awaited = state
             if self._unfinished is not None:
                 self._unfinished.cancel()
@@ -165,7 +165,7 @@ def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -
                 self._unfinished = asyncio.get_running_loop().call_later(within_s, self.transport.abort)
                 waiting[self] = None
             if len(waiting) > MOST_UNFINISHED:
-                oldest = next(iter(waiting))  # those of honest clients last for milliseconds
+                oldest = next(iter(waiting))  # an honest client's request takes milliseconds
                 oldest._await(None)
                 oldest.transport.abort()
 
@@ -173,7 +173,7 @@ def _impatient(stalled_s: float, head_s: float, listener: _TlsListener | None) -
 
 
 def _limited(app: AsgiApp, most: int) -> AsgiApp:
-    # connections that have asked for nothing yet do not count: anybody could open them, and keep all others out
+    # connections without a request do not count: a client could open many of them and block all others
     running = 0
 
     async def limited(scope: Message, receive: Receive, send: Send) -> None:
@@ -200,11 +200,11 @@ class WebServer:
 
     Args:
         certificate, key: PEM files, for https; None: http.
-        most_requests: at a time; those beyond are answered 503. None: any number.
+        most_requests: at a time; further ones are answered by 503. None: any number.
         stalled_s, head_s: real; see `STALLED_S` and `HEAD_S`.
 
     Raises:
-        ConfigError: the files are no certificate and its key.
+        ConfigError: the files are no certificate with its key.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class WebServer:
     ) -> None:
         import uvicorn
 
-        logging.getLogger("uvicorn").setLevel(logging.ERROR)  # what clients do wrong is theirs
+        logging.getLogger("uvicorn").setLevel(logging.ERROR)  # clients' errors are not this process's
         self._bound = bound
         listener = None if certificate is None else _TlsListener(bound, head_s)
         self._listener = listener or bound
@@ -230,7 +230,7 @@ class WebServer:
             log_config=None,
             access_log=False,
             lifespan="on",
-            proxy_headers=False,  # what a request says of its origin is anybody's word, and passwords are tried by it
+            proxy_headers=False,  # forwarding headers can be forged, and wrong passwords are counted by address
             timeout_graceful_shutdown=1,
             http=_impatient(stalled_s, head_s, listener),
             h11_max_incomplete_event_size=MOST_HEAD_BYTES,
@@ -248,11 +248,11 @@ class WebServer:
         self._thread = threading.Thread(target=self._run, name="web", daemon=True)
 
     def start(self) -> None:
-        """Begin to serve; requests that came before are answered then."""
+        """Begin to serve; earlier requests are then answered, too."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop, within seconds; whoever is connected is cut off."""
+        """Stop, within seconds; open connections are cut off."""
         self._server.should_exit = True
         self._thread.join(_STOPPED_S)
         for one in (self._listener, self._bound):
@@ -262,5 +262,5 @@ class WebServer:
     def _run(self) -> None:
         try:
             self._server.run(sockets=[self._listener])
-        except SystemExit:  # that is how it tells that it couldn't start
+        except SystemExit:  # uvicorn exits if it can't start
             logging.getLogger("afspm.plugins.web").error("nothing can be served")

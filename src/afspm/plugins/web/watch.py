@@ -21,7 +21,7 @@ MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
 
 
 class SpectrumStore:
-    """The newest spectra, in the order in which they came. Not for several threads at once."""
+    """The newest spectra, in the order of their arrival. Not for several threads at once."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[int, Spectrum]] = deque()
@@ -29,7 +29,7 @@ class SpectrumStore:
         self._newest_ns = -1
 
     def take(self, spectrum: Spectrum, time_ns: int) -> None:
-        """Add one that was published; what is not newer (a replay) is passed over."""
+        """Add a published spectrum; a replayed one (not newer) is ignored."""
         if time_ns <= self._newest_ns:
             return
         self._newest_ns = time_ns
@@ -43,17 +43,17 @@ class SpectrumStore:
         return list(self._kept)[-count:]
 
     def at(self, time_ns: int) -> Spectrum | None:
-        """Return the one of that time; None if it is not kept any more."""
+        """Return the spectrum of this time; None if it is no longer kept."""
         return next((spectrum for at_ns, spectrum in self._kept if at_ns == time_ns), None)
 
 
 class Watch:
-    """The overview, the newest pictures and spectra, and when anything was heard last.
+    """The overview, the newest pictures and spectra, and the time of the last message.
 
     Args:
         clock: of the experiment.
-        past: what was so before; None: nothing is known of that.
-        cut_off: returns what to say if nothing runs the experiment any more, else an empty text.
+        past: the overview before the start; None: unknown.
+        cut_off: returns a text if no process runs the experiment any more, else an empty text.
     """
 
     def __init__(
@@ -74,33 +74,34 @@ class Watch:
         self.connected = False
         self.ended = False
         self.changes = 0
-        self._heard_s = clock.monotonic_s()
+        self._last_message_s = clock.monotonic_s()
         self._changed = threading.Condition()
         self._callbacks: list[Callable[[], None]] = []
 
     @property
     def moment_ns(self) -> int | None:
-        """The recorded moment that is shown; None: it is now."""
+        """The recorded moment shown; None: now."""
         return None
 
     @property
     def revision(self) -> int:
-        """Differs after a jump to another moment: all that was made of the one before is made again."""
+        """Changes with a jump to another moment: content made before is invalid."""
         return 0
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing of the run is left at the moment that is shown."""
+        """Whether no process of the run is left at the moment shown."""
         return self.ended
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:
-        """Keep everything as it is while in the block; be brief in it."""
+        """Keep everything unchanged while in the block; be brief in it."""
         with self._changed:
             yield self.overview
 
     def take(self, message: str, thing: Any, time_ns: int, envelope: str = "") -> None:
-        """Take in what was published."""
+        """Process a published message."""
+        # only stored here, and drawn on request: the component must read its socket before it fills
         with self._changed:
             self.overview.take(message, thing, time_ns, envelope)
             if isinstance(thing, Scan):
@@ -110,24 +111,24 @@ class Watch:
             elif isinstance(thing, Spectrum):
                 self.spectra.take(thing, time_ns)
             elif message == "DriftMapping":
+                # without correction components use tip coordinates, so the map needs no conversion
                 is_mapping = len(thing.matrix) == 6 and thing.correcting
                 self.tip_to_sample = np.array(thing.matrix, dtype=np.float64).reshape(2, 3) if is_mapping else None
-            self._heard_s = self.clock.monotonic_s()
+            self._last_message_s = self.clock.monotonic_s()
             self.connected = True
             self._announce()
 
     def end(self) -> None:
-        """Note that the experiment has ended."""
         with self._changed:
             self.ended = True
             self._announce()
 
     def silent_s(self) -> float:
-        """Return the real seconds since anything was heard."""
-        return self.clock.monotonic_s() - self._heard_s
+        """Return the real seconds since the last message."""
+        return self.clock.monotonic_s() - self._last_message_s
 
     def on_change(self, callback: Callable[[], None]) -> None:
-        """Call `callback` after each change, in the thread that brings it; it must not wait for anything."""
+        """Call `callback` after each change, in the thread that brings it; it must not wait."""
         self._callbacks.append(callback)
 
     def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
@@ -136,7 +137,7 @@ class Watch:
             return self._changed.wait_for(lambda: condition(self.overview), within_s)
 
     def wait_free(self, within_s: float) -> bool:
-        """Wait until the microscope says that it is free."""
+        """Wait until the microscope is free; return False when the time is up."""
         return self.wait_for(lambda o: o.status is not None and o.status.state is ScopeState.FREE, within_s)
 
     def _announce(self) -> None:
@@ -147,7 +148,7 @@ class Watch:
 
 
 class Bell:
-    """Wakes tasks of the page's loop from any thread. However often it rings, each is woken once."""
+    """Wakes tasks of the page's loop from any thread. Several rings wake each task once."""
 
     def __init__(self) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -159,7 +160,7 @@ class Bell:
         self._loop = asyncio.get_running_loop()
 
     def ring(self) -> None:
-        """Wake all tasks that wait. From any thread; never waits."""
+        """Wake all waiting tasks. From any thread; never waits."""
         if self._loop is None or self._is_ringing:
             return
         self._is_ringing = True
@@ -181,24 +182,23 @@ class Bell:
 
 
 class Audience:
-    """The pages that are open, so that all hear of the end before the server goes. From any thread."""
+    """The open pages, so that all show the end before the server stops. From any thread."""
 
     def __init__(self) -> None:
         self._pages: set[int] = set()
         self._changed = threading.Condition()
 
     def join(self, page: object) -> None:
-        """Add a page that was opened."""
         with self._changed:
             self._pages.add(id(page))
 
     def leave(self, page: object) -> None:
-        """Remove a page that was closed, or has been told of the end."""
+        """Remove a page that was closed, or that shows the end."""
         with self._changed:
             self._pages.discard(id(page))
             self._changed.notify_all()
 
-    def wait_told(self, within_s: float) -> bool:
-        """Wait until no page is left that has not been told; return False when the time is up."""
+    def wait_until_end_shown(self, within_s: float) -> bool:
+        """Wait until every page shows the end; return False when the time is up."""
         with self._changed:
             return self._changed.wait_for(lambda: not self._pages, within_s)

@@ -1,4 +1,4 @@
-"""Estimators by name, and users' own.
+"""Estimators by name: afspm's, and a user's own.
 
 estimator("least-squares")
 estimator({"class": "sift", "transform": "affine"})
@@ -21,15 +21,15 @@ DEFAULT = "least-squares"
 
 
 def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = log_failure) -> Estimator:
-    """Return an estimator by name, guarded: its errors are reported, and bridged by a coarse estimate.
+    """Return an estimator by name, inside a guard that reports errors and bridges them by a coarse estimate.
 
     Args:
-        spec: a name that a package declares or "module.Name"; a table with that as its `class` and the settings of it
-            (only `class` names code); or an estimator.
-        report: called with each error over a pair; by default it is logged.
+        spec: a name that a package declares or "module.Name"; a table with such a name as its `class` and with the
+            settings (only `class` names code); or an estimator.
+        report: called with each error; by default it is logged.
 
     Raises:
-        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+        ConfigError: no such name, class or setting, a meaningless setting, or a missing library.
     """
     if isinstance(spec, Guarded):
         return spec
@@ -37,7 +37,7 @@ def estimator(spec: str | PlainMapping | Estimator = DEFAULT, report: Report = l
 
 
 def unguarded(spec: str | PlainMapping | Estimator = DEFAULT) -> Estimator:
-    """Return an estimator by name without a guard, for tests and benchmarks, where an error has to show.
+    """Return an estimator by name without its guard, for tests and benchmarks that must see errors.
 
     Raises:
         ConfigError: as `estimator`.

@@ -1,6 +1,6 @@
-"""Acceptance of a match: an estimate is always found, also where the scans show different places.
+"""Acceptance of a match. Any two scans have a best match, also scans of different places.
 
-A logistic regression puts the evidence together to the probability that the match is wrong by more than a pixel. It is
+A logistic regression turns the evidence into the probability that the match is wrong by more than a pixel. It is
 fitted by `python -m benchmarks.drift.fit`.
 """
 
@@ -20,12 +20,12 @@ Mask = NDArray[np.bool_]
 PARTS = 8  # of the overlap in each direction, at most
 PART_PX = 4  # smaller ones hold too little to correlate
 APART_PX = 4  # nearer than this a repetition is the match itself
-FEW = 10  # with fewer repetitions a surface doesn't repeat itself
-MOST_REPEATS = 30.0  # standard deviations: a place of its own
+FEW = 10  # with fewer repetitions a surface does not count as periodic
+MOST_REPEATS = 30.0  # standard deviations, from which a match counts as unique
 WRONG_AT_MOST = 0.05
-"""The largest probability of being wrong with which a match is accepted. A choice, not fitted: wrong matches among the
-accepted are too few to count in a fit. Of the families, where a third of the pairs share nothing, 0.6 % of the accepted
-are wrong at this value, nearly all of them stampers without a prior."""
+"""Largest accepted probability that a match is wrong. A choice, not fitted: wrong matches among the accepted are too
+few for a fit. In the families, where a third of the pairs are unrelated, 0.6 % of the accepted are wrong at this value,
+nearly all of them stampers without a prior."""
 
 
 @dataclass(frozen=True)
@@ -33,18 +33,18 @@ class MatchEvidence:
     """Figures of merit of a match.
 
     Attributes:
-        overlap: part of the smaller scan.
+        overlap: share of the smaller scan.
         sd_px: largest standard deviation of the shift.
-        gap: how much likelier, in nats, than any other shift.
-        rival: likelihood of another shift over the match's, in nats, both compared with no match. Where features of one
-            kind are far apart, one may fit another as well as itself, and only shows less.
+        gap: log-likelihood above any other shift, in nats.
+        rival: log-likelihood of the best other shift over the log-likelihood of the match, both relative to no match.
+            Where equal features are far apart, one may fit another as well as itself, and only overlap less.
         agreement: share of the parts of the overlap with features that correlate.
-        above_repeats: standard deviations by which the match exceeds the sites about it that look the same. A prior
-            singles out one site, whether or not it is the right one. A wrong one is one of many, and as far from their
-            mean as chance has it; the right one alone has its defects in their places.
+        above_repeats: standard deviations between the match and similar-looking sites around it. A prior selects one
+            site, right or wrong. A wrong site is one of many, at a random distance from their mean; only the right one
+            has its defects in their places.
         surprise: chi² of the shift, given the prior.
-        searched: share of the scan's area in which the prior lets the match be; 1 without one. The fewer places there
-            are, the fewer can fit by chance.
+        searched: share of the scan's area in which the prior allows the match; 1 without a prior. In a smaller area
+            fewer sites fit by chance.
     """
 
     overlap: float
@@ -57,7 +57,7 @@ class MatchEvidence:
     searched: float
 
     def features(self) -> dict[str, float]:
-        """Return the same on scales on which they add up, limited to the range of real matches."""
+        """Return the figures on additive scales, limited to the range of real matches."""
         return {
             "overlap": math.log(max(self.overlap, 0.05)),
             "sd_px": math.log(min(max(self.sd_px, 1e-3), 10.0)),
@@ -70,8 +70,7 @@ class MatchEvidence:
         }
 
     def objections(self) -> dict[str, float]:
-        """Return the contribution of each figure to the log odds that the match is wrong, compared with a typical
-        match."""
+        """Return how much each figure adds to the log odds of a wrong match, relative to a typical match."""
         return {name: WEIGHTS[name] * (value - RIGHT[name]) for name, value in self.features().items()}
 
     @property
@@ -81,7 +80,7 @@ class MatchEvidence:
         return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
 
     def refusal(self, wrong_at_most: float) -> str:
-        """Return why a match is refused, in words; empty if it is accepted."""
+        """Return the reason for refusing the match; empty if it is accepted."""
         if self.wrong <= wrong_at_most:
             return ""
         objections = self.objections()
@@ -104,8 +103,8 @@ _REASONS = {
 def agreement(one: Array, two: Array, known: Mask) -> float:
     """Return the share of parts with features in which two aligned images correlate by more than 0.5.
 
-    The overlap is divided into up to 8 x 8 parts. A part has features if its power is twice what a typical part has
-    left.
+    The overlap is divided into up to 8 x 8 parts. A part has features if its power is twice the residual power of a
+    typical part.
     """
     n = np.maximum(_sums(known.astype(np.float64)), 1.0)
     a, b = _sums(one * known) / n, _sums(two * known) / n
@@ -127,10 +126,11 @@ def _sums(values: Array) -> Array:
 def above_repeats(found: Array, overlap: Array, origin: Array) -> float:
     """Return how far a match stands out of the sites at which the surface repeats itself, in standard deviations.
 
-    `found` holds the correlation of two aligned images, [y, x] with no shift at `origin`.
+    The sites are the peaks at least half as high, with at least half the overlap. Coefficients are compared by Fisher's
+    atanh. Infinite if there are fewer peaks than a standard deviation needs.
 
-    These are the peaks at least half as high, where at least half as much overlaps. Coefficients are compared as
-    Fisher does, by atanh. Infinite if there are next to no such peaks.
+    Args:
+        found: the correlation of two aligned images, [y, x], with zero shift at `origin`.
     """
     from scipy.ndimage import maximum_filter
 

@@ -40,7 +40,7 @@ stretch. With 0.2 hard pairs get worse, since the share itself is then hardly kn
 
 @dataclass(frozen=True, eq=False)
 class Believed:
-    """The prior of theta: its mean and inverse covariance, (n,) and (n, n)."""
+    """The prior of theta: mean (n,) and inverse covariance (n, n)."""
 
     mean: Array
     precision: Array
@@ -48,11 +48,13 @@ class Believed:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """The end of the iteration and the equations there, per block of rows and over the variance of the noise.
+    """The end of the iteration: theta and its normal equations by block of rows, over the variance of the noise.
+
+    J is the gradient without noise, H its shrunk estimate (`noise.denoised`).
 
     Attributes:
         theta: (COUNT,), see `WarpedPair`.
-        curvature: (n, 8, 8), H'QJ with J the gradient without noise and H what of it is known.
+        curvature: (n, 8, 8), H'QJ.
         spread: (n, 8, 8), H'QH, the covariance of `slope`.
         slope: (n, 8), H'Qr.
     """
@@ -63,10 +65,10 @@ class Fit:
     slope: Array
 
     def information(self, believed: Believed) -> tuple[Array, Array]:
-        """Return the information M' S^-1 M of the slope on theta, and its product with the theta of the images alone.
+        """Return the information M' S^-1 M about theta, and its product with the theta of the images alone.
 
-        M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). M alone would
-        count the noise in H as a surface where M is less than S.
+        M is the curvature and S the covariance of the slope (Godambe, Ann. Math. Stat. 31, 1208, 1960). Where M is less
+        than S, M alone would count the noise in H as a surface.
         """
         curvature = self.curvature.sum(axis=0)
         # S alone is singular in small overlaps; a hundredth of the prior matters only where the images know less
@@ -77,7 +79,7 @@ class Fit:
 
 
 def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Index, steps: int) -> Array:
-    """Return theta after some steps with plain weights, for the coarse stages."""
+    """Return theta after some Gauss-Newton steps with uniform weights, for the coarse stages."""
     theta = theta.copy()
     for _ in range(steps):
         one, two, known = pair.warped(theta)
@@ -93,9 +95,9 @@ def least_squares(pair: WarpedPair, theta: Array, believed: Believed, free: Inde
 
 
 def generalised_least_squares(pair: WarpedPair, theta: Array, believed: Believed, seen_through: FineFilter) -> Fit:
-    """Iterate theta by generalised least squares, in which scars count less.
+    """Iterate theta by generalised least squares that gives scars a low weight.
 
-    Each round estimates gradient, noise and weights again, from the residual of the round before.
+    Each round re-estimates gradient, noise and weights from the residual of the round before.
     """
     for _ in range(ROUNDS):
         fit = _round(pair, theta, believed, seen_through)
@@ -111,7 +113,7 @@ def _round(pair: WarpedPair, theta: Array, believed: Believed, seen_through: Fin
     # Noise moves with theta as the surface does, and so does the noise left in H; both cancel. The slope therefore
     # changes by H'QJ with a J without noise, and the product of both noises is subtracted.
     one, two, known = pair.warped(theta)
-    if not known.any():  # in a small overlap with next to no features a step may lead out of it
+    if not known.any():  # in a small overlap almost without features a step may leave it
         raise Unusable("without a displacement that fits")
     mean, residual = (one + two) / 2, two - one
     left = without_lines(residual, known, pair.crossing)
@@ -149,8 +151,8 @@ def _signal(
 
 
 def _no_less(curvature: Array, spread: Array, precision: Array) -> Array:
-    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the difference
-    # that the curvature is may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
+    # H'QJ, but in no direction less than `LEAST_CURVATURE` of H'QH: where a direction is hardly visible, the curvature,
+    # a difference, may be noise alone. The precision of the prior is on both sides: in an overlap of some 10 px
     # the nuisances act through one gradient and are nearly dependent, and products of columns of 32 bits are not
     # definite any more. Scaled to a diagonal of 1, values below their digits count as nothing.
     total, whole = (_symmetric(each.sum(axis=0)) for each in (curvature, spread))
@@ -192,20 +194,20 @@ def _row_weights(residual: Array, known: NDArray[np.bool_]) -> Array:
 
 FLOOR_PX = 1e-3
 CLEAR_PX = 0.02  # a shift known better than this is as certain as its model says
-EVEN = 0.2  # a share of the information that one block of rows may well hold
+EVEN = 0.2  # usual share of the information in one block of rows
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """The signs that a shift is less certain than the model of its noise says.
+    """Signs that a shift is less certain than its noise model claims.
 
     Attributes:
-        varied: its variance with blocks of the image left out in turn, over the model's.
-        shared: its standard deviation, over the one with the rest of theta known: unmodelled effects of shear, creep
+        varied: variance of the shift with blocks of the image left out in turn, over the model's.
+        shared: standard deviation of the shift, over its value with the rest of theta known: unmodelled shear, creep
             and contrast act on the shift as well.
-        sd_px: the largest standard deviation by the model: the weaker the features, the more disturbances count.
-        leverage: the largest share of the information on the shift, in any direction, in one block of rows (MacKinnon,
-            Nielsen and Webb, J. Econometrics 235, 2001, 2023): a disturbance of these rows neither averages out nor
+        sd_px: largest standard deviation by the model: the weaker the features, the more disturbances count.
+        leverage: largest share, in any direction, of the information about the shift in one block of rows (MacKinnon,
+            Nielsen and Webb, J. Econometrics 235, 2001, 2023). A disturbance of these rows neither averages out nor
             shows.
     """
 
@@ -215,7 +217,7 @@ class Doubt:
     leverage: float
 
     def features(self) -> dict[str, float]:
-        """Return the same as logarithms, 0 for no doubt."""
+        """Return the signs as logarithms, 0 for no doubt."""
         return {
             "varied": math.log(max(self.varied, 1.0)),
             "shared": math.log(max(self.shared, 1.0)),
@@ -225,22 +227,22 @@ class Doubt:
 
     @property
     def spread(self) -> float:
-        """Factor by which the covariance is larger than its model, fitted by `python -m benchmarks.drift.fit`.
+        """Factor on the model's covariance, fitted by `python -m benchmarks.drift.fit`.
 
-        It is limited to the range of the fit: a power law means nothing beyond it.
+        It is limited to the range of the fit: beyond it the power law is meaningless.
         """
         factor = SPREAD["all"] * math.exp(sum(SPREAD[name] * value for name, value in self.features().items()))
         return min(factor, SPREAD["most"])
 
 
 def covariance(fit: Fit, believed: Believed) -> tuple[Array, Doubt]:
-    """Return the covariance (COUNT, COUNT) of theta, enlarged by the spread of its doubt, and the doubt.
+    """Return the covariance (COUNT, COUNT) of theta, enlarged by `Doubt.spread`, and the doubt.
 
     It is (M + P)^-1 (H'QH + P) (M + P)^-T with the curvature M = H'QJ (White, Econometrica 50, 1, 1982).
 
     The variance of the shift with blocks left out is the cluster jackknife (CV3; MacKinnon, Nielsen and Webb,
-    J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. As few blocks hold most
-    of the features it scatters widely, so it is one sign among others.
+    J. Appl. Econom. 38, 671, 2023), which allows for noise that is correlated within a block. A few blocks hold most of
+    the features, so it scatters widely and is only one of the signs.
     """
     if not np.isfinite(fit.theta).all():
         raise Unusable("without a displacement that fits")

@@ -1,4 +1,4 @@
-"""Registration by plain cross-correlation: the shift at which what both scans know looks most alike."""
+"""Registration by plain normalised cross-correlation."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ Array = NDArray[np.float64]
 
 _SMOOTH_PX = 1.0
 _APART_PX = 4.0  # from the highest peak: nearer ones belong to it
-# Edges of the overlap, and what the flattening of rows leaves around high features, pull by about this much at any
-# noise.
+# Edges of the overlap, and remains of row flattening around high features, pull by about this much at any noise.
 _SYSTEMATIC_PX = 0.2
 _GATE = 25.0  # chi² from the expectation, the limit of the search
 
@@ -28,13 +27,13 @@ class Correlation:
     """Masked normalised cross-correlation (Padfield 2012), by FFT, its peak refined by a parabola. Translation only.
 
     Attributes:
-        coefficient: least at the peak.
-        height: of the peak, in standard deviations of all other shifts.
-        rival: the highest of all other shifts, beside the peak, at most.
-        overlap: of the smaller scan, at least; two thirds of it are enough with a prior.
+        coefficient: least accepted peak.
+        height: least height of the peak, in standard deviations of all other shifts.
+        rival: largest accepted ratio of the next peak to the peak.
+        overlap: least overlap, as share of the smaller scan; with a prior, two thirds of it are enough.
 
     Raises:
-        ConfigError: a setting that makes no sense.
+        ConfigError: a meaningless setting.
     """
 
     coefficient: float = 0.4
@@ -50,7 +49,6 @@ class Correlation:
             raise ConfigError(f"{self.height!r} must be above 0", where="height")
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `Estimator`."""
         images: list[Image] = []
         for name, one in (("reference", reference), ("scan", scan)):
             try:
@@ -121,7 +119,7 @@ class _Peak:
 def _smooth(image: Image) -> Array:
     from scipy.ndimage import gaussian_filter
 
-    # only over what was measured: what gaps are filled with has edges of its own
+    # only over measured pixels: filled gaps have edges of their own
     known = image.known.astype(np.float64)
     weight = gaussian_filter(known, _SMOOTH_PX, mode="nearest")
     smooth: Array = gaussian_filter(image.values * known, _SMOOTH_PX, mode="nearest") / np.maximum(weight, 1e-9)
@@ -129,7 +127,7 @@ def _smooth(image: Image) -> Array:
 
 
 def _deviations(shifts_px: Array, grid: CommonGrid, prior: Prior) -> Array:
-    # half a pixel is added: the grid of shifts is that coarse
+    # half a pixel is added for the grid of shifts
     back = np.linalg.inv(grid.to_m)
     inverse = np.linalg.inv(back @ prior.covariance_m2 @ back.T + 0.25 * np.eye(2))
     off = shifts_px - grid.shift_px(prior.mean_m)

@@ -1,7 +1,7 @@
-"""Evidence of matched features: the probability of their agreement by chance, and the uncertainty of the displacement.
+"""Evidence of matched features: the probability of agreement by chance, and the uncertainty of the displacement.
 
-Against chance their number counts; against a periodic surface that no other displacement has nearly as many; against
-one feature that happens to look alike that they lie in several places.
+The number of matches excludes chance. No rival displacement with nearly as many matches excludes a periodic surface.
+Matches in several places exclude a single look-alike feature.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ from afspm.plugins.drift.registration import Prior
 
 Array = NDArray[np.float64]
 
-_RADIUS_PX = 1.5  # nearer no two keypoints need to be
+_RADIUS_PX = 1.5  # keypoints need not be nearer to each other
 _REACH_PX = 4.0  # matches nearer to each other see the same feature
 _BLOCKS = 4  # the reference is divided into 4 x 4
 _BLOCKS_MIN = 4
 _OVERLAP_MIN, _OVERLAP_MIN_WITH_PRIOR = 0.3, 0.2
-_UNSEEN_PX = 0.1  # by this the keypoints of both scans err together, which no scatter shows
+_UNSEEN_PX = 0.1  # common error of the keypoints of both scans, which no scatter shows
 _FEW_BLOCKS = 1.5  # the jackknife of so few has heavy tails
-_DEVIATIONS_MAX = 25.0  # squared, from what was expected
+_DEVIATIONS_MAX = 25.0  # squared, from the prior
 
 
 @dataclass(frozen=True, eq=False)
 class ConsensusEvidence:
-    """Matched features, and the pairs of them that agree.
+    """Matched features, with the pairs that agree on a transform.
 
     `a` and `b` are (n, 2) in tip coordinates, m; `pixel_m` is the common pixel.
     """
@@ -51,13 +51,13 @@ class ConsensusEvidence:
 
     @property
     def radius_m(self) -> float:
-        """Distance from the transform within which a pair agrees with it."""
+        """Largest distance of an agreeing pair from the transform."""
         return max(self.consensus.radius, _RADIUS_PX * self.pixel_m)
 
 
 @dataclass(frozen=True)
 class Standards:
-    """The standards that evidence must meet; see `Features`."""
+    """Thresholds for the evidence; see `Features`."""
 
     false_alarms: float
     inlier_share: float
@@ -75,7 +75,7 @@ def weighed(
     covariance: Array,
     center: Array,
 ) -> tuple[dict[str, float], str]:
-    """Return figures of merit by name, and the reason for a refusal (empty: none)."""
+    """Return figures of merit by name, and the reason for a refusal (empty: accepted)."""
     inlier, transform = evidence.consensus.inlier, evidence.consensus.transform
     off = transform(evidence.a[inlier]) - evidence.b[inlier]
     figures = {
@@ -123,9 +123,9 @@ def _objection(
 
 
 def _log10_false_alarms(evidence: ConsensusEvidence, reference: Region, prior: Prior | None) -> float:
-    # matches of one feature are no independent witnesses: one of them counts
+    # several matches of one feature are not independent: one of them counts
     radius_m = evidence.radius_m
-    # Two places thrown into the scans lie a given displacement apart with at most this density.
+    # Two random places in the scans lie a given displacement apart with at most this density.
     area_m2 = reference.size_m[0] * reference.size_m[1]
     if prior is not None:
         reach_m2 = np.linalg.det(prior.covariance_m2 + np.eye(2) * (0.01 * max(reference.size_m)) ** 2)

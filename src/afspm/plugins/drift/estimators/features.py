@@ -1,8 +1,8 @@
-"""Registration by features, after the paper (supporting information, "Drift Estimation"): keypoints, descriptors,
-brute-force matches with cross-check, and the transform that most of them agree on.
+"""Registration by features, after the paper (supporting information, "Drift Estimation").
 
-What is added to the paper: a result is accepted only if that many pairs can't agree by chance (`evidence`); the fit is
-tightened, since 5 % of the scan lets mismatches in (`tighten`); pixels need not be square; and it says how sure it is.
+Keypoints, descriptors, brute-force matches with cross-check, and the transform that most matches agree on. Added to the
+paper: a result is accepted only if its matches can't agree by chance (`evidence`); the fit is tightened, since a
+threshold of 5 % of the scan lets mismatches in (`tighten`); pixels need not be square; the result has a covariance.
 """
 
 from __future__ import annotations
@@ -30,23 +30,23 @@ GATE = 25.0  # chi² from the expectation, the limit of the search
 
 @dataclass(frozen=True)
 class Features:
-    """The base of all estimators by features; `Brief`, `Orb` and `Sift` are the kinds.
+    """The base of all estimators by features: `Brief`, `Orb` and `Sift`.
 
     Attributes:
         transform: "translation", "euclidean", "similarity" or "affine".
-        residual_threshold: how far a match may lie from the transform to be an inlier of RANSAC, as part of the scan's
-            resolution.
-        iterations: of RANSAC, each with a random few matches. More are needed where fewer are right.
-        tighten: whether the inliers are then reduced to the ones as near as most of them; the paper does not.
+        residual_threshold: largest distance of a RANSAC inlier from the transform, as share of the scan's resolution.
+        iterations: of RANSAC, each with a random minimal sample. The smaller the share of right matches, the more are
+            needed.
+        tighten: whether to drop inliers farther off than most inliers; the paper does not.
         max_keypoints: the strongest are kept.
-        false_alarms: how often chance may give a result that is accepted, for scans that have nothing in common.
-        inlier_share: of all matches, that must agree.
-        ambiguity: how large, beside the best, a consensus on another displacement may be.
-        bend_max: by how much scans may be turned, scaled or sheared against each other.
-        seed: of the random choices; the same scans always give the same.
+        false_alarms: accepted results by chance, expected for a pair without common features.
+        inlier_share: least share of inliers among all matches.
+        ambiguity: largest consensus on another displacement, as share of the best.
+        bend_max: largest rotation, scale or shear between scans.
+        seed: of the random samples; equal scans give equal results.
 
     Raises:
-        ConfigError: a setting that makes no sense.
+        ConfigError: a meaningless setting.
     """
 
     transform: str = "translation"
@@ -75,7 +75,6 @@ class Features:
                 raise ConfigError(f"{getattr(self, name)!r} is not a number from 1", where=name)
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `Estimator`."""
         images: list[Image] = []
         for name, one in (("reference", reference), ("scan", scan)):
             try:
@@ -136,19 +135,19 @@ class Features:
 
 
 class Brief(Features):
-    """Harris corners, BRIEF descriptors: the paper's default. They do not turn with the sample."""
+    """Harris corners with BRIEF descriptors, the paper's default. They do not follow a rotation of the sample."""
 
     kind = "brief"
 
 
 class Orb(Features):
-    """ORB: turns with the sample."""
+    """ORB: follows a rotation of the sample."""
 
     kind = "orb"
 
 
 class Sift(Features):
-    """SIFT: turns and scales with the sample."""
+    """SIFT: follows rotation and scale of the sample."""
 
     kind = "sift"
 

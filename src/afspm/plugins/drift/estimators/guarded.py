@@ -1,7 +1,7 @@
 """A guard around any estimator: distinguishes errors from refusals, reports errors and bridges them.
 
-A refusal says that two scans can't be registered. An error says nothing about the scans: it is reported with the pair,
-and a plain correlation takes the place of the estimate where it is known where to look, and that is sure of its peak.
+A refusal means that two scans can't be registered. An error means nothing about the scans: it is reported with the
+pair. A plain correlation then takes its place, if there is a prior and the peak is clear.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from afspm.plugins.drift.overlap import overlap_ratio
 from afspm.plugins.drift.registration import DriftScan, Estimator, LinearSeen, Prior, Registration
 
 COARSE_SD_PX = 0.5
-"""Added to the uncertainty of the coarse estimate, in the larger pixel of both scans: 95 % ellipses then hold 98 % and
-more of the accepted pairs of the families, and of zooms in their survey."""
+"""Added to the standard deviation of the coarse estimate, in the larger pixel of both scans. The 95 % ellipses then
+contain at least 98 % of the accepted pairs of the families, and of zooms in their survey."""
 
 _log = logging.getLogger("afspm.plugins.drift")
 
 
 @dataclass(frozen=True)
 class PairFailure:
-    """An error of an estimator over a pair of scans.
+    """An error of an estimator with a pair of scans.
 
     Attributes:
         estimator: its name.
@@ -53,16 +53,15 @@ Report = Callable[[PairFailure], None]
 
 
 def log_failure(failure: PairFailure) -> None:
-    """Log a failure as an error."""
     _log.error("%s", failure)
 
 
 class Guarded:
-    """Runs an estimator so that no caller needs to be careful.
+    """Runs an estimator so that no caller needs to check its result.
 
-    An exception, and a result that is none, of wrong shapes, or accepted with values that can't be, are failures: see
-    `Registration.failure`. A displacement with which the scans would share nothing, and a sample that is mirrored or
-    much stretched, are refused. The estimator gets copies, so that changes to them do not reach later comparisons.
+    An exception, a result of the wrong type or shape, and impossible accepted values are failures: see
+    `Registration.failure`. A displacement without overlap, and a mirrored or much stretched sample, are refused. The
+    estimator receives copies of the values, so that its changes do not reach later comparisons.
 
     Args:
         report: called with each failure.
@@ -77,11 +76,10 @@ class Guarded:
         return f"<estimator {self.name}: {self.inner!r}>"
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `Estimator`."""
         try:
             found = self.inner.register(_copied(reference), _copied(scan), prior)
             failure = _malformed(found)
-        except Exception as error:  # any code, of a user's own estimator too, may stumble in any way
+        except Exception as error:  # an estimator may be a user's own code, and raise anything
             failure = f"{type(error).__name__}: {error}"
         if failure:
             self._report(PairFailure(self.name, reference.key, scan.key, failure))
@@ -90,12 +88,12 @@ class Guarded:
         return Registration.refused(f"{self.name}: {impossible}") if impossible else found
 
     def _coarse(self, reference: DriftScan, scan: DriftScan, prior: Prior | None, failure: str) -> Registration:
-        # without an expectation one particle is as good as the next: a plain correlation is then sure of wrong ones
+        # without a prior a plain correlation takes one particle for another, with a clear peak
         if prior is None or isinstance(self.inner, Correlation):
             return Registration.failed(failure)
         try:
             found = Correlation().register(reference, scan, prior)
-        except Exception as error:  # what made the estimator stumble may make this one stumble
+        except Exception as error:  # the same values may make this estimator raise, too
             self._report(PairFailure("correlation", reference.key, scan.key, f"{type(error).__name__}: {error}"))
             return Registration.failed(failure)
         if not found.accepted or _malformed(found) or _impossible(found, reference, scan):
@@ -154,5 +152,5 @@ def _impossible(found: Registration, reference: DriftScan, scan: DriftScan) -> s
         return f"accepted with a sample {unlike}"
     if overlap_ratio(reference.region, scan.region, found.displacement_m) == 0.0:
         far_m = float(np.hypot(*found.displacement_m))
-        return f"accepted with a displacement of {far_m:.3g} m, at which the scans do not overlap"
+        return f"accepted with a displacement of {far_m * 1e9:.3g} nm, at which the scans do not overlap"
     return ""

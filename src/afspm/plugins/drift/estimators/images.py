@@ -1,4 +1,4 @@
-"""Images to register: scans with flattened rows on a common pixel grid; scans that hold nothing are refused."""
+"""Images to register: scans with flattened rows on a common pixel grid. Scans without information are refused."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Image:
     """A prepared image.
 
     Attributes:
-        values: [y, x], finite everywhere: what was not measured is filled from the nearest row.
-        known: [y, x], where something was measured, or a single row is missing between two that were.
-        made_up: [y, x], where rows beside stand in for what was measured, which says nothing of a displacement; None:
-            nowhere.
+        values: [y, x], finite everywhere: unmeasured pixels are filled from the nearest row.
+        known: [y, x], true for measured pixels, and for a single missing row between measured ones.
+        made_up: [y, x], true where neighbouring rows replace measured ones, without information about a displacement;
+            None: nowhere.
     """
 
     values: Array
@@ -39,7 +39,7 @@ class Image:
 
 
 def prepare(values: Array) -> Image:
-    """Flatten the rows, cut off what sticks out, mend scars, scale to a standard deviation of 1.
+    """Flatten the rows, clip outliers, mend scars, scale to a standard deviation of 1.
 
     Raises:
         Unusable: less than half of the rows measured, constant, saturated, or without topography (a crashed tip).
@@ -70,7 +70,7 @@ def prepare(values: Array) -> Image:
 
 
 def flatten_rows(values: Array, known: Mask) -> Array:
-    """Subtract a straight line from each row, by two rounds of weighted least squares in which outliers count less."""
+    """Subtract a straight line from each row, by two rounds of weighted least squares that suppress outliers."""
     flat = _less_lines(values, known.astype(np.float64))
     for _ in range(2):
         scale = 1.4826 * np.median(np.abs(flat[known]), overwrite_input=True)
@@ -96,10 +96,10 @@ SCAR_SD = 2.5  # beyond the rows on both sides of it, in standard deviations of 
 
 
 def without_scars(values: Array) -> Array:
-    """Replace scars by what the rows above and below them show.
+    """Replace scars by interpolation between the rows above and below.
 
-    A scar is up to `SCAR_ROWS` rows thick: most of `SCAR_PX` pixels of each of its rows are above both of the rows
-    beside it, or below both. Nothing on a surface is as thin and much longer.
+    A scar is up to `SCAR_ROWS` rows thick. In each of its rows, most of `SCAR_PX` pixels are above both neighbouring
+    rows, or below both. No feature of a surface is as thin and much longer.
     """
     level = levelled(values)
     scar = np.zeros(values.shape, dtype=bool)
@@ -111,17 +111,17 @@ def without_scars(values: Array) -> Array:
 
 
 def levelled(values: Array) -> Array:
-    """Subtract the offsets of the rows, by the medians of the steps between them."""
+    """Subtract the offsets of the rows, found as medians of the steps between rows."""
     steps = np.median(np.diff(values, axis=0), axis=1)
     level: Array = values - np.concatenate([[0.0], np.cumsum(steps)])[:, None]
     return level
 
 
 def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
-    """Return how far `thick` rows are all above both neighbours, how far all below, and how far their middle is from
-    the mean of both.
+    """Return by how much `thick` rows stand out of their neighbours: upwards, downwards, and by their middle row.
 
-    Each is an image without the first row and the last ones.
+    The first is the least height above both neighbouring rows, the second the least depth below both, the third the
+    middle row minus the mean of both. Each is an image without the first row and the last `thick` rows.
     """
     count = len(level) - thick - 1
     above, below = level[:count], level[thick + 1 :]
@@ -132,12 +132,12 @@ def standing_out(level: Array, thick: int) -> tuple[Array, Array, Array]:
 
 
 def spread_of(values: Array) -> float:
-    """Return the standard deviation of a normal distribution, by the median."""
+    """Return a robust standard deviation, from the median absolute deviation."""
     return 1.4826 * float(np.median(abs(values - np.median(values))))
 
 
 def scarred(up: Mask, down: Mask, thick: int) -> Mask:
-    """Return where scars of `thick` rows are, from where the rows stand out."""
+    """Return the mask of scars `thick` rows thick, from the pixels that stand out up or down."""
     there = _mostly(up) | _mostly(down)
     scar = np.zeros((there.shape[0] + thick + 1, there.shape[1]), dtype=bool)
     for k in range(thick):
@@ -146,7 +146,7 @@ def scarred(up: Mask, down: Mask, thick: int) -> Mask:
 
 
 def mended_rows(values: Array, level: Array, scar: Mask) -> Array:
-    """Replace scars by a line between the rows beside them.
+    """Replace scars by linear interpolation between the neighbouring rows.
 
     Args:
         level: the image without the offsets of its rows.
@@ -222,7 +222,7 @@ class CommonGrid:
 
     Attributes:
         to_m: (2, 2) from pixels to metres in tip coordinates.
-        to_own: (2, 2) from pixels to those of the scan, along its own axes.
+        to_own: (2, 2) from pixels of the grid to pixels of the scan, along the scan's own axes.
         reference_m, scan_m: (2,) the centres in tip coordinates.
     """
 
@@ -237,7 +237,7 @@ class CommonGrid:
         return shift
 
     def displacement_m(self, shift_px: Array) -> Array:
-        """Invert `shift_px`."""
+        """Convert a shift between pixel coordinates to a displacement in tip coordinates."""
         displacement: Array = self.to_m @ shift_px + (self.scan_m - self.reference_m)
         return displacement
 
@@ -255,9 +255,9 @@ class CommonGrid:
 def onto_common_grid(
     reference: DriftScan, image1: Image, scan: DriftScan, image2: Image
 ) -> tuple[CommonGrid, Image, Image]:
-    """Resample both images to the axes of the reference and the coarser pixel of the two.
+    """Resample both images to the axes of the reference and to the coarser pixel of the two.
 
-    An image that has them already is not touched: interpolation costs accuracy.
+    An image already on this grid is not resampled: interpolation costs accuracy.
     """
     angle = reference.region.angle_rad
     turn = scan.region.angle_rad - angle

@@ -1,4 +1,4 @@
-"""Keypoints and descriptors of scikit-image, each kind as a function from an image to the strongest of them."""
+"""Keypoints and descriptors of scikit-image: for each kind, a function from an image to its strongest keypoints."""
 
 from __future__ import annotations
 
@@ -17,9 +17,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Keypoints:
-    """Attributes:
-    xy_px: (n, 2) positions (x, y) from the centre of the image.
-    descriptors: (n, d), near where the surroundings are alike (Euclidean).
+    """Keypoints of an image, with their descriptors.
+
+    Attributes:
+        xy_px: (n, 2) positions (x, y) from the centre of the image.
+        descriptors: (n, d), near each other (Euclidean) where the surroundings are alike.
     """
 
     xy_px: Array
@@ -30,7 +32,7 @@ class Keypoints:
 
 
 def brief(image: Image, count_max: int) -> Keypoints:
-    """Harris corners with binary descriptors of 256 comparisons within 49 px (Calonder et al. 2010)."""
+    """Return Harris corners with binary descriptors of 256 comparisons within 49 px (Calonder et al. 2010)."""
     feature = _skimage()
     response = feature.corner_harris(image.values, sigma=1.0)
     corners = feature.corner_peaks(response, min_distance=1, threshold_rel=0.0, num_peaks=count_max)
@@ -44,7 +46,7 @@ def brief(image: Image, count_max: int) -> Keypoints:
 
 
 def orb(image: Image, count_max: int) -> Keypoints:
-    """FAST corners over scales with binary descriptors that turn with them (Rublee et al. 2011)."""
+    """Return FAST corners over scales with binary descriptors that rotate with them (Rublee et al. 2011)."""
     detector = _skimage().ORB(n_keypoints=count_max, fast_threshold=0.05)
     if not _found(detector.detect_and_extract, _unit(image.values)):
         return _none(256)
@@ -53,7 +55,7 @@ def orb(image: Image, count_max: int) -> Keypoints:
 
 
 def sift(image: Image, count_max: int) -> Keypoints:
-    """Blobs over scales with histograms of gradients (Lowe 2004)."""
+    """Return blobs over scales with histograms of gradients (Lowe 2004)."""
     detector = _skimage().SIFT()
     values = _unit(image.values)
     if not _found(detector.detect, values):
@@ -150,14 +152,14 @@ _CELLS = 1 << 20  # of the table of distances that exist at one time: 4 MB
 
 
 def matched(first: Descriptors, second: Descriptors, allowed: Allowed | None = None) -> NDArray[np.intp]:
-    """Return pairs of rows that are each other's nearest (Euclidean; of two as near the earlier one).
+    """Return pairs of rows that are mutual nearest neighbours (Euclidean; of equally near ones the earlier).
 
     Args:
         first, second: (n, d) and (m, d).
-        allowed: for a slice of the first, which pairs may be at all, (rows, m).
+        allowed: for a slice of `first`, the mask (rows, m) of allowed pairs.
 
     Returns:
-        Row numbers (k, 2), in the order of the first.
+        Row numbers (k, 2), in the order of `first`.
     """
     if not len(first) or not len(second):
         return np.empty((0, 2), dtype=np.intp)

@@ -1,4 +1,4 @@
-"""Registration by generalised least squares over all pixels (an outline is in `LeastSquares`)."""
+"""Registration by generalised least squares over all pixels (outline: `LeastSquares`)."""
 
 from __future__ import annotations
 
@@ -30,35 +30,35 @@ from afspm.plugins.drift.registration import DriftScan, LinearSeen, Prior, Regis
 
 Array = NDArray[np.float64]
 
-WIDEST = (0.01, 0.03)  # of what shear and turn are thought possible at first, by x and by y
+WIDEST = (0.01, 0.03)  # prior standard deviations of shear and rotation in the first stage, by x and by y
 GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
-BORDER_PX = 1  # where a filter and a spline have to guess what lies beyond
-FARTHEST_PX = 8.0  # from where the search has found it
+BORDER_PX = 1  # filters and splines have no data beyond the border
+FARTHEST_PX = 8.0  # from the result of the search
 TURNED = 0.03  # radians by which the lines of two scans cross
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
 EXPECTED = 2.0
-"""By which more doubt is allowed where a displacement is expected: nearly all wrong matches are of scans with nothing
-in common and no prior, and most right ones that are doubtful are zooms with one."""
+"""Factor on the allowed probability where a displacement is expected: nearly all wrong matches are of unrelated scans
+without a prior, and most doubtful right matches are zooms with one."""
 DISTRUST = 4.0
-"""By which the variance of the noise is taken for larger than its model says, where the images are weighed against what
-else displaces them. The factor of the ellipses, which grows with doubt, would let the images tell too little there."""
+"""Factor on the noise model's variance where the images are weighed against nuisances. The factor of the ellipses,
+which grows with doubt, would give the images too little weight there."""
 
 
 class LeastSquares:
     """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q + creep of the lines.
 
-    1. `prepare`: rows flattened, outliers cut; scans that hold nothing refused. `grid`: a common pixel.
-    2. `search` and `score`: candidates by normalised cross-correlation, the likeliest of them.
-    3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, through a filter and weighted by rows
-       as their `noise` asks.
-    4. `covariance`: what the noise leaves uncertain, and more where there is doubt; `nuisances`: averaged over what
-       shear, turn, calibration and creep there may be.
-    5. `acceptance`: is it a match at all?
+    1. `prepare`: flatten rows, clip outliers, refuse scans without information. `grid`: a common pixel.
+    2. `search` and `score`: candidates by normalised cross-correlation, and the likeliest of them.
+    3. `alignment`: Gauss-Newton, coarse to fine; the fine stage without `spikes`, filtered and weighted by rows
+       according to their `noise`.
+    4. `covariance`: the uncertainty from noise, enlarged by doubt; `nuisances`: the average over possible shear,
+       rotation, calibration and creep.
+    5. `acceptance`: refuse what may be no match.
 
     Args:
-        wrong_at_most: the largest probability that a match which is accepted is wrong by more than a pixel; twice as
-            large where a displacement is expected.
+        wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled where a
+            displacement is expected.
 
     Raises:
         ConfigError: it is not between 0 and 1.
@@ -70,7 +70,6 @@ class LeastSquares:
         self._wrong_at_most = wrong_at_most
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
-        """See `afspm.plugins.drift.registration.Estimator`."""
         images = []
         for name, each in (("reference", reference), ("scan", scan)):
             try:

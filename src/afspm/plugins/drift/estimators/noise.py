@@ -1,4 +1,4 @@
-"""Noise of images: power spectra and the filter made of them, noise along rows, and shrinking of noisy gradients."""
+"""Noise of images: power spectra and the filter made of them, noise along rows, and shrinkage of noisy gradients."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Real = TypeVar("Real", np.float32, np.float64)
 
 MEDIAN_POWER = 0.4549  # median of the square of a normal value of unit variance
-BLUR_PX = 0.45  # takes what interpolation would alias
+BLUR_PX = 0.45  # removes frequencies that interpolation would alias
 
 
 def cosine_frequencies(shape: tuple[int, ...]) -> Array:
@@ -26,12 +26,12 @@ def cosine_frequencies(shape: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class FineFilter:
-    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²) through which the fine alignment sees both.
+    """The radial filter H = sqrt(2 S / (2 S + N)) exp(-2 pi² f² 0.45²) of both images in the fine alignment.
 
-    Applied to both of two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and
-    Thomson, Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial
-    mean of both spectra: N is its floor in the top octave, and S, the rest, is taken flat below its peak: a filter
-    that whitens low frequencies would have a long impulse response, and the borders would leak across the image.
+    Applied to two noisy images, H² weighs each frequency as the maximum-likelihood processor does (Hannan and Thomson,
+    Biometrika 58, 77, 1971; Knapp and Carter, IEEE Trans. ASSP 24, 320, 1976). S and N come from the radial mean of
+    both spectra. N is its floor in the top octave. S is the rest, taken flat below its peak: a filter that whitens low
+    frequencies would have a long impulse response, and the borders would leak across the image.
 
     Attributes:
         frequency: per pixel, ascending.
@@ -59,12 +59,10 @@ class FineFilter:
         return cls((np.arange(power.size) + 0.5) * width, gain)
 
     def at(self, frequency: Array) -> Array:
-        """Return H at frequencies."""
         h: Array = np.interp(frequency, self.frequency, self.gain) * np.exp(-2.0 * (np.pi * frequency * BLUR_PX) ** 2)
         return h
 
     def applied(self, values: Array) -> Array:
-        """Return an image filtered."""
         from scipy.fft import dctn, idctn
 
         filtered: Array = idctn(dctn(values, norm="ortho") * self.at(cosine_frequencies(values.shape)), norm="ortho")
@@ -78,7 +76,7 @@ class FineFilter:
 
 
 def independent_values(first: Array, second: Array) -> float:
-    """Return how many independent values each pixel brings to the correlation of two images.
+    """Return the number of independent values per pixel in the correlation of two images.
 
     S(P1) S(P2) / S(P1 P2) / n, with the sums S over all n frequencies of their power spectra (Bartlett,
     J. R. Stat. Soc. Suppl. 8, 27, 1946).
@@ -94,17 +92,17 @@ BLOCK_ROWS = 8
 BLOCKS = 8  # at least, where rows are few, of two rows or more
 CACHED = 1 << 15  # numbers
 LEAST_NOISE = 1e-8
-"""Least variance, where the scan's is 1: scans have a few digits, and agreement beyond them is no knowledge."""
+"""Least variance, with the scan's variance 1: scans have a few digits, and agreement beyond them means nothing."""
 HIGHEST_FREQUENCY = 0.22  # per pixel, of the spectrum of residuals: above it the filter leaves little of them
 
 
 @dataclass(frozen=True, eq=False)
 class CrossingLines:
-    """The lines of a scan that is turned against the grid; each has an unknown parabola of its own.
+    """The lines of a scan that is rotated against the grid; each has an unknown parabola of its own.
 
     Attributes:
-        number: [y, x], the line that each pixel of the grid is nearest to, from 0 on.
-        along: [y, x], where on that line it lies, about -1 to 1.
+        number: [y, x], the nearest line of each pixel of the grid, from 0 on.
+        along: [y, x], the position on that line, about -1 to 1.
     """
 
     number: NDArray[np.intp]
@@ -112,7 +110,7 @@ class CrossingLines:
 
     @classmethod
     def of(cls, x: Array, y: Array) -> CrossingLines:
-        """Number the lines by own pixel coordinates [y, x] of a grid.
+        """Number the lines from the scan's own pixel coordinates, [y, x] of the grid.
 
         Lines are numbered by halves: a pixel between two lines shows some of both.
         """
@@ -156,22 +154,22 @@ PROJECTIONS = 4
 def seen(
     columns: NDArray[Real], weight: Array, metric: Array | None, crossing: CrossingLines | None = None
 ) -> NDArray[Real]:
-    """Return Q f free of parabolas: its product with another image g is f'Qg, free of the parabolas of both.
+    """Return Q f without parabolas: its product with another image g is f'Qg without the parabolas of both.
 
-    Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row is scanned
-    in seconds and the next one starts again (feedback, flattening by up to the second order, drift of the z piezo), so
+    Generalised least squares row by row: each row has a parabola of its own, and noise with a memory. A row takes
+    seconds, and the next one starts again (feedback, flattening by up to the second order, drift of the z piezo). So
     nothing is assumed of its parabola, and the noise within it is white plus 1/f, with covariance C and Q = C^-1. The
-    rest of a row f after the nuisance B = [1, x, x²] is fitted in this metric, f - B (B'QB)^-1 B'Q f, carries all
+    rest of a row f after a fit of the nuisance B = [1, x, x²] in this metric, f - B (B'QB)^-1 B'Q f, carries all
     information of the row (Frisch and Waugh, Econometrica 1, 387, 1933; Aitken, Proc. R. Soc. Edinb. 55, 42, 1936).
 
     Args:
         columns: [y, column, x].
-        weight: [y, x] of each pixel; 0 where nothing is known. f and g are multiplied with its root.
+        weight: [y, x] of each pixel; 0 for unknown pixels. f and g are multiplied by its root.
         metric: Q, (x, x); None: white noise.
-        crossing: lines of the other scan, if they lie across the rows; then the noise is taken for white.
+        crossing: lines of the other scan, if they lie across the rows; the noise is then taken as white.
 
     Returns:
-        Like `columns`; the root of the weight of g is in it.
+        Like `columns`; the root of the weight of g is included.
     """
     if crossing is not None:
         return crossing.seen(columns, weight)
@@ -199,7 +197,7 @@ def _seen(columns: NDArray[Real], weight: Array, metric: NDArray[Real] | None) -
     x = np.linspace(-1.0, 1.0, columns.shape[2], dtype=columns.dtype)
     rows, lines = columns * root, np.concatenate([root, root * x, root * x**2], axis=1)
     rows_q, lines_q = (rows, lines) if metric is None else (_along_rows(rows, metric), _along_rows(lines, metric))
-    # of some rows less is known than a parabola has
+    # some rows have fewer known pixels than a parabola has parameters
     gram = lines @ lines_q.transpose(0, 2, 1) + 1e-5 * np.eye(3, dtype=columns.dtype)
     fitted = np.linalg.solve(gram, lines_q @ rows.transpose(0, 2, 1)).transpose(0, 2, 1)
     rows_q -= fitted @ lines_q
@@ -221,15 +219,14 @@ def _less_lines(rows: NDArray[Real], root: NDArray[Real]) -> NDArray[Real]:
 
 
 def without_lines(values: Array, known: NDArray[np.bool_], crossing: CrossingLines | None = None) -> Array:
-    """Subtract from each row, [y, x], the parabola fitted to it, and from crossing lines theirs; 0 where nothing is
-    known."""
+    """Subtract from each row of [y, x] a fitted parabola, and from crossing lines theirs; 0 for unknown pixels."""
     return seen(values[:, None], known.astype(np.float64), None, crossing)[:, 0]
 
 
 def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
     """Return the sums of products of columns, [y, column, x], over blocks of rows: (block, columns of one, of two).
 
-    Where `one` is `seen`, the lines of `two` cancel, but only in whole rows.
+    Where `one` comes from `seen`, the lines of `two` cancel, but only in whole rows.
     """
     starts = np.arange(0, one.shape[0], min(max(one.shape[0] // BLOCKS, 2), BLOCK_ROWS))
     sums: Array = np.add.reduceat(one @ two.transpose(0, 2, 1), starts, axis=0, dtype=np.float64)
@@ -237,9 +234,9 @@ def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
-    """Return Q of white and 1/f noise, N(f) = a + b / f; None if it is as good as white (b W <= 0.3 a).
+    """Return Q of white and 1/f noise, N(f) = a + b / f; None if the noise is nearly white (b W <= 0.3 a).
 
-    N is fitted to the spectra of the rows of a residual (median over rows), as the filter has changed them.
+    N is fitted to the median spectrum of the rows of a residual, as changed by the filter.
     """
     from scipy.linalg import inv, toeplitz
     from scipy.optimize import nnls
@@ -272,26 +269,26 @@ Small = NDArray[np.float32]
 PATCH_PX, STEP_PX = 8, 4
 TINY = np.finfo(np.float32).tiny
 ENOUGH_PATCHES = 1500
-CERTAIN = 9.0  # times its noise power must a coefficient have to be kept for its own sake
+CERTAIN = 9.0  # times its noise power, from which a coefficient is kept on its own
 
 
 def denoised(image: Array, noise: Array) -> tuple[Array, Array]:
     """Shrink the coefficients of the cosine transforms of an image's patches by their noise.
 
-    Where a surface is flat its gradient is noise. Multiplied with the noise of the residual it blurs the estimate and
-    makes it look certain, the more the less of the image is edges; a bound knows the true gradient and has no such
-    term. Coefficients c of overlapping patches are shrunk by the larger of two gains: the garrote 1 - k N / c²
-    (Breiman, Technometrics 37, 373, 1995), which keeps features, and Wiener's S / (S + N), which keeps the texture that
-    all patches have in common. The power of noise N and texture S of each coefficient are medians over the patches, so
-    that rows, which have more noise across than along, and features are both allowed for.
+    Where a surface is flat its gradient is noise. Its product with the noise of the residual blurs the estimate and
+    makes it look certain, the more the fewer edges the image has; a bound with the true gradient has no such term.
+    Coefficients c of overlapping patches are shrunk by the larger of two gains: the garrote 1 - k N / c² (Breiman,
+    Technometrics 37, 373, 1995), which keeps features, and Wiener's S / (S + N), which keeps the texture common to all
+    patches. The power of noise N and texture S of each coefficient are medians over the patches; this allows for
+    features, and for rows, which have more noise across than along.
 
     Args:
-        noise: an image of noise alone, as strong as it is in `image`, but another.
+        noise: an image of independent noise, as strong as the noise in `image`.
 
     Returns:
-        The shrunk image, and its derivative in the direction of the noise: the product of that with the noise is, on
-        average, the product of the shrunk image with the noise that is in `image` (Stein, Ann. Stat. 9, 1135, 1981;
-        with a noise of one's own: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
+        The shrunk image, and its derivative in the direction of the noise. The product of the derivative with the noise
+        is on average the product of the shrunk image with the noise in `image` (Stein, Ann. Stat. 9, 1135, 1981; with
+        generated noise: Ramani, Blu and Unser, IEEE Trans. Image Process. 17, 1540, 2008).
     """
     c, n = _coefficients(image), _coefficients(noise)  # in 32 bits: half the time, and precise enough for a weight
     # patches without overlap hold as much information, and some of many are enough

@@ -1,10 +1,10 @@
-"""What displaces an image besides drift between two scans: averaged over what there may be of it.
+"""Nuisances that displace an image besides drift between two scans: averaged over plausible amounts.
 
-Where features are few, a shift looks much like a shear or like creep at the start of the lines, and a fit that leaves
-all of them free is less certain of the shift than need be: most scans have little of most of them. So the fit is made
-once with all of them free, and then reckoned again for each of some models of what there is. The results are averaged
-by how likely each model makes the images (Hoeting et al., Stat. Sci. 14, 382, 1999). The fit is linear about its end,
-so that takes no further look at the images.
+Where features are few, a shift looks much like a shear, or like creep at the start of the lines. A fit with all of them
+free is then less certain of the shift than necessary: most scans have little of most of them. So the fit is made once
+with all of them free, and then recomputed for each of some models of their size. The results are averaged, weighted by
+how likely each model makes the images (Hoeting et al., Stat. Sci. 14, 382, 1999). The fit is linear about its end, so
+this needs no further look at the images.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from afspm.plugins.drift.estimators.warp import CREEP, CREEP_PX, LINEAR
 Array = NDArray[np.float64]
 
 SHEARS: Final = (0.003, 0.01)
-"""By drift during the scans: pixels per pixel along y, where nothing is known of it."""
+"""Candidate shears by drift during the scans, pixels per pixel along y, for an unknown velocity."""
 CALIBRATIONS: Final = (0.0, 0.01)
 TURNS: Final = (0.0, 0.01)
 CREEP_AT: Final = ((0.6, None), (0.2, slice(0, len(CREEP_PX))), (0.2, slice(len(CREEP_PX), 2 * len(CREEP_PX))))
-"""How likely lines creep nowhere, at their left and at their right end."""
+"""Probabilities of creep nowhere, at the left and at the right end of lines."""
 CREEP_SD_PX: Final = 0.5  # of each part
-NONE: Final = 1e-3  # px, or px over ten: so little is nothing
+NONE: Final = 1e-3  # px, or px over ten: counts as zero
 
 
 @dataclass(frozen=True, eq=False)
 class Shear:
-    """Knowledge of the linear map by which drift during the scans shears one against the other.
+    """Prior of the linear map from drift during the scans, which shears one against the other.
 
     Attributes:
         aspect: height of a pixel over its width.
         mean: (2, 2), in pixels.
-        sds: of the displacement per length along y; one of them is right.
+        sds: candidate standard deviations of the displacement per length along y.
     """
 
     aspect: float = 1.0
@@ -49,9 +49,9 @@ def averaged(information: Array, pull: Array, precision: Array, shear: Shear) ->
     """Return theta and its covariance, averaged over the models of linear map and creep.
 
     Args:
-        information: (n, n), what the images tell of theta (see `warp.WarpedPair`): the logarithm of their likelihood is
+        information: (n, n) about theta from the images (see `warp.WarpedPair`): their log-likelihood is
             -theta' information theta / 2 + pull' theta.
-        pull: (n,); the mean of the prior of all but linear map and creep is in it already.
+        pull: (n,); includes the mean of the prior of all parameters but linear map and creep.
         precision: (n, n), the inverse covariance of that prior.
     """
     weights, priors = _models(precision, shear)

@@ -1,5 +1,7 @@
-"""The transform that most pairs of points agree on: RANSAC on least squares (paper, supporting information, "Drift
-Estimation"; Fischler and Bolles 1981)."""
+"""The transform that most pairs of points agree on: RANSAC with least squares.
+
+Sources: paper, supporting information, "Drift Estimation"; Fischler and Bolles 1981.
+"""
 
 from __future__ import annotations
 
@@ -29,14 +31,13 @@ class Transform:
         return mapped
 
     def shift_at(self, point: Array) -> Array:
-        """Return the displacement of one point."""
         moved: Array = self(point[None])[0] - point
         return moved
 
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """A transform and the pairs (n,) that agree with it: they lie within `radius` of it."""
+    """A transform, and the mask (n,) of the pairs within `radius` of it."""
 
     transform: Transform
     inlier: Mask
@@ -80,11 +81,11 @@ def _affine(a: Array, b: Array) -> Array | None:
 
 @dataclass(frozen=True)
 class Form:
-    """Which transforms are looked for.
+    """A family of transforms.
 
     Attributes:
-        pairs: how many determine one.
-        linear: least squares for its 2 x 2 part, of points about their means; None where they don't determine it.
+        pairs: number that determines a transform.
+        linear: least squares for the 2 x 2 part, from points about their means; None if they don't determine it.
     """
 
     pairs: int
@@ -100,8 +101,11 @@ FORMS = {
 
 
 def fitted(a: Array, b: Array, form: Form, bend_max: float) -> Transform | None:
-    """The transform of points `a` (n, 2) nearest to `b`, least squares. None where they don't determine one, or it
-    turns, scales or shears by more than `bend_max` (what drifts does not)."""
+    """Return the least-squares transform from points `a` to `b`, (n, 2) each.
+
+    None if the points don't determine it, or if it rotates, scales or shears by more than `bend_max`, as drift does
+    not.
+    """
     if len(a) < form.pairs:
         return None
     middle, shift = a.mean(axis=0), (b - a).mean(axis=0)
@@ -128,12 +132,14 @@ class Search:
     rng: np.random.Generator
 
     def among(self, a: Array, b: Array, radius: float) -> Consensus | None:
-        """The paper's steps: fit to a random few, see who agrees (squared error), fit to those, keep the better one,
-        end early when almost all agree.
+        """Return the best consensus among pairs, by the paper's steps.
+
+        Each step fits a random minimal sample, finds the agreeing pairs (squared error), fits these, and keeps the
+        better consensus. The search ends early when almost all pairs agree.
 
         Args:
             a, b: the pairs, (n, 2) each.
-            radius: how far a pair may lie from the transform.
+            radius: largest distance of an agreeing pair from the transform.
 
         Returns:
             None if no transform was found.
@@ -157,7 +163,7 @@ class Search:
 
 
 def consensus(a: Array, b: Array, transform: Transform | None, radius: float) -> Consensus | None:
-    """Return the pairs that agree with a transform."""
+    """Return the pairs that agree with a transform; None without a transform."""
     if transform is None:
         return None
     return Consensus(transform, _squares(a, b, transform) <= radius**2, radius)
@@ -166,8 +172,10 @@ def consensus(a: Array, b: Array, transform: Transform | None, radius: float) ->
 def tightened(
     a: Array, b: Array, start: Consensus, form: Form, *, least: float, most: float, bend_max: float
 ) -> Consensus:
-    """Fit to the pairs as near as most inliers: three robust standard deviations, from `least` to
-    `most`, until nothing changes. A wide radius lets mismatches in, and each of them pulls."""
+    """Refit to the nearest inliers until nothing changes: a wide radius lets mismatches in, and each of them pulls.
+
+    The radius is three robust standard deviations of the inliers, between `least` and `most`.
+    """
     best = start
     for _ in range(10):
         near = np.sqrt(_squares(a, b, best.transform)[best.inlier])
@@ -184,13 +192,13 @@ def tightened(
 
 
 def log10_false_alarms(pairs: int, inliers: int, sample: int, chance: float) -> float:
-    """Return how many consensuses as large are expected among pairs that have nothing in common, as a power of ten.
+    """Return log10 of the expected number of equally large consensuses among unrelated pairs.
 
     A contrario (Moisan and Stival 2004): (n - s) C(n, k) C(k, s) p^(k - s).
 
     Args:
         pairs, inliers, sample: n, k and s.
-        chance: p, that a wrong pair agrees with a transform.
+        chance: p, the probability that a wrong pair agrees with a transform.
     """
     if inliers <= sample:
         return math.inf
@@ -203,8 +211,11 @@ def log10_false_alarms(pairs: int, inliers: int, sample: int, chance: float) -> 
 
 
 def jackknife_covariance(a: Array, b: Array, block: NDArray[np.intp], form: Form, at: Array) -> Array | None:
-    """Covariance (2, 2) of the displacement at a point, from leaving out one block of pairs after the other: pairs of
-    one place err together, so they are left out together. None for fewer than 3 blocks, or if it can't be fitted."""
+    """Return the covariance (2, 2) of the displacement at a point, by leaving out one block of pairs in turn.
+
+    Pairs of one place have correlated errors, so they are left out together. None for fewer than 3 blocks, or if a fit
+    fails.
+    """
     blocks = np.unique(block)
     shifts = []
     for left_out in blocks:

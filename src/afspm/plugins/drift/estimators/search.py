@@ -18,7 +18,7 @@ from afspm.plugins.drift.registration import DriftScan, Prior
 Array = NDArray[np.float64]
 
 
-GATE = 25.0  # chi² of an expected shift, beyond which nothing is looked for
+GATE = 25.0  # chi² of an expected shift, the limit of the search
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class ExpectedShift:
         return float(off @ np.linalg.solve(self.covariance + covariance, off))
 
     def on_smaller(self, factor: int, offset_px: Array) -> ExpectedShift:
-        """Return the same on images with pixels `factor` times as large and centres moved apart by `offset_px`."""
+        """Return the expectation for images with pixels `factor` times as large and centres apart by `offset_px`."""
         mean: Array = (self.mean - offset_px) / factor
         return ExpectedShift(mean, self.covariance / factor**2 + 0.3 * np.eye(2))
 
@@ -58,8 +58,8 @@ class ExpectedShift:
 def shear_by_drift(prior: Prior | None, reference: DriftScan, scan: DriftScan) -> tuple[Array, float | None]:
     """Return the displacement of rows by drift, in m per m along the slow axis, and its standard deviation.
 
-    Drift displaces a row by v t, and t runs along the slow axis. The result is unknown (zero, None)
-    unless both scans have been taken alike: the prior knows the difference of two velocities, and that alone.
+    Drift displaces a row by v t, and t runs along the slow axis. The result is unknown (zero, None) unless both scans
+    have the same direction, angle and pace: the prior contains only the difference of their velocities.
     """
     nothing = np.zeros(2), None
     if prior is None or prior.velocity_sd_m_s is None or reference.upwards is None:
@@ -97,12 +97,16 @@ def candidates(scene: Scene, prior: ExpectedShift | None) -> list[Array]:
 
 
 class MaskedCorrelation:
-    """Normalised cross-correlation of two images of which parts are known, for all shifts at once (Padfield, IEEE
-    Trans. Image Process. 21, 2706, 2012)."""
+    """Normalised cross-correlation of two partly known images, for all shifts at once.
+
+    Source: Padfield, IEEE Trans. Image Process. 21, 2706, 2012.
+    """
 
     def __init__(self, known1: Mask, known2: Mask, reach_px: int | None = None):
-        """Args:
-        reach_px: of the largest shift, for images of one shape; None: as long as they overlap.
+        """Prepare the parts that depend only on the masks.
+
+        Args:
+            reach_px: largest shift, for images of one shape; None: any shift with overlap.
         """
         from scipy.fft import next_fast_len, rfft2
 
@@ -193,7 +197,7 @@ class Scorer:
         ]
 
     def best(self, shifts: list[Array]) -> tuple[Scored, float] | None:
-        """Return the likeliest shift and the likelihood of the best rival; None if all overlap too little."""
+        """Return the likeliest shift and the likelihood of the best rival; None if no shift has enough overlap."""
         scored = [s for s in map(self._score, shifts) if s is not None]
         if not scored:
             return None

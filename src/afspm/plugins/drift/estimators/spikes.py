@@ -1,8 +1,8 @@
-"""Spikes and scars: pixels and stretches of rows that stand out in one of two scans, and not in the other.
+"""Spikes and scars: pixels and stretches of rows that stand out in only one of two scans.
 
-A filter would smear them over features, and the fit would take their edges for the sample's. In one image a spike and
-the top of a small particle look alike, and on a rough surface most scars are lower than what lies beside them. The
-difference of both images shows what one of them has alone.
+A filter would smear them over features, and the fit would take their edges for edges of the sample. In one image a
+spike looks like the top of a small particle, and on a rough surface most scars are lower than their surroundings. Only
+the difference of both images separates them.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ Index = NDArray[np.intp]
 
 SPIKE_PX = 2  # along its row
 LEAST_SD = 6.0  # above both neighbours, or below both, in standard deviations of the steps along the rows
-OTHER = 0.5  # how much of that the other scan has, at most
+OTHER = 0.5  # largest share of that in the other scan
 LEAST_SHARED = 0.1  # of a row, for it to be compared
 
 
 SCAR_ROWS = 3
 SCAR_SD = 3.0  # above the rows on both sides of it, or below, in the difference of the scans
-OWN = 0.6  # how much of that the scan itself has, at least: else the scar is in the other one, or an edge
+OWN = 0.6  # least share of that in the scan itself: else the scar is in the other scan, or is an edge
 
 
 def without_scars_of_one(scene: Scene, theta: Array) -> Scene:
-    """Return two images without the scars that one of them has alone; what stands in for them is marked as made up.
+    """Return two images without the scars that only one of them has; the replaced pixels are marked as made up.
 
     Args:
-        theta: how they are displaced, to a fraction of a pixel; see `warp.WarpedPair`.
+        theta: the displacement, to a fraction of a pixel; see `warp.WarpedPair`.
     """
     first, second = scene.first, scene.second
     return Scene(_unscarred(first, second, theta), _unscarred(second, first, -theta))
@@ -80,10 +80,10 @@ def _along(values: Array) -> Array:
 
 
 def without_spikes(scene: Scene, theta: Array) -> Scene:
-    """Return two images with the mean of its neighbours in the row in place of a spike.
+    """Return two images with each spike replaced by the mean of its neighbours in the row.
 
     Args:
-        theta: how they are displaced, to a pixel; see `warp.WarpedPair`.
+        theta: the displacement, to a pixel; see `warp.WarpedPair`.
     """
     first, second = scene.first, scene.second
     return Scene(_mended(first, second, theta), _mended(second, first, -theta))

@@ -39,7 +39,7 @@ class Spline:
         return cls(spline_filter(values, mode="mirror"), inner)
 
     def at(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """Return values at points, and where they are known."""
+        """Return values at points, and the mask of the known ones."""
         from scipy.ndimage import map_coordinates
 
         ny, nx = self.coefficients.shape
@@ -52,7 +52,7 @@ class Spline:
         return values, known
 
     def on_grid(self, x: Array, y: Array) -> tuple[Array, Mask]:
-        """Return the same on a grid of one pixel with axes x and y, much faster: row by row and column by column."""
+        """Return `at` for a grid of one pixel with axes x and y; much faster, by rows and columns."""
         values, known = self.coefficients, np.ones((y.size, x.size), dtype=bool)
         picked = []
         for axis, at in enumerate((y, x)):
@@ -94,7 +94,7 @@ def _mirrored(index: NDArray[np.intp], size: int) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class OverlapBox:
-    """The pixels of the mid grid, (x, y) from the centres: the rectangle in which two shifted images overlap."""
+    """The rectangle of the mid grid in which two shifted images overlap: pixels (x, y) from the centres."""
 
     x: Array
     y: Array
@@ -120,12 +120,11 @@ class OverlapBox:
 
     @property
     def center(self) -> Array:
-        """Centre, (2,)."""
         return np.array([self.x.mean(), self.y.mean()])
 
 
-LEAST_SEARCHED_PX = 32  # of a side of the smaller image: the rest of a smaller one may be too little to compare
-CREEP_PX = (4.0, 9.0)  # within which what a line starts with is gone to 1/e
+LEAST_SEARCHED_PX = 32  # least side of the decimated smaller image: less may be too little to compare
+CREEP_PX = (4.0, 9.0)  # lengths over which creep at the start of a line decays to 1/e
 LINEAR = slice(2, 6)  # the linear map among the parameters theta of a pair
 CREEP = slice(6, 6 + 2 * len(CREEP_PX))  # from the left and from the right, for each length
 SLOPES = CREEP.stop  # the first of them: they act through the gradient
@@ -137,15 +136,15 @@ class WarpedPair:
     """Two images on a box.
 
     Parameters are theta = (ux, uy, axx, axy, ayx, ayy, c.., g, h): shift u px and linear map A about the centre of the
-    box, d(q) = u + A (q - centre); how far lines creep at their start, in pixels of their own scan, the same in both;
-    logarithm g of the gain of the second over the first, and h, by how much more the second is bent (heights z appear
-    as z + h z² / 2: feedback and tip do that to edges).
+    box, d(q) = u + A (q - centre); creep c at the start of the lines, in pixels of their own scan, the same in both;
+    logarithm g of the gain of the second over the first; and excess curvature h of the second (heights z appear as
+    z + h z² / 2: feedback and tip do that to edges).
 
     Attributes:
-        shift_px: (2,) about u: the distance between the starts of the lines of both on the box.
-        own_px: width of a pixel of each scan, in pixels of the grid: lines creep for some of their own pixels, which in
-            a zoom is next to nothing. 0: its lines don't lie along the rows of the grid, so there is no model.
-        crossing: the lines of the second scan, where they don't.
+        shift_px: (2,) near u: the distance between the starts of the lines of both on the box.
+        own_px: width of a pixel of each scan, in pixels of the grid. Lines creep for some of their own pixels, which is
+            next to nothing for a zoom. 0: its lines don't lie along the rows of the grid, so creep has no model.
+        crossing: the lines of the second scan, if they don't lie along the rows.
     """
 
     first: Spline
@@ -156,10 +155,10 @@ class WarpedPair:
     crossing: CrossingLines | None = None
 
     def warped(self, theta: Array) -> tuple[Array, Array, Mask]:
-        """Return I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and where both are known.
+        """Return I1(q - d/2) and I2(q + d/2), each with half of the other's contrast, and the mask known in both.
 
-        Both are moved by half: so both carry equal interpolation noise, the gradient of their mean is not correlated
-        with the noise of their difference, and the shift is not pulled towards whole pixels.
+        Moving both by half gives both equal interpolation noise. So the gradient of their mean is not correlated with
+        the noise of their difference, and the shift is not pulled towards whole pixels.
         """
         if theta[2:SLOPES].any():
             (one, known1), (two, known2) = self._both(theta)
@@ -202,7 +201,7 @@ class WarpedPair:
     ) -> Columns:
         """Return the derivatives of the residual by the free part of theta, and the residual, [y, column, x].
 
-        They have 32 bits: their products take most of the time and are exact to a millionth.
+        They have 32 bits: their products take most of the time, and are exact to a millionth.
         """
         by = (*self._by_slopes(gx, gy), -mean, (mean, -mean / 2))
         return np.stack([*(_product(by[i]) for i in free), residual], axis=1, dtype=np.float32)
@@ -221,13 +220,13 @@ def _product(column: Array | tuple[Array, Array]) -> Array:
     return column[0] * column[1] if isinstance(column, tuple) else column
 
 
-NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # of a neighbour, less the one opposite
+NINE_POINTS = (672.0 / 840.0, -168.0 / 840.0, 32.0 / 840.0, -3.0 / 840.0)  # on the difference of opposite neighbours
 
 
 def derivative(values: Array, axis: int) -> Array:
     """Return the derivative per pixel, from nine points.
 
-    With five points waves of less than six pixels weighed too little. The image is continued linearly beyond its
+    Five points give waves of less than six pixels too little weight. The image is continued linearly beyond its
     borders.
     """
 
@@ -274,7 +273,7 @@ class Scene:
         return self.splines(self.band)
 
     def splines(self, values: Both) -> tuple[Spline, Spline]:
-        """Return splines of values known where the images are."""
+        """Return splines of values, with the masks of the images."""
         one, two = (
             Spline.of(each, image.known, image.made_up)
             for each, image in zip(values, (self.first, self.second), strict=True)
@@ -287,7 +286,7 @@ class Scene:
 
     @property
     def least_known(self) -> int:
-        """Number of known pixels, of the image with fewer."""
+        """Number of known pixels of the image with fewer."""
         return min(int(self.first.known.sum()), int(self.second.known.sum()))
 
     def _filtered(self, sigma_px: float) -> Both:

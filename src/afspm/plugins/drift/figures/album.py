@@ -1,4 +1,4 @@
-"""All figures of a run into a folder."""
+"""Writes all figures of a run into a folder."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ _PAIRS = 2
 
 @dataclass(frozen=True, eq=False)
 class RunPart:
-    """Some scans of a run, one after the other: those before or after drift correction was switched on.
+    """Consecutive scans of a run, before or after drift correction was switched on.
 
     Attributes:
-        name: what becomes of it in a file's name, e.g. "on".
+        name: part of a file's name, e.g. "on".
         title: e.g. "correction on".
         start, stop: indices of its scans.
-        estimates: off-line, of each against the first of the part; None where they were not made.
+        estimates: off-line registrations of each scan with the first of the part; None where there are none.
     """
 
     name: str
@@ -55,8 +55,8 @@ class DriftRun:
     Attributes:
         scans: in the order of time.
         record: of the tracker.
-        parts: one after the other.
-        matched: a registration of two scans (indices) that rests on features, if there is one.
+        parts: in the order of time.
+        matched: a registration of two scans (indices) with matched features, if there is one.
         truth_m: (n, 2) true drift, where it is known.
     """
 
@@ -68,12 +68,12 @@ class DriftRun:
 
     @property
     def switched_on_s(self) -> float | None:
-        """Time at which correction was switched on, the start of the second of two parts."""
+        """Time at which correction was switched on: the start of the second of two parts."""
         return float(self.record.time_s[self.parts[1].start]) if len(self.parts) > 1 else None
 
 
 def write(run: DriftRun, folder: Path, *, title: str = "") -> list[Path]:
-    """Write what can be drawn of it; returns the files."""
+    """Write all figures for which there is material, and return the files."""
     written = []
     for name, made in _figures(run, title):
         path = folder / f"drift_{name}.png"

@@ -1,4 +1,4 @@
-"""The figures of drift: one function each, which returns a matplotlib figure."""
+"""The figures of drift: one function for each matplotlib figure."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from afspm.plugins.drift.registration import DriftScan, Matches
 def draw_offsets(
     record: DriftRecord, *, truth_m: Array | None = None, switched_on_s: float | None = None, title: str = ""
 ) -> Figure:
-    """As in the paper's experiment: how far the sample has come, and how its velocity changes.
+    """Draw the displacement of the sample and its change over time, as in the paper's experiment.
 
     Args:
         record: of the run.
@@ -82,10 +82,11 @@ _PAIR_INCHES = 2.2
 
 @dataclass(frozen=True, eq=False)
 class ScanPair:
-    """Two scans, and by how much the features lie elsewhere within the second.
+    """Two scans, with the displacement of features from the first to the second.
 
     Attributes:
-        moved_m: (2,) in the frame of the image: where a feature of the first is in the second, minus where it was.
+        moved_m: (2,) in the frame of the image: position of a feature in the second scan, minus its position in the
+            first.
         title: e.g. "correction off".
     """
 
@@ -96,7 +97,10 @@ class ScanPair:
 
 
 def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
-    """A row of two scans for each pair, in their own frames, with the arrow in the second."""
+    """Draw each pair as a row of two scans, with the displacement as an arrow in the second.
+
+    Scans are shown in their own frames.
+    """
     with styled():
         made = figure(2 * _PAIR_INCHES, (_PAIR_INCHES + 0.15) * len(pairs))
         for row, pair in zip(made.subplots(len(pairs), 2, squeeze=False), pairs, strict=True):
@@ -122,10 +126,10 @@ def _arrow(ax: Axes, pair: ScanPair) -> None:
 
 
 def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | None = None) -> Figure:
-    """Draw how far the features lie from where they were in the first scan, against time.
+    """Draw the displacement of features from their place in the first scan, against time.
 
     Args:
-        record: of the pairs; `matched` says which were accepted.
+        record: of the pairs; `matched` marks the accepted ones.
         truth_m: (n, 2) true values, where known.
     """
     with styled():
@@ -172,7 +176,7 @@ _MOST_BINS = 100
 
 
 def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
-    """Of x, of y and of the distance, for the pairs that were accepted (the first scan itself left out)."""
+    """Draw histograms of x, y and distance for the accepted pairs, without the first scan itself."""
     moved = record.misplacement_m[1:][record.matched[1:]]
     with styled():
         made = figure(WIDTH_IN, 2.2)
@@ -190,8 +194,11 @@ def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
 
 
 def freedman_diaconis(values: Array) -> Array:
-    """Edges of bins as wide as 2 IQR n^(-1/3), which makes the histogram close to the density in the mean square (D.
-    Freedman, P. Diaconis, Z. Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981). One bin where all are alike."""
+    """Return edges of bins as wide as 2 IQR n^(-1/3), or of one bin if all values are equal.
+
+    This width makes the histogram close to the density in the mean square (D. Freedman, P. Diaconis, Z.
+    Wahrscheinlichkeitstheorie verw. Gebiete 57, 453, 1981).
+    """
     low, high = float(values.min()), float(values.max())
     quarter, three_quarters = np.percentile(values, (25, 75))
     width = 2.0 * (three_quarters - quarter) / len(values) ** (1 / 3)
@@ -215,10 +222,10 @@ _INCHES = 2.6
 
 
 def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None) -> Figure:
-    """a: both scans with the matched keypoints in orange; b: the pairs joined, inliers in colour, outliers dotted.
+    """Draw both scans twice: (a) with the matched keypoints; (b) with matches joined, outliers dotted.
 
     Raises:
-        InvalidValue: an estimator that matches no features.
+        InvalidValue: the estimator matches no features.
     """
     if matches is None:
         raise InvalidValue("this estimator uses no features", hint='e.g. estimator "brief"')
@@ -230,7 +237,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
                 show_scan(ax, one)
                 ax.set_xlabel("x / µm")
             row[0].set_ylabel("y / µm")
-            row[1].set_yticklabels([])  # the lines come across
+            row[1].set_yticklabels([])  # the lines between the scans cross them
         points = [_in_frame(one, at) for one, at in ((reference, matches.reference_m), (scan, matches.scan_m))]
         for ax, at in zip(rows[0], points, strict=True):
             ax.plot(at[:, 0], at[:, 1], "o", markersize=4, markerfacecolor="none", markeredgecolor=ORANGE)
@@ -244,7 +251,7 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
 
 
 def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
-    # positions in the frame before it is turned, µm
+    # positions in the frame before rotation, µm
     angle = scan.region.angle_rad
     cos, sin = np.cos(angle), np.sin(angle)
     center = np.asarray(scan.region.center_m)
@@ -253,7 +260,7 @@ def _in_frame(scan: DriftScan, xy_m: Array) -> Array:
 
 
 def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool_], colours: str | None) -> None:
-    # of many lines some are drawn, evenly chosen: all would hide the scans
+    # an even selection of lines: too many would hide the scans
     from matplotlib import colormaps
 
     chosen = np.flatnonzero(which)
@@ -271,7 +278,9 @@ def _join(made: Figure, axes: Array, points: list[Array], which: NDArray[np.bool
 
 
 def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | None = None) -> Figure:
-    """a: how far off the place of the first scan each was taken; b: what was known after it, minus the truth.
+    """Draw two errors against time: (a) the misplacement of each scan; (b) the estimated minus the true drift.
+
+    The misplacement is the distance on the sample from the place of the first scan.
 
     Args:
         record: of the run.
@@ -297,7 +306,7 @@ def draw_errors(record: DriftRecord, truth_m: Array, *, switched_on_s: float | N
 
 def _misplaced(ax: Axes, off_m: Array, hours: Array) -> None:
     distance_m = np.hypot(*off_m.T)
-    distance_m[distance_m == 0.0] = np.nan  # the zero of the first scan has no place on a logarithmic axis
+    distance_m[distance_m == 0.0] = np.nan  # a logarithmic axis has no place for the first scan's zero
     ax.semilogy(hours, distance_m * 1e9, "o-", color="black", markersize=2.5, linewidth=0.6)
     ax.set_ylabel("position error of the scan / nm")
 
@@ -306,7 +315,7 @@ def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
     error_m = record.drift_m - record.drift_m[:1] - truth_m
     unit, factor = unit_of(error_m)
     for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
-        sd = record.sd_m[1:, axis] * factor  # the first is what displacements are counted from
+        sd = record.sd_m[1:, axis] * factor  # displacements are counted from the first scan
         ax.fill_between(hours[1:], -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
         ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, believed - true")
     ax.axhline(0.0, color=GREY, linewidth=0.4)

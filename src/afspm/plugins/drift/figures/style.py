@@ -1,4 +1,4 @@
-"""The style of the figures: sizes, colours that everybody can tell apart, units on the axes."""
+"""The style of the figures: sizes, colours safe for colour-blind readers, units on the axes."""
 
 from __future__ import annotations
 
@@ -41,37 +41,36 @@ _STYLE: Plain = {
 
 
 def styled() -> Any:
-    """Return the context for making a figure in afspm's style instead of the user's."""
+    """Return a context for afspm's figure style, independent of the user's."""
     return matplotlib.style.context(["default", _STYLE])
 
 
 def figure(width_in: float, height_in: float) -> Figure:
-    """An empty figure that needs no screen."""
+    """Return an empty figure that needs no screen."""
     made = Figure(figsize=(width_in, height_in), facecolor="white", layout=LAYOUT)
     FigureCanvasAgg(made)
     return made
 
 
 def save(made: Figure, path: Path) -> None:
-    """Write a figure as the ending of the file says."""
+    """Write a figure in the format of the file's suffix."""
     made.savefig(path, dpi=DPI)
 
 
 def unit_of(*lengths_m: Array | float) -> tuple[str, float]:
-    """In which unit lengths of this size are best read, and the factor from metres to it."""
+    """Return the unit in which these lengths read best, and the factor from metres to this unit."""
     finite = [np.abs(np.asarray(a, dtype=np.float64)[np.isfinite(a)]) for a in lengths_m]
     largest = max((float(a.max()) for a in finite if a.size), default=0.0)
     return next((unit, factor) for below, unit, factor in _UNITS if largest < 2 * below)
 
 
 def time_axis(ax: Axes, *, label: bool = True) -> None:
-    """Hours."""
     ax.set_xlabel("time / h" if label else "")
     ax.margins(x=0.02)
 
 
 def show_scan(ax: Axes, scan: DriftScan) -> None:
-    """A scan in grey, levelled by the differences of its lines, in µm of its own frame (before it is turned)."""
+    """Show a scan in grey, levelled line by line, in µm of its own frame (before rotation)."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
     level = flattened(scan.values)
@@ -86,5 +85,4 @@ def show_scan(ax: Axes, scan: DriftScan) -> None:
 
 
 def letter(ax: Axes, text: str) -> None:
-    """Names a part of a figure."""
     ax.set_title(text, loc="left", weight="bold", size=9)

@@ -1,7 +1,7 @@
 """The worker's task: register scans one after the other, and remember the last answers.
 
-A scan that it is asked for again, since it or the scheduler was killed, is answered from memory: no tracker may take a
-scan twice, and no scan has two mappings.
+After a kill of worker or scheduler the same scan may be requested again. It is answered from memory: no tracker may
+take a scan twice, and no scan has two mappings.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Estimation:
 
     Args:
         save: keeps the state on disk, before it is published.
-        failures: to which the tracker's estimator adds its errors; they are taken from it scan by scan.
+        failures: the list to which the tracker's estimator adds its errors; it is emptied before each scan.
     """
 
     def __init__(
@@ -45,11 +45,15 @@ class Estimation:
 
     @property
     def forecast(self) -> Plain | None:
-        """Of what is known now; None before the first scan."""
+        """The tracker's forecast as plain JSON; None before the first scan."""
         return self._tracker.forecast.to_dict() if self._answers else None
 
     def restore(self, state: Plain) -> None:
-        """Take up what was saved. Raises InvalidValue, KeyError or TypeError if it is of something else."""
+        """Restore a saved state.
+
+        Raises:
+            InvalidValue, KeyError, TypeError: the state belongs to another tracker or version.
+        """
         self._tracker.restore(state["tracker"])
         self._answers = OrderedDict((one["key"], Registered(**one)) for one in state["answers"])
 
@@ -58,10 +62,10 @@ class Estimation:
 
         Args:
             key: of the scan; its name for people is `scan.key`.
-            asked: the region that was meant, in sample coordinates.
+            asked: the requested region, in sample coordinates.
 
         Raises:
-            AfspmError: the tracker does not take it.
+            AfspmError: the tracker refuses the scan.
         """
         known = self._answers.get(key)
         if known is not None:
@@ -75,10 +79,10 @@ class Estimation:
         return answer
 
     def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        """From that time on the controller moves the tip along.
+        """Note that the controller moves the tip with this velocity from `time_s` on.
 
         Raises:
-            ConfigError: the tracker does not reckon with that.
+            ConfigError: the tracker can't take this into account.
         """
         told = getattr(self._tracker, "compensated", None)
         if told is None:
@@ -113,10 +117,7 @@ class Estimation:
 
 
 def _why_again(rule: RescanRule, scan: DriftScan, asked: Region | None, update: Update) -> str:
-    """Why a scan lies too far from where it was asked for; empty if it does not.
-
-    Nothing was known before the first scan, and nothing is found where it was not matched.
-    """
+    # before the first scan nothing was predicted, and an unmatched scan has no measured position
     if rule.rule == "never" or asked is None or not update.registrations or not update.matched or update.lost:
         return ""
     scanned = update.after.mapping.to_sample(scan.region)

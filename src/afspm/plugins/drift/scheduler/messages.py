@@ -1,4 +1,4 @@
-"""Messages about drift: jobs and reports of the worker, and wishes to components."""
+"""Messages about drift: jobs and reports of the worker, and requests for rescans."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class Registered:
         matrix: 3 x 3, of the mapping then.
         covariance_m2, rate_m_s, rate_covariance: see `drift.tracking.Prediction`; empty where nothing is known.
         outcome, lost, reason: see `drift.tracking.Update`.
-        residual_m: (x, y) by which the sample was found elsewhere than predicted.
-        references: names of the scans that it was compared with.
-        rescan: why it should be taken again; empty if not.
-        forecast: of what is known now, for `forecast_from_dict`; None: unchanged.
-        failures: the errors of the estimator over this scan, each with its pair.
+        residual_m: (x, y) measured minus predicted position of the sample.
+        references: names of the scans with which it was registered.
+        rescan: the reason for a rescan; empty if none is needed.
+        forecast: the new forecast, for `forecast_from_dict`; None: unchanged.
+        failures: the errors of the estimator with this scan, each with its pair.
     """
 
     key: str
@@ -48,7 +48,7 @@ class Registered:
     failures: list[str]
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # out of a file it is a number
+        object.__setattr__(self, "outcome", RegistrationOutcome(self.outcome))  # a saved state has it as a number
 
     @property
     def matched(self) -> bool:
@@ -69,14 +69,14 @@ class Registered:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """The worker runs, or knows something new without a scan."""
+    """The worker runs, or has a new forecast without a scan."""
 
     forecast: Plain | None
 
 
 @dataclass(frozen=True)
 class NotRegistered:
-    """A scan could not be looked at at all."""
+    """The worker could not process a scan at all."""
 
     key: str
     reason: str
@@ -94,12 +94,12 @@ WorkerReport = Registered | Forecasted | NotRegistered | WorkerGone
 
 @dataclass(frozen=True)
 class ScanJob:
-    """A scan to be registered; its region is in tip coordinates.
+    """A scan to register; its region is in tip coordinates.
 
     Attributes:
         start_s, end_s: experiment time.
         upwards: direction of the slow axis; None: not known.
-        asked: the region that was meant, in sample coordinates; None: not known.
+        asked: the requested region, in sample coordinates; None: not known.
     """
 
     key: str
@@ -112,33 +112,33 @@ class ScanJob:
 
 @dataclass(frozen=True)
 class StartWorker:
-    """Start the worker; one that runs is killed, and its job forgotten."""
+    """Start the worker; a running worker is killed, and its job forgotten."""
 
 
 @dataclass(frozen=True)
 class Compensated:
-    """From that time on the controller moves the tip along with this velocity."""
+    """The controller moves the tip with this velocity from this time on."""
 
     time_s: float
     velocity_m_s: tuple[float, float]
 
 
 WorkerJob = StartWorker | ScanJob | Compensated
-"""Jobs for the worker. A scan may come twice: then it is answered as the first time."""
+"""Jobs for the worker. A repeated scan gets the first answer."""
 
 
 @dataclass(frozen=True)
 class RescanWanted:
-    """A wish to the Rescanner.
+    """A request to the Rescanner.
 
     Attributes:
-        said: the ScanParameters2d of the region, in the coordinates of components.
-        shape: (rows, columns); None: what is set.
-        upwards: the direction wanted; None: any.
+        requested: the ScanParameters2d of the region, in the coordinates of components.
+        shape: (rows, columns); None: the shape in force.
+        upwards: the direction to scan; None: any.
     """
 
     kind: RescanKind
-    said: bytes
+    requested: bytes
     shape: tuple[int, int] | None
     reason: str
     time_ns: int
@@ -146,10 +146,10 @@ class RescanWanted:
 
 
 class DriftCodec(PlaceCodec, Protocol):
-    """The wire as far as drift compensation needs it."""
+    """The part of the wire format that drift compensation needs."""
 
     def encode_mapping(self, registered: Registered, filename: str, center_m: XY, *, correcting: bool) -> bytes:
         """Return a DriftMapping as the payload of a packet, for a scan with this file and centre at the tip."""
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
-        """A DriftRescan as the payload of a packet."""
+        """Return a DriftRescan as the payload of a packet."""

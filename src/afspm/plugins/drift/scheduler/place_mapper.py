@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from afspm.basics.errors import AfspmError, InvalidValue
+from afspm.basics.formatting import position_text
 from afspm.model import (
     ControlRequest,
     ControlResponse,
@@ -30,8 +31,8 @@ from afspm.plugins.drift.scheduler.positions import (
     PositionPair,
     TargetPosition,
     away_m,
+    in_reported_unit,
     is_same,
-    told_as,
     value_in,
 )
 from afspm.plugins.drift.scheduler.scan_timing import ScanDurations
@@ -40,9 +41,9 @@ from afspm.scheduler.safety.parameter_values import number_of
 from afspm.wire.messages import PROBE_POSITION, SCAN_LINES, SCAN_PARAMETERS, SPECTRUM
 
 MOVES_PX = 0.01
-"""A region that lies this far off in the tip's coordinates is set again before it is scanned."""
+"""A region further off in tip coordinates is set again before its scan."""
 MOVES_M = 1e-11
-"""The same of the probe: finer than any scanner positions it."""
+"""The same bound for the probe: finer than any scanner's positioning."""
 
 _REMEMBERED = 64
 _SET_SCAN, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
@@ -57,13 +58,13 @@ MappingAt = Callable[[float], Mapping | None]
 class SavedPlace:
     """A `PositionPair` as its two messages."""
 
-    said: bytes
+    requested: bytes
     sent: bytes
 
 
 @dataclass(frozen=True)
 class MappedBefore:
-    """The mapped form of a request with an id, which is sent again as it was."""
+    """The mapped form of a request with an id: a repeated request is sent unchanged."""
 
     kind: int
     place: SavedPlace
@@ -72,7 +73,7 @@ class MappedBefore:
 
 @dataclass(frozen=True)
 class Places:
-    """The scan and the probe in force at the microscope, in both coordinates.
+    """The scan region and probe position in force at the microscope, in both coordinates.
 
     Attributes:
         shape: (rows, columns) in force; None: not known.
@@ -102,13 +103,13 @@ class SavedPlaces:
     @classmethod
     def of(cls, places: Places) -> SavedPlaces:
         region, probe = (
-            None if one is None else SavedPlace(one.said, one.sent)
+            None if one is None else SavedPlace(one.requested, one.sent)
             for one in (places.region.current, places.probe.current)
         )
         return cls(region, probe, places.shape, places.upwards, places.durations, places.remembered)
 
     def restored(self, codec: PlaceCodec) -> Places:
-        """Raises ValueError: a place can't be read."""
+        """Return the places. Raises ValueError for an unreadable place."""
         region = None if self.region is None else _place(codec, _SET_SCAN, self.region)
         probe = None if self.probe is None else _place(codec, _SET_PROBE, self.probe)
         return Places(
@@ -124,7 +125,7 @@ class PlaceMapper:
     """One step of mapping in progress: the places so far.
 
     Args:
-        mapping_at: by what is known of the drift now.
+        mapping_at: from the current forecast of drift.
     """
 
     region: TargetPosition[Region]
@@ -140,7 +141,6 @@ class PlaceMapper:
         self._mapping_at = mapping_at
 
     def finish(self) -> Places:
-        """Return the places after the step."""
         return Places(**{name: self.__dict__[name] for name in _PARTS})
 
     # --- requests ---
@@ -150,8 +150,8 @@ class PlaceMapper:
         if isinstance(place, Region):
             if (known := self.region.published(place)) is None:
                 region = place if mapping is None else mapping.to_sample(place)
-                said, sent = (self._codec.encode(ScanParameters(one)) for one in (region, place))
-                known = self.region.at(PositionPair(region, said, place, sent))
+                requested, sent = (self._codec.encode(ScanParameters(one)) for one in (region, place))
+                known = self.region.at(PositionPair(region, requested, place, sent))
             self.region = known
             return
         if (known_probe := self.probe.published(place)) is None:
@@ -182,23 +182,23 @@ class PlaceMapper:
         return self._mapped(key, request, sample, now_s)
 
     def _mapped(self, key: str, request: Request, sample: Region | ProbePosition, now_s: float) -> MappedRequest:
-        """Map a place as a whole, whatever part of it was asked for, and remember what comes of it."""
+        # a request for a part of a place (its x, its width) becomes the whole place: rotation mixes the parts
         kind, asked = (_SET_SCAN if isinstance(sample, Region) else _SET_PROBE), request.subject
         rest = asked if isinstance(asked, ScanParameters) else ScanParameters()
         is_whole = isinstance(asked, ProbePosition) or isinstance(rest.region, Region)
         place, subject = self._to_tip(sample, request.payload if is_whole else None, rest, now_s)
         payload = self._codec.encode(subject)
         if request.id:
-            newest = MappedBefore(kind, SavedPlace(place.said, place.sent), payload)
+            newest = MappedBefore(kind, SavedPlace(place.requested, place.sent), payload)
             self.remembered = dict([*self.remembered.items(), (key, newest)][-_REMEMBERED:])
-        return MappedRequest(Request(kind, subject, payload, request.id), _names(asked), _said(place))
+        return MappedRequest(Request(kind, subject, payload, request.id), _names(asked), _both_places(place))
 
     def _again(self, known: MappedBefore, request: Request) -> MappedRequest:
         place = _place(self._codec, known.kind, known.place)
         self._sending(place)
         subject = self._codec.decode_packet(_MESSAGES[known.kind], known.payload)
         return MappedRequest(
-            Request(known.kind, subject, known.payload, request.id), _names(request.subject), _said(place)
+            Request(known.kind, subject, known.payload, request.id), _names(request.subject), _both_places(place)
         )
 
     def _sending(self, place: PositionPair[Any]) -> None:
@@ -221,12 +221,12 @@ class PlaceMapper:
         there = self._tip_of(here.sample, now_s)
         if away_m(there, here.tip) <= self._tolerance_m(here.tip):
             return None
-        place, subject = self._to_tip(here.sample, here.said, ScanParameters(), now_s)
+        place, subject = self._to_tip(here.sample, here.requested, ScanParameters(), now_s)
         kind = _SET_SCAN if isinstance(place.tip, Region) else _SET_PROBE
-        return MappedRequest(Request(kind, subject, place.sent), (), _said(place))
+        return MappedRequest(Request(kind, subject, place.sent), (), _both_places(place))
 
     def _tip_of(self, sample: Region | ProbePosition, now_s: float) -> Any:
-        """Where the tip must be: for a scan that begins now at its middle, for the probe now."""
+        # a scan that begins now is placed for its middle, the probe for now
         middle_s = now_s
         if isinstance(sample, Region):
             middle_s += self.durations.expected_s(self.shape, sample.size_m) / 2
@@ -237,19 +237,18 @@ class PlaceMapper:
         return ProbePosition((float(x), float(y)))
 
     def _to_tip(
-        self, sample: Region | ProbePosition, said: bytes | None, rest: ScanParameters, now_s: float
+        self, sample: Region | ProbePosition, requested: bytes | None, rest: ScanParameters, now_s: float
     ) -> tuple[PositionPair[Any], object]:
-        """The place in both coordinates, and what the microscope is to be sent for it."""
         tip = self._tip_of(sample, now_s)
         if isinstance(sample, Region):
             subject: object = ScanParameters(tip, rest.shape, rest.unit)
-            if said is None:
-                said = self._codec.encode(ScanParameters(sample))
-            region_place = PositionPair(sample, said, tip, self._codec.encode(subject))
+            if requested is None:
+                requested = self._codec.encode(ScanParameters(sample))
+            region_place = PositionPair(sample, requested, tip, self._codec.encode(subject))
             self._sending(region_place)
             return region_place, subject
-        said = self._codec.encode(sample) if said is None else said
-        probe_place = PositionPair(sample, said, tip, self._codec.encode(tip))
+        requested = self._codec.encode(sample) if requested is None else requested
+        probe_place = PositionPair(sample, requested, tip, self._codec.encode(tip))
         self._sending(probe_place)
         return probe_place, tip
 
@@ -300,15 +299,14 @@ class PlaceMapper:
         if mapping is None or not isinstance(subject, Parameter) or _place_of(asked) is None:
             return None
         if subject.value is not None:
-            return subject  # set as a part of the whole place, about which no value came back
+            return subject  # set with the whole place, whose answer has no value
         tip_value = None if told is None else number_of(told)
         if tip_value is None:
             return None
         sample_value = self._in_sample(subject.name, tip_value, mapping)
-        return None if sample_value is None else told_as(subject.name, sample_value, told)
+        return None if sample_value is None else in_reported_unit(subject.name, sample_value, told)
 
     def _in_sample(self, name: str, tip_value: float, mapping: Mapping) -> float | None:
-        """A part of the place in force, from what the microscope tells of it."""
         if name in PROBE_CHANGES:
             position = self.probe.current
             if position is None:
@@ -324,7 +322,7 @@ class PlaceMapper:
             return None
         try:
             tip = REGION_CHANGES[name](tip_value).onto(region.tip)
-        except InvalidValue:  # the microscope tells what is no frame: that is told as it is
+        except InvalidValue:  # the microscope reports no valid region: its value is passed on unchanged
             return None
         return value_in(name, region.sample if is_same(tip, region.tip) else mapping.to_sample(tip))
 
@@ -332,10 +330,10 @@ class PlaceMapper:
 
     def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> Packet:
         handler = {
-            SCAN_PARAMETERS.name: self._region_told,
-            PROBE_POSITION.name: self._probe_told,
-            SPECTRUM.name: self._spectrum_told,
-            SCAN_LINES.name: self._lines_told,
+            SCAN_PARAMETERS.name: self._map_region,
+            PROBE_POSITION.name: self._map_probe,
+            SPECTRUM.name: self._map_spectrum,
+            SCAN_LINES.name: self._map_lines,
         }.get(header.message)
         if handler is None:
             return packet
@@ -343,7 +341,7 @@ class PlaceMapper:
         payload = handler(told, packet.payload, (header.time_ns or now_ns) * 1e-9)
         return packet if payload is None else Packet(packet.envelope, payload, packet.time_ns)
 
-    def _region_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+    def _map_region(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         if not isinstance(told, ScanParameters) or not isinstance(told.region, Region):
             return None
         if isinstance(told.shape, tuple):
@@ -356,21 +354,21 @@ class PlaceMapper:
         self.region = known
         if mapping is None or known.current is None:
             return None
-        return self._codec.relocated("ScanParameters2d", payload, known.current.said)
+        return self._codec.relocated("ScanParameters2d", payload, known.current.requested)
 
-    def _lines_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
-        """They lie where the frame is that they are taken in; the finished scan will be told to lie where it was."""
+    def _map_lines(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        # lines get the place of the frame in force; the finished scan will get its measured place
         region, mapping = getattr(told, "region", None), self._mapping_at(time_s)
         if region is None or mapping is None:
             return None
         known = self.region.published(region)
         if known is None or known.current is None:
-            said = self._codec.encode(ScanParameters(mapping.to_sample(region)))
+            requested = self._codec.encode(ScanParameters(mapping.to_sample(region)))
         else:
-            self.region, said = known, known.current.said
-        return self._codec.relocated("ScanLines", payload, said)
+            self.region, requested = known, known.current.requested
+        return self._codec.relocated("ScanLines", payload, requested)
 
-    def _probe_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+    def _map_probe(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         if not isinstance(told, ProbePosition):
             return None
         mapping, known = self._mapping_at(time_s), self.probe.published(told)
@@ -380,10 +378,10 @@ class PlaceMapper:
         self.probe = known
         if mapping is None or known.current is None:
             return None
-        return self._codec.relocated("ProbePosition", payload, known.current.said)
+        return self._codec.relocated("ProbePosition", payload, known.current.requested)
 
-    def _spectrum_told(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
-        """It lies where the sample was at its own time, which may not be that of the move to it."""
+    def _map_spectrum(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        # mapped for its own time: the sample may have drifted since the probe was moved
         mapping, position_m = self._mapping_at(time_s), getattr(told, "position_m", None)
         if mapping is None or position_m is None:
             return None
@@ -391,12 +389,12 @@ class PlaceMapper:
 
 
 def _place(codec: PlaceCodec, kind: int, saved: SavedPlace) -> PositionPair[Any]:
-    sample, tip = (codec.decode_packet(_MESSAGES[kind], part) for part in (saved.said, saved.sent))
+    sample, tip = (codec.decode_packet(_MESSAGES[kind], part) for part in (saved.requested, saved.sent))
     if isinstance(sample, ScanParameters) and isinstance(tip, ScanParameters):
         sample, tip = sample.region, tip.region
     if sample is None or tip is None:
         raise ValueError("a place in force that can't be read")
-    return PositionPair(sample, saved.said, tip, saved.sent)
+    return PositionPair(sample, saved.requested, tip, saved.sent)
 
 
 def _place_of(request: Request) -> Region | RegionChange | ProbePosition | PositionChange | None:
@@ -411,7 +409,7 @@ def _place_of(request: Request) -> Region | RegionChange | ProbePosition | Posit
         return None
     value = 1.0 if subject.value is None else number_of(subject)
     if value is None:
-        return None  # the limits say what is wrong with it
+        return None  # the limits will refuse it with the reason
     return REGION_CHANGES[subject.name](value) if subject.name in REGION_CHANGES else PROBE_CHANGES[subject.name](value)
 
 
@@ -425,12 +423,12 @@ def _names(asked: object) -> tuple[str, ...]:
     return (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
-def _said(place: PositionPair[Any]) -> str:
+def _both_places(place: PositionPair[Any]) -> str:
     def centre(where: Region | ProbePosition) -> str:
         x, y = where.center_m if isinstance(where, Region) else where.xy_m
-        return f"({x:.6g}, {y:.6g}) m"
+        return position_text((x, y))
 
-    return f"that is {centre(place.tip)} at the tip, asked for at {centre(place.sample)} on the sample"
+    return f"that is {centre(place.tip)} at the tip, requested at {centre(place.sample)} on the sample"
 
 
 def _position(mapping: Mapping, xy_m: tuple[float, float]) -> ProbePosition:

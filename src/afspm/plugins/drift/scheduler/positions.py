@@ -1,4 +1,4 @@
-"""The places in force at the microscope, in both coordinates: as asked for, and as set."""
+"""The places in force at the microscope, in both coordinates: as requested, and as set."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from afspm.scheduler.events import Codec
 P = TypeVar("P", bound=Region | ProbePosition)
 
 SAME = 1e-3
-"""Part of a region's size by which a controller may round: what it tells then is what it was set to."""
+"""Share of a region's size by which a controller may round: within it, the reported region is the one that was set."""
 SAME_PLACE_M = 1e-9
 
 _CANDIDATES = 8
@@ -28,13 +28,13 @@ _VALUES = {
 
 
 class PlaceCodec(Codec, Protocol):
-    """The wire as far as places matter."""
+    """The part of the wire format that places need."""
 
     def encode(self, thing: object) -> bytes:
-        """A ScanParameters or ProbePosition as a message."""
+        """Return a ScanParameters or ProbePosition as a message."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """A message with the place of another: of a ScanParameters2d (for scans too), or of a ProbePosition."""
+        """Return a message with the place of another: of a ScanParameters2d (for scans, too), or of a ProbePosition."""
 
 
 @dataclass(frozen=True)
@@ -42,21 +42,21 @@ class PositionPair(Generic[P]):
     """A place in both coordinates.
 
     Attributes:
-        sample: as components say it.
-        said: the message in which they said it, to the last bit.
+        sample: as requested by a component.
+        requested: the component's message, to the last bit.
         tip: as the microscope was set.
-        sent: the message by which it was.
+        sent: the message that set it.
     """
 
     sample: P
-    said: bytes
+    requested: bytes
     tip: P
     sent: bytes
 
 
 @dataclass(frozen=True)
 class TargetPosition(Generic[P]):
-    """The place in force, and the places sent lately: a packet may come before the answer to its request."""
+    """The place in force, and the places sent lately: a packet may arrive before the answer to its request."""
 
     current: PositionPair[P] | None = None
     sent: tuple[PositionPair[P], ...] = ()
@@ -74,14 +74,14 @@ class TargetPosition(Generic[P]):
         return replace(self, current=next((place for place in reversed(self.sent) if place.sent == sent), self.current))
 
     def published(self, tip: P) -> TargetPosition[P] | None:
-        """Return the target with the place that the microscope publishes in force; None: the scheduler set no such."""
+        """Put in force the place that the microscope publishes; None if the scheduler did not set it."""
         known: list[PositionPair[P]] = [*self.sent] if self.current is None else [self.current, *self.sent]
-        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # the newest first, of those as near
+        near = [place for place in reversed(known) if is_same(place.tip, tip)]  # of equally near ones the newest
         return self.at(min(near, key=lambda place: away_m(place.tip, tip))) if near else None
 
 
 def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
-    """The largest distance of two corners, or of two positions, m."""
+    """Return the largest distance between corresponding corners, or between two positions, m."""
     if isinstance(a, Region) and isinstance(b, Region):
         corners = zip(a.corners_m(), b.corners_m(), strict=True)
         return max(math.dist(one, other) for one, other in corners)
@@ -91,7 +91,7 @@ def away_m(a: Region | ProbePosition, b: Region | ProbePosition) -> float:
 
 
 def is_same(a: Region | ProbePosition, b: Region | ProbePosition) -> bool:
-    """Return whether two places are one but for rounding."""
+    """Return whether two places are equal except for rounding."""
     near_m = SAME * math.hypot(*a.size_m) if isinstance(a, Region) else SAME_PLACE_M
     return away_m(a, b) <= near_m
 
@@ -101,10 +101,10 @@ def value_in(name: str, region: Region) -> float:
     return float(_VALUES[name](region))
 
 
-def told_as(name: str, value: float, told: Parameter | None) -> Parameter:
-    """A value in SI in the unit in which the microscope told its own."""
+def in_reported_unit(name: str, value: float, told: Parameter | None) -> Parameter:
+    """Return a value in SI as a parameter in the unit that the microscope uses for it."""
     unit = _unit(told or Parameter(name))
-    # 15 digits: what was set as 0.1 nm is told as 0.1, not as 0.09999999999999999
+    # 15 digits: a value set as 0.1 nm reads as 0.1, not as 0.09999999999999999
     return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)
 
 

@@ -1,4 +1,4 @@
-"""The response to a registered scan: flags, scans to be taken again, a rate handed over to the controller."""
+"""The response to a registered scan: flags, rescans, and a rate for the controller."""
 
 from __future__ import annotations
 
@@ -27,33 +27,34 @@ from afspm.scheduler.events import Announced, Delegate, ProblemSeen
 RESCAN = "DriftRescan"
 _DRIFT, _MALFUNCTION = int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)
 _MOST_UNREGISTERED = 3
-"""As many unregistered scans in a row are as good as a lost sample: the number of the trackers."""
+"""Unregistered scans in a row that count as a lost sample; the trackers use the same number."""
 _AT_START = "a scan in the other direction gives the velocity of the drift"
 
 
 def respond(draft: DriftDraft, what: FollowUp) -> None:
-    """Give a response that was put off until its scan was published."""
+    """Give a response that was deferred until its scan was published."""
     match what:
         case RespondToScan():
-            _to_scan(draft, what)
+            _respond_to_scan(draft, what)
         case RespondToFailure():
-            _to_failure(draft, what.why)
+            _respond_to_failure(draft, what.why)
         case CallPerson():
             _call_person(draft)
 
 
 def is_given_up(draft: DriftDraft) -> bool:
-    """Return whether a person was called to a worker that always ends."""
+    """Return whether device-malfunction is flagged, for example because the worker ended repeatedly."""
     return _MALFUNCTION in draft.control.problems
 
 
-def _to_scan(draft: DriftDraft, what: RespondToScan) -> None:
+def _respond_to_scan(draft: DriftDraft, what: RespondToScan) -> None:
     registered = what.registered
     draft.duties = replace(draft.duties, unregistered=0)
     if not draft.corrects:
-        draft.duties = replace(draft.duties, started=True)  # before correction the velocity has time to show
+        # until correction begins, there is time to measure the velocity
+        draft.duties = replace(draft.duties, started=True)
     elif draft.control.mode is ControlMode.MANUAL:
-        # a person's scan is followed, and not scanned again
+        # a person's scan is followed, but no rescan requested
         if registered.matched and not registered.lost:
             _clear_own_flag(draft)
     elif registered.lost:
@@ -61,37 +62,38 @@ def _to_scan(draft: DriftDraft, what: RespondToScan) -> None:
     elif not draft.duties.started:
         _scan_in_opposite_direction(draft, what.job.upwards)
     elif draft.tally.exceeds(draft.env.settings.most_unregistered):
-        _too_few(draft)
+        _respond_to_low_share(draft)
     else:
         if registered.matched:
             _clear_own_flag(draft)
         if registered.rescan:
-            _want(draft, RescanKind.AGAIN, registered.rescan)
+            _request_rescan(draft, RescanKind.AGAIN, registered.rescan)
 
 
-def _to_failure(draft: DriftDraft, why: str) -> None:
+def _respond_to_failure(draft: DriftDraft, why: str) -> None:
     if not draft.corrects or draft.control.mode is ControlMode.MANUAL:
         return
     unregistered = draft.duties.unregistered + 1
     if unregistered < _MOST_UNREGISTERED:
         draft.duties = replace(draft.duties, unregistered=unregistered)
         if draft.tally.exceeds(draft.env.settings.most_unregistered):
-            _too_few(draft)
+            _respond_to_low_share(draft)
         return
-    draft.duties = replace(draft.duties, unregistered=0)  # a component that goes on gets the flag after as many again
+    # if a component clears the flag, it is flagged again after the same number
+    draft.duties = replace(draft.duties, unregistered=0)
     draft.tally = draft.tally.share_restarted()
     _search(draft, f"{_MOST_UNREGISTERED} scans in a row could not be registered: {why}")
 
 
 def _call_person(draft: DriftDraft) -> None:
-    """Flag a malfunction until a person has looked; a worker whose drift is never corrected delays no component."""
+    # without correction the worker's end delays no component
     if not draft.env.settings.correct:
         return
     draft.worker = replace(draft.worker, waits_for_person=True)
     draft.outputs.append(ProblemSeen(_MALFUNCTION, flagged=True, name=draft.env.name))
 
 
-def _too_few(draft: DriftDraft) -> None:
+def _respond_to_low_share(draft: DriftDraft) -> None:
     draft.tally = draft.tally.share_restarted()
     share = f"more than {draft.env.settings.most_unregistered:.0%} of the last {LATELY} scans were not registered"
     _search(draft, f"{share}: {draft.tally.summary()}")
@@ -99,13 +101,13 @@ def _too_few(draft: DriftDraft) -> None:
 
 def _search(draft: DriftDraft, why: str) -> None:
     draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
-    # a component that searches has widened the region: the region of the scans before is what was asked for
+    # a searching component has widened the region itself: a request for that region would be wrong
     if draft.control.solving != _DRIFT:
-        _want(draft, RescanKind.SEARCH, why)
+        _request_rescan(draft, RescanKind.SEARCH, why)
 
 
 def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None:
-    """Have the first scan taken in the other direction before any component goes on."""
+    # flagged, so that no component scans before both directions are there
     draft.duties = replace(draft.duties, started=True)
     if upwards is None:
         why = f"the microscope does not report {names.SCAN_DIRECTION}"
@@ -113,23 +115,23 @@ def _scan_in_opposite_direction(draft: DriftDraft, upwards: bool | None) -> None
         return
     draft.log("INFO", "thermal-drift is flagged until the first scan was taken in both directions: normal at the start")
     draft.outputs.append(ProblemSeen(_DRIFT, flagged=True, name=draft.env.name))
-    _want(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
+    _request_rescan(draft, RescanKind.OPPOSITE, _AT_START, upwards=not upwards)
 
 
 def _clear_own_flag(draft: DriftDraft) -> None:
-    """Clear the scheduler's flag; a component that solves it restores its own changes first."""
+    # a component that solves the problem restores its own changes first
     control = draft.control
     if control.problems.get(_DRIFT) == draft.env.name and control.solving != _DRIFT:
         draft.outputs.append(ProblemSeen(_DRIFT, flagged=False, name=draft.env.name))
 
 
-def _want(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
+def _request_rescan(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | None = None) -> None:
     place = draft.places.region.current
     if place is None:
         draft.log("ERROR", f"{reason}, and the region to scan again is unknown")
         return
-    wanted = RescanWanted(kind, place.said, draft.places.shape, reason, draft.now_ns, upwards)
-    level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # one belongs to the beginning of every night
+    wanted = RescanWanted(kind, place.requested, draft.places.shape, reason, draft.now_ns, upwards)
+    level = "INFO" if kind is RescanKind.OPPOSITE else "WARNING"  # it belongs to the start of every night
     draft.log(level, f"requesting a rescan: {reason}")
     draft.outputs.append(Announced(RESCAN, draft.env.codec.encode_rescan(wanted)))
 
@@ -139,10 +141,10 @@ def _want(draft: DriftDraft, kind: RescanKind, reason: str, *, upwards: bool | N
 
 @dataclass(frozen=True)
 class RateGiven:
-    """The controller was asked to compensate `value_m_s` along an axis.
+    """A request to the controller to compensate `value_m_s` along an axis.
 
     Attributes:
-        is_new: the worker has to reckon with it from now on.
+        is_new: the worker must take it into account from now on.
     """
 
     axis: int
@@ -152,13 +154,13 @@ class RateGiven:
 
 
 def restore_compensation(draft: DriftDraft) -> None:
-    """Have the controller compensate what is reckoned with: nothing at first, whatever a night before has left."""
+    """Set the controller to the compensation in force, at first zero: an earlier night may have left another."""
     for axis, name in enumerate(_axes(draft)):
         _ask_rate(draft, RateGiven(axis, name, draft.duties.given_m_s[axis], is_new=False))
 
 
 def hand_over(draft: DriftDraft) -> None:
-    """Give the controller the newest rate, if it is significant; nothing is changed under the hands of a person."""
+    """Give the controller the newest rate, if it is significant and no person is in control."""
     predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
     if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
         return
@@ -171,9 +173,9 @@ def hand_over(draft: DriftDraft) -> None:
 
 
 def rate_answered(draft: DriftDraft, given: RateGiven, response: Response) -> None:
-    """Take the answer for one axis: the controller may take one and refuse the other."""
+    """Process the answer for one axis: the controller may accept one axis and refuse the other."""
     if not response.ok:
-        # not free: a scan has begun already, and the rate is handed over after the next
+        # NOT_FREE: a scan has already begun; the rate is handed over after the next one
         if response.code != ControlResponse.NOT_FREE:
             draft.log("ERROR", f"the controller refused the drift rate, {given.name}: {response.reason}")
         return

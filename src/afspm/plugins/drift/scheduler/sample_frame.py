@@ -1,17 +1,19 @@
 """`SampleFrame`: coordinates in which the sample stands still, though it drifts under the tip.
 
-Theory of operation. The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`. It decides in
-three places:
+Theory of operation
+-------------------
 
-| what | module |
+The frame is a part of the scheduler's state behind `scheduler.coordinate_frame`. It decides in three places:
+
+| decision | module |
 | --- | --- |
-| requests and packets are mapped by the forecast of the drift | `place_mapper` |
-| scans wait for their registration, and settle what is known | `scan_intake` |
-| flags, rescans and rates follow from a published scan | `response` |
+| map requests and packets by the forecast of drift | `place_mapper` |
+| hold scans until they are registered, then settle their mapping | `scan_intake` |
+| flag problems, request rescans, hand over rates after a scan was published | `response` |
 
-The worker is a process of its own, since a registration takes as long as many scans' publication. Its start and its
-jobs are effects (`Delegate`), its reports inputs (`FrameReported`); a report comes late, twice, or never, and each of
-these publishes the scan once, with one mapping. Requests never wait for a scan.
+The worker is a process of its own, since a registration takes as long as the publication of many scans. Its start and
+its jobs are effects (`Delegate`), its reports inputs (`FrameReported`). A report may come late, twice, or never; in
+each case the scan is published once, with one mapping. Requests never wait for a scan.
 """
 
 from __future__ import annotations
@@ -72,7 +74,7 @@ class SampleFrame:
         """Return the frame of an experiment that begins.
 
         Args:
-            name: of the scheduler, in which it flags problems.
+            name: of the scheduler, under which problems are flagged.
         """
         return cls(DriftEnvironment(settings, codec, name), DriftState.initial(settings))
 
@@ -86,7 +88,7 @@ class SampleFrame:
             case PacketIn():
                 scan_intake.take_packet(draft, event)
             case TranslatorCaughtUp() if draft.gate.held is not None:
-                draft.gate = draft.gate.keep(event)  # the packets that wait came before it
+                draft.gate = draft.gate.keep(event)  # the waiting packets were published before it
             case RequestIn() if event.request.kind == ControlRequest.END_EXPERIMENT and draft.gate.held is not None:
                 why = "the experiment ended before"
                 scan_intake.publish_as_predicted(draft, draft.gate.held, why, "WARNING")
@@ -98,7 +100,7 @@ class SampleFrame:
                 if isinstance(event.purpose, RateGiven):
                     response.rate_answered(draft, event.purpose, event.response)
             case Tick() if draft.following:
-                _respond(draft)  # one in a step, since it may change who is in control
+                _respond(draft)  # one per step, since a response may change which client is in control
             case Tick():
                 draft.outputs.append(event)
                 scan_intake.expire(draft)
@@ -174,7 +176,7 @@ class SampleFrame:
         try:
             saved: SavedDrift = from_plain(SavedDrift, plain)
             return self._with(saved.restored(self.env.settings, self.env.codec))
-        except (AfspmError, AttributeError) as error:  # a forecast of another tracker, plain data of another frame
+        except (AfspmError, AttributeError) as error:  # saved by another tracker or frame
             raise ValueError(f"the saved drift can't be used: {error}") from error
 
     def recalled(self, packets: Iterable[LoggedPacket]) -> SampleFrame:
@@ -207,7 +209,7 @@ def _follow_control(draft: DriftDraft, change: ControlChanged) -> None:
 
 @dataclass(frozen=True)
 class _DirectionAsked:
-    """The answer is taken as any other value of the parameter."""
+    """Marks a request for the scan direction; its answer is processed like any value of a parameter."""
 
 
 def _ask_direction(draft: DriftDraft) -> None:

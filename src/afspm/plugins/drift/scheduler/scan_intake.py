@@ -1,11 +1,11 @@
 """A scan from its first packet to its publication in sample coordinates.
 
-| step | when | then |
+| step | trigger | action |
 | --- | --- | --- |
-| held | its first channel comes | all that follows it waits in the gate |
-| registered | its channel for drift comes | a job for the worker |
+| held | its first channel arrives | all that follows waits in the gate |
+| registered | its channel for drift arrives | a job for the worker |
 | settled | the worker's report, an error, a time limit | its mapping is announced, and saved with the state |
-| released | at once | scan and followers come once more, and pass in their order |
+| released | at once | scan and followers are reconsidered, and pass in their order |
 | responded to | in a step of its own | flags and rescans, after the scan was published |
 """
 
@@ -68,9 +68,9 @@ _LEVELS = {
     RegistrationOutcome.NEW: "INFO",
 }
 _MOST_TRIES = 2
-"""A scan over which the worker ends is tried as often."""
+"""Tries with a scan during which the worker ends."""
 _MOST_ENDS = 4
-"""After as many ends in a row, without a scan registered between them, the worker is not started again."""
+"""Ends of the worker in a row, without a registered scan in between, after which it is not restarted."""
 
 
 # --- packets ----------------------------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
     """Pass a packet on, or keep it with the scan that it belongs to or follows."""
     if (before := draft.gate.held) is not None:
         draft.gate = draft.gate.keep(event)
-        _look_at(draft, before, event)
+        _find_channel(draft, before, event)
         return
     message, packet = event.header.message, event.packet
     if message == "ScopeStateMsg":
@@ -98,14 +98,14 @@ def take_packet(draft: DriftDraft, event: PacketIn) -> None:
     held = HeldScan(key, _middle_s(draft, scan, event), until_s, scan.filename, scan.region.center_m)
     draft.gate = replace(draft.gate, held=held).keep(event)
     draft.outputs.append(HoldControl(until_s))
-    _look_at(draft, held, event)
+    _find_channel(draft, held, event)
 
 
-def _look_at(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
-    """Find the channel to register among the packets that wait, or the end of a scan that has none."""
+def _find_channel(draft: DriftDraft, held: HeldScan, event: PacketIn) -> None:
+    # a state other than SCANNING ends a scan that has no channel to register
     if held.asked:
         return
-    if draft.worker.ends >= _MOST_ENDS:  # a person was called, or decided that the experiment goes on
+    if draft.worker.ends >= _MOST_ENDS:  # a person was called, or has chosen to go on
         publish_as_predicted(draft, held, "drift is no longer followed", "WARNING")
         return
     message, codec = event.header.message, draft.env.codec
@@ -131,7 +131,7 @@ def _register(draft: DriftDraft, held: HeldScan, scan: Scan, event: PacketIn) ->
         upwards = begun.upwards
         durations = draft.places.durations.learn(scan.shape, scan.region.size_m, end_s - start_s)
         draft.places = replace(draft.places, durations=durations)
-    _ask_worker(draft, held, ScanJob(held.key, scan, start_s, end_s, upwards, _meant(draft, scan)))
+    _ask_worker(draft, held, ScanJob(held.key, scan, start_s, end_s, upwards, _requested_region(draft, scan)))
 
 
 def _ask_worker(draft: DriftDraft, held: HeldScan, job: ScanJob) -> None:
@@ -140,8 +140,8 @@ def _ask_worker(draft: DriftDraft, held: HeldScan, job: ScanJob) -> None:
     draft.outputs.append(Delegate(job))
 
 
-def _meant(draft: DriftDraft, scan: Scan) -> Region | None:
-    """The region that the scan was meant to show, if it was taken where the scheduler had it set."""
+def _requested_region(draft: DriftDraft, scan: Scan) -> Region | None:
+    # unknown if the scan was taken elsewhere than the scheduler had set it
     place = draft.places.region.current
     if place is None or not is_same(place.tip, scan.region):
         return None
@@ -149,7 +149,7 @@ def _meant(draft: DriftDraft, scan: Scan) -> Region | None:
 
 
 def _middle_s(draft: DriftDraft, scan: Scan, event: PacketIn) -> float:
-    """The middle between the scan's start and its own end: a file that comes late biases nothing."""
+    # from the scan's own end, so that a late file causes no error
     expected_s = draft.places.durations.expected_s(scan.shape, scan.region.size_m)
     return draft.timing.middle_s(_end_s(scan, event, draft.now_ns), expected_s)
 
@@ -165,7 +165,7 @@ def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | No
 
 
 def take_report(draft: DriftDraft, report: WorkerReport) -> None:
-    """Take a report of the worker."""
+    """Process a report of the worker."""
     match report:
         case Registered():
             _registered(draft, report)
@@ -173,14 +173,14 @@ def take_report(draft: DriftDraft, report: WorkerReport) -> None:
             draft.worker = replace(draft.worker, ends=0)
             _give_up(draft, report.key, report.reason)
         case WorkerGone():
-            _gone(draft, report)
+            _worker_gone(draft, report)
         case Forecasted():
-            _learn(draft, report.forecast)
+            _take_forecast(draft, report.forecast)
 
 
 def _registered(draft: DriftDraft, report: Registered) -> None:
     draft.worker = replace(draft.worker, ends=0)
-    _learn(draft, report.forecast)
+    _take_forecast(draft, report.forecast)
     held, job = draft.gate.held, draft.worker.job
     is_awaited = held is not None and held.key == report.key
     if held is not None and is_awaited:
@@ -188,7 +188,7 @@ def _registered(draft: DriftDraft, report: Registered) -> None:
         draft.gate = draft.gate.settle(report.key, report.matrix if corrects else None)
         _log_if_slow(draft, held)
     if job is None or job.key != report.key:
-        return  # a worker that was restarted repeats its last report
+        return  # a restarted worker repeats its last report
     draft.worker = replace(draft.worker, job=None)
     draft.forecast = replace(draft.forecast, lost=report.lost)
     before_ns = draft.gate.next_ns() if is_awaited else None
@@ -196,17 +196,17 @@ def _registered(draft: DriftDraft, report: Registered) -> None:
     _log_outcome(draft, report, job.scan.filename)
     if is_awaited:
         _release(draft)
-    _follow(draft, RespondToScan(report, job))
+    _respond_later(draft, RespondToScan(report, job))
     response.hand_over(draft)
 
 
-def _gone(draft: DriftDraft, report: WorkerGone) -> None:
+def _worker_gone(draft: DriftDraft, report: WorkerGone) -> None:
     ends = draft.worker.ends + 1
     draft.worker = replace(draft.worker, ends=ends)
     held, job = draft.gate.held, draft.worker.job
     if ends >= _MOST_ENDS:
         draft.log("CRITICAL", f"drift is no longer followed: {report.reason}")
-        _follow(draft, CallPerson())
+        _respond_later(draft, CallPerson())
         if held is not None:
             publish_as_predicted(draft, held, report.reason)
         return
@@ -221,7 +221,7 @@ def _gone(draft: DriftDraft, report: WorkerGone) -> None:
 
 
 def expire(draft: DriftDraft) -> None:
-    """Give up a scan that waits too long; a worker that hangs over it is killed."""
+    """Give up a scan that waited too long, and kill a worker that hangs."""
     held = draft.gate.held
     if held is None or draft.now_s < held.until_s:
         return
@@ -238,7 +238,7 @@ def restart_if_cleared(draft: DriftDraft) -> None:
         draft.outputs.append(Delegate(StartWorker()))
 
 
-def _learn(draft: DriftDraft, forecast: Plain | None) -> None:
+def _take_forecast(draft: DriftDraft, forecast: Plain | None) -> None:
     try:
         draft.forecast = draft.forecast.learn(forecast)
     except AfspmError as error:
@@ -246,29 +246,29 @@ def _learn(draft: DriftDraft, forecast: Plain | None) -> None:
 
 
 def _log_if_slow(draft: DriftDraft, held: HeldScan) -> None:
-    """Warn once, before it takes too long: with more references it takes several times as long."""
+    # once, and early: with more references a registration takes several times as long
     limit_s = draft.env.settings.longest_registration
     took_s = draft.now_s - (held.until_s - limit_s)
     if draft.worker.slow_logged or took_s < limit_s / 3:
         return
     draft.worker = replace(draft.worker, slow_logged=True)
     text = f"registering a scan took {took_s:.1f} s, and is given up after longest_registration = {limit_s:g} s"
-    draft.log("WARNING", f"{text}: use fewer pixels, or raise it")
+    draft.log("WARNING", f"{text}: use fewer pixels, or raise longest_registration")
 
 
 # --- publication ------------------------------------------------------------------------------------------------------
 
 
 def _give_up(draft: DriftDraft, key: str, why: str, level: str = "") -> None:
-    """Publish a scan by prediction; after too many of them the prediction is not reliable."""
+    # counted as a failure: after several of them the prediction is not reliable
     held = draft.gate.held
     if held is not None and held.key == key:
-        _follow(draft, RespondToFailure(why))
+        _respond_later(draft, RespondToFailure(why))
         publish_as_predicted(draft, held, why, level)
 
 
 def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str = "") -> None:
-    """Publish a scan that was not registered where the sample is predicted."""
+    """Publish an unregistered scan at the predicted place."""
     mapping = draft.forecast.mapping_at(draft.env.settings, held.middle_s)
     draft.gate = draft.gate.settle(held.key, None if mapping is None else mapping.matrix.tolist())
     report = _predicted(draft, held, why)
@@ -280,14 +280,12 @@ def publish_as_predicted(draft: DriftDraft, held: HeldScan, why: str, level: str
 def _announce(
     draft: DriftDraft, report: Registered, filename: str, center_m: tuple[float, float], before_ns: int | None
 ) -> None:
-    """Count a scan, and publish how its position is known."""
     draft.tally = draft.tally.add(report.outcome)
     payload = draft.env.codec.encode_mapping(report, filename, center_m, correcting=draft.corrects)
     draft.outputs.append(Announced(MAPPING, payload, before_ns))
 
 
 def _log_outcome(draft: DriftDraft, report: Registered, filename: str, level: str = "") -> None:
-    """Log the errors of an estimator, and a scan that is not registered well."""
     for failure in report.failures:
         draft.log("ERROR", failure)
     if report.outcome is not RegistrationOutcome.REGISTERED:
@@ -300,13 +298,13 @@ def _log_outcome(draft: DriftDraft, report: Registered, filename: str, level: st
 
 
 def _release(draft: DriftDraft) -> None:
-    # saved first: published again after a kill, the scan must have the same mapping
+    # saved first: a scan published again after a kill must have the same mapping
     draft.outputs += (SaveNow(), *map(Reconsider, draft.gate.waiting))
     draft.gate = draft.gate.opened()
 
 
-def _follow(draft: DriftDraft, what: FollowUp) -> None:
-    """Put a response off to a step of its own, since it may change who is in control."""
+def _respond_later(draft: DriftDraft, what: FollowUp) -> None:
+    # in a step of its own, since a response may change which client is in control
     draft.following = (*draft.following, (draft.now_s, what))
 
 
@@ -333,7 +331,7 @@ def _predicted(draft: DriftDraft, held: HeldScan, why: str) -> Registered:
 
 
 def scan_key(scan: Scan, packet: Packet) -> str:
-    """Return a key that all channels of a scan share, and no other scan has."""
+    """Return a key common to all channels of a scan, and unique to it."""
     if scan.time_ns is None and scan.filename:
         return scan.filename
     return f"at {packet.time_ns if scan.time_ns is None else scan.time_ns} ns"

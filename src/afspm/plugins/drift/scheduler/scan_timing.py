@@ -15,12 +15,12 @@ _KEPT = 16
 
 @dataclass(frozen=True)
 class ScanStart:
-    """A scan that has begun.
+    """The start of a scan.
 
     Attributes:
         time_s: experiment time.
         upwards: direction of its slow axis; None: not known.
-        was_paused: its rows did not all follow each other at once.
+        was_paused: there was a pause between some of its rows.
     """
 
     time_s: float
@@ -30,16 +30,16 @@ class ScanStart:
 
 @dataclass(frozen=True)
 class ScanStartTracker:
-    """Follows the state of the microscope.
+    """Follows the state of the microscope to find the start of scans.
 
-    SCANNING is published again after a pause, and to a scheduler after its restart: then the scan began before.
+    SCANNING is published again after a pause, and to a restarted scheduler: then the scan began earlier.
     """
 
     begun: ScanStart | None = None
     is_scanning: bool = False
 
     def with_state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> ScanStartTracker:
-        """Take a state; `upwards`: the direction in force. A lost microscope goes on with its scan."""
+        """Process a state; `upwards`: the direction in force. A lost microscope goes on with its scan."""
         if status.state is ScopeState.UNDEFINED:
             return self
         is_scanning, begun = status.state is ScopeState.SCANNING, self.begun
@@ -54,18 +54,18 @@ class ScanStartTracker:
         return replace(self, is_scanning=False)
 
     def of_scan(self, end_s: float) -> ScanStart | None:
-        """Return the start of the scan that ended at a time; None: it is not known."""
+        """Return the start of the scan that ended at a time; None: not known."""
         return self.begun if self.begun is not None and self.begun.time_s < end_s else None
 
     def middle_s(self, end_s: float, expected_s: float) -> float:
-        """Return the middle of the scan that ended then: by its start, or by its expected duration."""
+        """Return the middle of the scan that ended then, from its start or from its expected duration."""
         begun = self.of_scan(end_s)
         return end_s - expected_s / 2 if begun is None else (begun.time_s + end_s) / 2
 
 
 @dataclass(frozen=True)
 class ScanDuration:
-    """The duration of one kind of scan."""
+    """The duration of scans of one shape and size."""
 
     shape: Shape
     size_m: XY
@@ -74,12 +74,12 @@ class ScanDuration:
 
 @dataclass(frozen=True)
 class ScanDurations:
-    """Learnt from finished scans, newest last; empty again when the speed is set."""
+    """Durations of finished scans, newest last; emptied when the speed is set."""
 
     known: tuple[ScanDuration, ...] = ()
 
     def learn(self, shape: Shape, size_m: XY, duration_s: float) -> ScanDurations:
-        """Take the duration of a scan of this shape and size."""
+        """Add the duration of a scan of this shape and size."""
         newest = ScanDuration(shape, _rounded(size_m), duration_s)
         others = [one for one in self.known if (one.shape, one.size_m) != (newest.shape, newest.size_m)]
         return ScanDurations((*others, newest)[-_KEPT:])
@@ -87,7 +87,7 @@ class ScanDurations:
     def expected_s(self, shape: Shape | None, size_m: XY) -> float:
         """Return the expected duration of a scan; 0 if nothing is known.
 
-        One of another size or shape is reckoned from the latest: its time goes as the length of its lines.
+        An unknown size or shape is scaled from the latest scan, by the total length of its lines.
         """
         if not self.known:
             return 0.0
@@ -101,5 +101,5 @@ class ScanDurations:
 
 
 def _rounded(size_m: XY) -> XY:
-    """Sizes to six digits: a controller's rounding makes no other scan."""
+    # six digits: a size that a controller rounds is still the same scan
     return (float(f"{size_m[0]:.6g}"), float(f"{size_m[1]:.6g}"))

@@ -25,18 +25,19 @@ from afspm.wire.messages import DriftMapping, DriftRescan, ScanParameters2d
 
 
 class DriftCompensatedScheduler(Scheduler):
-    """A Scheduler whose components live in the coordinates of the sample, while the microscope stays in those of its
-    tip: drift is followed from scan to scan, scans and spectra are published where they were taken on the sample, and
-    what is asked for is sent to where it is at the tip by then.
+    """A Scheduler that gives components sample coordinates, while the microscope works in tip coordinates.
 
-    It publishes a `DriftMapping` whenever more is known, and a `DriftRescan` when it would like a scan to be taken
-    again, for the component `Rescanner`. When it does not know any more where the sample is, since it is not found or
-    three scans in a row could not be registered, it flags thermal-drift; when nothing will be registered any more,
-    device-malfunction: who removes that has it tried again.
+    Drift is followed from scan to scan. Scans and spectra are published at their place on the sample, and requested
+    places are sent to the microscope where they will be under the tip.
+
+    A `DriftMapping` is published for each scan, and a `DriftRescan` requests a rescan from the component `Rescanner`.
+    The scheduler flags thermal-drift when the sample is lost: it was not found, or three scans in a row could not be
+    registered. It flags device-malfunction when no more scans will be registered; clearing this problem starts another
+    try.
 
     Args:
         drift: how drift is followed and corrected.
-        control, limits, cache: as for the Scheduler. Limits hold for what goes to the microscope: tip coordinates.
+        control, limits, cache: as for the Scheduler. Limits hold for requests to the microscope, in tip coordinates.
     """
 
     frame: ClassVar = Frame.SAMPLE
@@ -62,7 +63,7 @@ class DriftCompensatedScheduler(Scheduler):
             self.needs_parameters = (compensate.x, compensate.y)
 
     def check(self) -> None:
-        """Make estimator and tracker once, and check that they do what is asked. Raises ConfigError if not."""
+        """Create estimator and tracker once, and check that they support these settings. Raises ConfigError if not."""
         from afspm.plugins.drift.estimators import estimator
         from afspm.plugins.drift.trackers import tracker
 
@@ -86,7 +87,7 @@ class DriftCompensatedScheduler(Scheduler):
 
 
 class DriftWireCodec(WireCodec):
-    """The wire as `DriftCodec` asks for it."""
+    """The wire format in the form of `DriftCodec`."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
         of = "ProbePosition" if message in ("Spec1d", "ProbePosition") else "ScanParameters2d"
@@ -113,7 +114,7 @@ class DriftWireCodec(WireCodec):
         ).SerializeToString()
 
     def encode_rescan(self, wanted: RescanWanted) -> bytes:
-        params = ScanParameters2d.FromString(wanted.said)
+        params = ScanParameters2d.FromString(wanted.requested)
         if wanted.shape is not None:
             params.data.shape.y, params.data.shape.x = wanted.shape
         message = DriftRescan(

@@ -16,11 +16,11 @@ _STRICT = {"extra": "forbid"}
 
 @dataclass(frozen=True)
 class RescanRule:
-    """When the Rescanner is asked to take a scan again.
+    """When the Rescanner is asked for a rescan.
 
     Attributes:
-        rule: "tolerance": the sample was found further off than `tolerance`, with two standard deviations of that
-            added; "paper": what the scan and the region it was meant for share is less than `f_rescan`; "never".
+        rule: "tolerance": the sample is further off than `tolerance`, with two standard deviations added; "paper": scan
+            and requested region share less than `f_rescan`; "never".
         tolerance: None: a tenth of the scan's smaller side.
         f_rescan: part of the area (paper, "Overarching workflow").
     """
@@ -40,7 +40,7 @@ class RescanRule:
 
 @dataclass(frozen=True)
 class Compensate:
-    """Parameters of the controller by which it moves the tip along by itself, in m/s."""
+    """Names of the controller's parameters for its own drift compensation, in m/s."""
 
     x: str
     y: str
@@ -50,20 +50,20 @@ class Compensate:
 
 @dataclass(frozen=True)
 class DriftCompensationSettings:
-    """The settings by which drift is followed and corrected.
+    """Settings of drift tracking and correction.
 
     Attributes:
-        estimator, tracker: a name, or a table with the name as its `class` and the settings of it.
-        channel: of the scans that are compared; None: the first that is published in a unit of length.
-        correct: whether components are given sample coordinates; else drift is followed and told, and nothing changed.
-        correct_after: since the start of the experiment; until then as if `correct` were false.
-        rescan: when a scan is taken again.
-        most_unregistered: share of the last ten scans that may lie where they were predicted, since they were not
-            recognised or could not be registered; above it thermal-drift is flagged. 1: never.
-        at_start: "up-down": the first scan is followed by one in the other direction, which tells the velocity, where
+        estimator, tracker: a name, or a table with the name as its `class` and with its settings.
+        channel: of the scans that are compared; None: the first one published in a unit of length.
+        correct: whether components are given sample coordinates; else drift is only followed and published.
+        correct_after: time since the start of the experiment; until then as if `correct` were false.
+        rescan: when a rescan is requested.
+        most_unregistered: largest share of unregistered scans among the last ten; above it thermal-drift is flagged.
+            1: never.
+        at_start: "up-down": the first scan is followed by one in the other direction, which gives the velocity, if
             a component solves thermal-drift and the microscope reports its direction; "nothing": it is not.
-        compensate: hands the velocity over to a controller that compensates by itself.
-        longest_registration: for how long (real) what the microscope publishes waits for a scan to be registered.
+        compensate: hands the velocity over to a controller with its own drift compensation.
+        longest_registration: real time for which packets of the microscope wait for a registration.
     """
 
     estimator: str | Plain = "least-squares"
@@ -86,20 +86,22 @@ class DriftCompensationSettings:
                 raise InvalidValue(f"{name} = {value} s is not zero or more", where="drift")
 
         if not 0.0 <= self.most_unregistered <= 1.0:
-            said = f"most_unregistered = {self.most_unregistered} is not a share"
-            raise InvalidValue(said, where="drift", hint="0 to 1")
+            reason = f"most_unregistered = {self.most_unregistered} is not a share"
+            raise InvalidValue(reason, where="drift", hint="0 to 1")
 
     def beside(self, solved: Collection[str]) -> DriftCompensationSettings:
-        """Return these settings for a run whose components solve these problems: without a component that scans again,
-        the first scan is taken in one direction."""
+        """Return these settings for a run whose components solve the given problems.
+
+        Without a component that takes rescans, the first scan is taken in one direction only.
+        """
         return self if "thermal-drift" in solved else replace(self, at_start="nothing")
 
     @classmethod
     def from_table(cls, table: Plain) -> DriftCompensationSettings:
-        """Out of plain JSON, already in SI.
+        """Return the settings from plain JSON in SI.
 
         Raises:
-            ConfigError, InvalidValue: an unknown setting, or a value that can't be.
+            ConfigError, InvalidValue: an unknown setting, or an impossible value.
         """
         plain = dict(table)
         try:

@@ -1,4 +1,4 @@
-"""The state of drift compensation: a tree of frozen parts, the draft of its next state, and what survives a kill."""
+"""The state of drift compensation: a tree of frozen parts, the draft of its next state, and its saved form."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class CurrentForecast:
     """The newest forecast.
 
     Attributes:
-        start_s: experiment time at which the experiment began; None: before that.
+        start_s: experiment time at which the experiment began; None: before the start.
         lost: whether the position of the sample is unknown, as of the newest registered scan.
         text: the forecast as JSON, which only its tracker understands; None: nothing is known yet.
 
@@ -51,7 +51,7 @@ class CurrentForecast:
             object.__setattr__(self, "forecast", forecast_from_dict(json.loads(self.text)))
 
     def learn(self, forecast: Plain | None) -> CurrentForecast:
-        """Take a forecast of the worker; None: it knows nothing new. Raises InvalidValue if it is no forecast."""
+        """Take a forecast of the worker; None: unchanged. Raises InvalidValue for anything else."""
         return self if forecast is None else CurrentForecast(self.start_s, self.lost, json.dumps(forecast))
 
     def predicted(self, time_s: float) -> Prediction | None:
@@ -76,11 +76,11 @@ class HeldScan:
     """A scan that waits for its position.
 
     Attributes:
-        middle_s: experiment time that its position stands for.
+        middle_s: experiment time for which its position holds.
         until_s: real time until which it waits.
         filename, center_m: of its first channel, in tip coordinates.
         asked: it is being registered.
-        tries: how often that was begun.
+        tries: number of jobs for it.
     """
 
     key: str
@@ -94,13 +94,13 @@ class HeldScan:
 
 @dataclass(frozen=True)
 class ScanGate:
-    """Keeps a scan back until its position is known, and everything that the microscope publishes after it.
+    """Keeps back a scan until its position is known, and every later packet of the microscope.
 
-    So all channels of a scan get the same mapping, the best that is known, and the order of packets is kept.
+    So all channels of a scan get the same, best known mapping, and the order of packets is kept.
 
     Attributes:
         waiting: inputs behind the scan, oldest first.
-        settled: the mappings of the latest scans that have passed; None: published unchanged.
+        settled: the mappings of the latest published scans; None: published unchanged.
         channel: of the scans that are registered; None: the first in a unit of length.
     """
 
@@ -117,23 +117,23 @@ class ScanGate:
         return next((event.packet.time_ns for event in self.waiting if isinstance(event, PacketIn)), None)
 
     def settle(self, key: str, matrix: Matrix | None) -> ScanGate:
-        """Fix the mapping of a scan, now and should it be published again."""
+        """Fix the mapping of a scan, also for a repeated publication."""
         others = [(other, one) for other, one in self.settled.items() if other != key]
         return replace(self, settled=dict([*others, (key, matrix)][-_SETTLED:]))
 
     def opened(self) -> ScanGate:
-        """Return the gate without a scan that waits; `waiting` is to be reconsidered."""
+        """Return the gate without a waiting scan; the caller reconsiders `waiting`."""
         return replace(self, held=None, waiting=())
 
     def with_channel_of(self, scan: Scan) -> ScanGate:
-        """Choose the channel, if it is not chosen and a scan is in a unit of length."""
+        """Choose the channel of this scan, if none is chosen yet and its unit is a length."""
         is_chosen = self.channel is not None or not same_kind(scan.unit, "m")
         return self if is_chosen else replace(self, channel=scan.channel)
 
 
 @dataclass(frozen=True)
 class Duties:
-    """The responses that were given, as far as later ones depend on them.
+    """Responses given so far, as far as later ones depend on them.
 
     Attributes:
         started: the first scan was followed by one in the other direction, or need not be.
@@ -148,7 +148,7 @@ class Duties:
 
 @dataclass(frozen=True)
 class WorkerLife:
-    """The worker process, as far as it is known.
+    """The known state of the worker process.
 
     Attributes:
         job: the scan that it registers.
@@ -179,7 +179,7 @@ class RespondToFailure:
 
 @dataclass(frozen=True)
 class CallPerson:
-    """No scan will be registered any more."""
+    """No more scans will be registered."""
 
 
 FollowUp = RespondToScan | RespondToFailure | CallPerson
@@ -187,10 +187,10 @@ FollowUp = RespondToScan | RespondToFailure | CallPerson
 
 @dataclass(frozen=True)
 class DriftState:
-    """All that drift compensation decides by.
+    """The state of drift compensation: the basis of all its decisions.
 
     Attributes:
-        following: responses to come, each with the real time since when it is due.
+        following: deferred responses, each with the real time since when it is due.
     """
 
     places: Places = field(default_factory=Places)
@@ -225,7 +225,7 @@ class SavedDrift:
         return cls(places, state.forecast, gate.channel, gate.settled, state.tally, state.duties)
 
     def restored(self, settings: DriftCompensationSettings, codec: DriftCodec) -> DriftState:
-        """Raises ValueError: a place can't be read."""
+        """Return the state. Raises ValueError for an unreadable place."""
         return DriftState(
             places=self.places.restored(codec),
             forecast=self.forecast,
@@ -237,10 +237,10 @@ class SavedDrift:
 
 @dataclass(frozen=True)
 class DriftEnvironment:
-    """Everything that a step needs beside the state.
+    """The constants of all steps.
 
     Attributes:
-        name: of the scheduler, in which it flags problems.
+        name: of the scheduler, under which problems are flagged.
     """
 
     settings: DriftCompensationSettings

@@ -1,4 +1,4 @@
-"""Counts how many scans were registered, altogether and lately."""
+"""Counts registered scans, altogether and lately."""
 
 from __future__ import annotations
 
@@ -9,18 +9,17 @@ from afspm.basics.frozen import replace
 from afspm.model import RegistrationOutcome, registration_summary
 
 LATELY = 10
-"""The number of scans by which the share of unregistered ones is judged."""
+"""Number of scans in the share of unregistered ones."""
 
 
 @dataclass(frozen=True)
 class RegistrationTally:
-    """Counts the outcomes of registration. Scans of a new place are not among those by which the share is judged."""
+    """Counts the outcomes of registration. Scans of a new place don't count for the share of unregistered scans."""
 
     counts: Mapping[RegistrationOutcome, int] = field(default_factory=dict)
     lately: tuple[bool, ...] = ()
 
     def add(self, outcome: RegistrationOutcome) -> RegistrationTally:
-        """Count a scan."""
         lately = self.lately
         if outcome is not RegistrationOutcome.NEW:
             lately = (*lately, outcome.is_registered)[-LATELY:]
@@ -28,17 +27,15 @@ class RegistrationTally:
 
     @property
     def scans(self) -> int:
-        """The number of scans so far."""
         return sum(self.counts.values())
 
     def summary(self) -> str:
-        """Return the counts for people."""
         return registration_summary(outcome for outcome, count in self.counts.items() for _ in range(count))
 
     def exceeds(self, most_unregistered: float) -> bool:
-        """Return whether more of the last scans were not registered than this share of `LATELY`."""
+        """Return whether more than this share of the last `LATELY` scans was not registered."""
         return self.lately.count(False) > most_unregistered * LATELY
 
     def share_restarted(self) -> RegistrationTally:
-        """Leave the scans so far out of the share: it was acted upon."""
+        """Leave the scans so far out of the share: a response was given."""
         return replace(self, lately=())

@@ -1,7 +1,7 @@
-"""The process that registers scans: whatever an estimator of a user does, and however long, the scheduler goes on.
+"""The process that registers scans. Errors and long computations of an estimator don't stop the scheduler.
 
-It takes jobs one after the other, and saves its state before it reports. The end of its jobs ends it, and so does the
-death of the scheduler's process, even while it registers: the worker of the next scheduler knows more by then.
+It processes jobs one after the other, and saves its state before it reports. It ends with its jobs, and with the
+scheduler's process, even during a registration: by then the worker of the next scheduler is the newer one.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Complaint:
 def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:
     """Register scans until there are no more jobs."""
     leave_interrupts_to_parent()
-    # a print of a user's estimator goes to where errors go
+    # a user's estimator may print: its output belongs with the errors
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
     try:
@@ -64,6 +64,7 @@ def main(jobs: Connection, reports: Connection, settings: DriftCompensationSetti
 
 
 def _end_with_parent() -> None:
+    # at once, even during a registration: otherwise it would overwrite the state that the next worker has read
     parent = multiprocessing.parent_process()
     assert parent is not None
     connection.wait([parent.sentinel])
@@ -80,7 +81,7 @@ class _Worker:
         self._report(Forecasted(self._estimation.forecast))
 
     def _saved(self) -> Estimation:
-        """The estimation as it was when a scan was registered last."""
+        # from disk: the state after the last registered scan
         failures: list[PairFailure] = []
         made = tracker(self._settings.tracker, estimator(self._settings.estimator, failures.append))
         estimation = Estimation(made, self._settings.rescan, self._save, failures)
@@ -97,7 +98,7 @@ class _Worker:
     def _save(self, state: Plain) -> None:
         try:
             self._store.save(state)
-        except FileError as error:  # the knowledge of the drift now is worth more than what a kill would lose
+        except FileError as error:  # the present forecast is worth more than a state for a restart
             if not self._is_full_logged:
                 self._report(Complaint(f"the state of the drift can't be saved: {error}"))
             self._is_full_logged = True
@@ -120,9 +121,9 @@ class _Worker:
         drift_scan = DriftScan(values, scan.region, job.start_s, job.end_s, job.upwards, name)
         try:
             return self._estimation.register(job.key, drift_scan, job.asked)
-        except Exception as error:  # of a user's own estimator or tracker, too: its text is the reason
+        except Exception as error:  # a user's own estimator or tracker may raise anything; its text becomes the reason
             reason = str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"
-            self._estimation = self._saved()  # without what was half done
+            self._estimation = self._saved()  # without the half-processed scan
             return NotRegistered(job.key, reason)
 
     def _report(self, report: WorkerReport | Complaint) -> None:

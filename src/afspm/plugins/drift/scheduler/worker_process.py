@@ -1,4 +1,4 @@
-"""The worker as the scheduler's process has it: a child that takes jobs, and whose reports come by a thread."""
+"""The worker from the scheduler's side: a child process that takes jobs, with a thread that receives its reports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ from afspm.plugins.drift.scheduler.worker import Complaint, main
 
 _FAREWELL_S = 1.0
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-# forked, the child would hold the scheduler's sockets and locks
+# spawn: a forked child would hold the scheduler's sockets and locks
+# a process and not a pool: `concurrent.futures` has no public way to kill a worker that hangs
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
@@ -33,7 +34,7 @@ class DriftWorkerProcess:
 
     Attributes:
         wake: called from another thread when there is a report.
-        late: keeps a simulated time from running away while a scan is registered.
+        late: holds simulated time while a scan is registered.
     """
 
     def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
@@ -58,7 +59,7 @@ class DriftWorkerProcess:
         self._jobs.put(job)
 
     def reports(self) -> Iterator[WorkerReport]:
-        """Yield the reports since the last call, oldest first; those of a former worker are dropped.
+        """Yield the reports since the last call, oldest first; reports of a former worker are dropped.
 
         Simulated time passes again once the report about a scan was handled.
         """
@@ -90,7 +91,7 @@ class DriftWorkerProcess:
                 end.close()
             self._add(self._life, WorkerGone(f"it can't be started: {error}"))
             return
-        finally:  # only the child holds these: so that their end is the end of the child
+        finally:  # closed here, so that only the child holds them and their end shows its end
             from_us.close()
             to_us.close()
         self._process, self._jobs = process, queue.SimpleQueue()
@@ -106,11 +107,11 @@ class DriftWorkerProcess:
         self._jobs.put(None)
         process.join(within_s)
         process.kill()
-        # not for the thread that reads: a process that an estimator has forked holds the pipe open
+        # no wait for the reading thread: a process forked by an estimator may hold the pipe open
         process.join()
 
     def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:
-        """In a thread: from the worker's first report to its end."""
+        # in a thread: from the worker's first report to its end
         gone = None
         with contextlib.suppress(EOFError, OSError), reports:
             while True:
@@ -130,7 +131,7 @@ class DriftWorkerProcess:
 
 
 def _write_all(jobs: Connection, waiting: queue.SimpleQueue[object]) -> None:
-    """In a thread: a worker that is busy does not read, and the scheduler must not wait for it."""
+    # in a thread: a busy worker does not read, and the scheduler must not wait for it
     with contextlib.suppress(OSError), jobs:
         while (job := waiting.get()) is not None:
             jobs.send(job)
@@ -138,7 +139,7 @@ def _write_all(jobs: Connection, waiting: queue.SimpleQueue[object]) -> None:
 
 @contextlib.contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Small matrices are not worth more threads than one; libraries of the child read it as they are loaded."""
+    # small matrices gain nothing from more threads; the child's libraries read the variables as they are loaded
     added = [name for name in _THREADS if name not in os.environ]
     os.environ.update(dict.fromkeys(added, "1"))
     try:

@@ -1,4 +1,4 @@
-"""The worker's state on disk: one .npz file of JSON and arrays, replaced as a whole. Nothing in it is code."""
+"""The worker's state on disk: one .npz file of JSON and arrays, replaced as a whole. It contains no code."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class WorkerStateFile:
         self.path = path
 
     def save(self, state: Plain) -> None:
-        """Write it aside and rename; a power cut leaves the one or the other.
+        """Write a new file and rename it; a power cut leaves the old file or the new one.
 
         Raises:
             FileError: the disk is full …
@@ -42,7 +42,7 @@ class WorkerStateFile:
         write_atomic(self.path, [file.getbuffer()], synced=True)
 
     def load(self) -> Plain | None:
-        """Return what was saved last; None if nothing was.
+        """Return the last saved state; None if there is none.
 
         Raises:
             FileError: it can't be read.
@@ -53,8 +53,10 @@ class WorkerStateFile:
             with self.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
                 state = json.loads(arrays[_JSON].tobytes())
                 found: Plain = _with_arrays(state, arrays)
-        except Exception as error:  # a damaged file makes numpy raise whatever it likes
-            raise FileError(f"can't be read: {error}", where=str(self.path), hint="remove it to begin anew") from error
+        except Exception as error:  # numpy raises many kinds of exceptions for a damaged file
+            raise FileError(
+                f"can't be read: {error}", where=str(self.path), hint="remove it to start without it"
+            ) from error
         return found
 
 

@@ -17,8 +17,8 @@ class SettingsGrid:
     """All combinations of the values of some settings.
 
     Attributes:
-        values: by name; see `NightSettings.of`. What belongs to a tracker that a combination does not have
-            ("paper.queue" for the bank) makes no further combinations.
+        values: by name; see `NightSettings.of`. Settings of a tracker that a combination does not have ("paper.queue"
+            for the bank) make no further combinations.
     """
 
     values: Mapping[str, tuple[object, ...]]
@@ -28,7 +28,7 @@ class SettingsGrid:
         """Read a grid from a command line: files ending in .toml, and NAME=VALUE[,VALUE…], which override them.
 
         Raises:
-            ConfigError: not such a text, or wrong TOML. FileError: the file can't be read.
+            ConfigError: another form of text, or wrong TOML. FileError: the file can't be read.
         """
         values: dict[str, tuple[object, ...]] = {}
         for text in given:
@@ -49,10 +49,10 @@ class SettingsGrid:
         return tuple(name for name, values in self.values.items() if len(values) > 1)
 
     def settings(self) -> Iterator[tuple[str, NightSettings]]:
-        """Return each combination once, with the settings that differ as its name; the defaults first.
+        """Yield each combination once, labelled by its varied settings; the defaults first.
 
         Raises:
-            ConfigError, InvalidValue: as `NightSettings.of`; or what is told to a part that no night has.
+            ConfigError, InvalidValue: as `NightSettings.of`; or a setting of a part that no night has.
         """
         fixed = {name: values[0] for name, values in self.values.items() if len(values) == 1}
         nights = [(chosen, NightSettings.of(fixed | chosen)) for chosen in [{}, *self._combinations()]]

@@ -1,4 +1,4 @@
-"""One simulated night, without any process: a scan every so often, and a tracker that follows the sample."""
+"""One simulated night without processes: scans at a fixed interval, and a tracker that follows the sample."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from afspm.simulation import World
 
 Array = NDArray[np.float64]
 
-SETTLED_S = 7200.0  # the rate is not known at the start: that is another matter than following it
+SETTLED_S = 7200.0  # at the start the rate is unknown; the metrics judge tracking after that
 _95_PERCENT = -2.0 * math.log(0.05)  # of the square of a normal error of two components, in standard deviations
 
 
@@ -30,9 +30,9 @@ class SimulatedNight:
 
     Attributes:
         record: scan by scan, without the second direction of the first one.
-        truth_m: (n, 2) what the drift was at the middle of each scan, from the first on.
-        rescans: how many scans were taken again.
-        lost: whether the tracker ever said that it was lost.
+        truth_m: (n, 2) true drift at the middle of each scan, from the first on.
+        rescans: number of rescans.
+        lost: whether the tracker was ever lost.
     """
 
     record: DriftRecord
@@ -48,11 +48,11 @@ class SimulatedNight:
 
     @property
     def unknown_m(self) -> Array:
-        """Believed minus true drift after each scan, (n, 2)."""
+        """Estimated minus true drift after each scan, (n, 2)."""
         return self.record.drift_m - self.record.drift_m[:1] - self.truth_m
 
     def metrics(self) -> dict[str, float]:
-        """Return the numbers by which nights are compared; lengths in nm."""
+        """Return the metrics for comparing nights; lengths in nm."""
         settled = self.record.time_s - self.record.time_s[0] >= min(SETTLED_S, np.ptp(self.record.time_s) / 4)
         misplaced, unknown = 1e9 * self.misplaced_m, self.unknown_m
         inverse = np.linalg.pinv(self.record.covariance_m2[1:])
@@ -70,10 +70,10 @@ class SimulatedNight:
 
 
 def night(settings: NightSettings, seed: int) -> SimulatedNight:
-    """Simulate a night. The same seed is the same sample, drift and noise for all settings.
+    """Simulate a night. Equal seeds give equal sample, drift and noise, for all settings.
 
     Raises:
-        ConfigError: settings without a meaning.
+        ConfigError: meaningless settings.
     """
     world = World.from_settings(_world(settings, seed), seed, 0.0)
     following = tracker(settings.tracker, estimator(settings.estimator))

@@ -1,4 +1,4 @@
-"""Recorded scans as drift sees them."""
+"""Recorded scans in the form of `DriftScan`."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Series:
     Attributes:
         channel, unit: of the values.
         scans: each with the name of its file as the key; in tip coordinates.
-        left_out: what can't be followed, and why.
+        left_out: for each file left out, the reason.
     """
 
     channel: str
@@ -30,10 +30,10 @@ class Series:
 
 
 def series(contents: Sequence[FileContent], channel: str = "") -> Series:
-    """Return the scans of one channel; without a name, that of the topography of most files.
+    """Return the scans of one channel; without a name, of the most frequent topography channel.
 
     Raises:
-        InvalidValue: there are no two scans of it.
+        InvalidValue: it has fewer than two scans.
     """
     name = channel or topography(contents)
     found: list[DriftScan] = []
@@ -59,7 +59,7 @@ def topography(contents: Sequence[FileContent]) -> str:
     """Return the channel that is the topography of most files.
 
     Raises:
-        InvalidValue: none has one.
+        InvalidValue: no file has a topography.
     """
     heights = Counter(content.topography.channel for content in contents if content.topography is not None)
     if not heights:
@@ -68,7 +68,7 @@ def topography(contents: Sequence[FileContent]) -> str:
 
 
 def drift_scan(scan: Scan, content: FileContent) -> DriftScan:
-    """Return one channel of a file. Without a duration it counts as taken when it was finished."""
+    """Return one channel of a file. Without a start time, the scan counts as taken at its end."""
     end_ns = content.end_ns if content.end_ns is not None else content.start_ns
     start_ns = content.start_ns if content.start_ns is not None else end_ns
     if start_ns is None or end_ns is None:

@@ -20,14 +20,14 @@ class NightSettings:
 
     Attributes:
         surface: kind of the sample, see `afspm.simulation`.
-        size_m, pixels: of the square that is scanned.
-        every_s: from the beginning of one scan to that of the next.
+        size_m, pixels: of the scanned square.
+        every_s: from the beginning of one scan to the beginning of the next.
         line_s: of trace and retrace together.
-        hours: how long.
-        drift_m: how far the sample goes in the end; its direction, and a random walk besides, follow from the seed.
-        rescan: when a scan is taken again, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
-        tolerance_m: for that rule; None: a tenth of the size.
-        f_rescan: for that of the paper.
+        hours: duration.
+        drift_m: displacement of the sample at the end; its direction and an added random walk follow from the seed.
+        rescan: when a rescan is taken, see `afspm.plugins.drift.overlap`: "tolerance", "paper" or "never".
+        tolerance_m: for the rule "tolerance"; None: a tenth of the size.
+        f_rescan: for the rule "paper".
         at_start: "up-down": the first place is scanned in both directions, as by the scheduler's default; "nothing".
         estimator, tracker: "class" and settings.
     """
@@ -54,23 +54,21 @@ class NightSettings:
         if self.pixels * self.line_s > self.every_s:
             raise InvalidValue(
                 f"a scan of {self.pixels * self.line_s:g} s does not fit into {self.every_s:g} s",
-                hint="less pixels, a shorter line_s or a longer every_s",
+                hint="fewer pixels, a shorter line_s or a longer every_s",
             )
         if self.scans < 2:
             raise InvalidValue(f"{self.hours:g} h with a scan every {self.every_s:g} s are not two scans")
 
     @property
     def scans(self) -> int:
-        """Return how many scans are planned."""
         return int(self.hours * 3600.0 / self.every_s + 1e-9)
 
     @classmethod
     def of(cls, names: Table) -> NightSettings:
-        """Make settings from names: fields, and "paper.queue" for a setting of the tracker (estimator) "paper" where it
-        is chosen.
+        """Return the settings from names: fields, and "paper.queue" for a setting of the chosen tracker or estimator.
 
         Raises:
-            ConfigError: unknown names. InvalidValue: values that don't fit each other.
+            ConfigError: unknown names. InvalidValue: values that contradict each other.
         """
         plain: Plain = {name: value for name, value in names.items() if "." not in name}
         known = [one.name for one in fields(cls)]
@@ -83,7 +81,7 @@ class NightSettings:
             table = plain.get(part, {})
             table = {"class": table} if isinstance(table, str) else dict(table)
             table.setdefault("class", _DEFAULTS[part])
-            plain[part] = table | _told(table["class"], names)
+            plain[part] = table | _settings_of(table["class"], names)
         return cls(**plain)
 
 
@@ -93,6 +91,6 @@ STARTS = ("up-down", "nothing")
 _DEFAULTS = {"estimator": DEFAULT_ESTIMATOR, "tracker": DEFAULT_TRACKER}
 
 
-def _told(name: str, names: Table) -> dict[str, object]:
+def _settings_of(name: str, names: Table) -> dict[str, object]:
     before = f"{name}."
     return {key.removeprefix(before): value for key, value in names.items() if key.startswith(before)}

@@ -9,7 +9,7 @@ from statistics import median
 import numpy as np
 
 BY = "misplaced rms"
-"""What settings are judged by: how far off their place scans are taken, once the rate is known."""
+"""The metric of the ranking: misplacement of scans, once the rate is known."""
 
 
 @dataclass(frozen=True)
@@ -17,11 +17,11 @@ class Summary:
     """The nights of one combination of settings.
 
     Attributes:
-        label: what it is called.
-        nights: how many came to their end.
-        failed: why the others did not.
+        label: its name in the table.
+        nights: number of completed nights.
+        failed: errors of the other nights.
         quartiles: of each metric: lower quartile, median, upper quartile.
-        is_default, is_best: which it is.
+        is_default, is_best: whether these settings are the defaults, the best.
         holds: for the defaults, whether they are as good as the best: their median lies within its spread.
     """
 
@@ -35,18 +35,18 @@ class Summary:
 
     @property
     def median(self) -> float:
-        """Median of the metric of the ranking; infinite without a night."""
+        """Median of the ranking metric; infinite without a night."""
         return self.quartiles[BY][1] if self.nights else float("inf")
 
 
 def summarised(
     labels: Sequence[str], metrics: Mapping[str, Sequence[Mapping[str, float]]], failed: Mapping[str, Sequence[str]]
 ) -> list[Summary]:
-    """Return one summary for each label, best first. The first label is that of the defaults.
+    """Return one summary for each label, best first. The first label belongs to the defaults.
 
     Args:
-        metrics: of the nights, by label. Nights that were lost count as infinitely bad.
-        failed: why other nights did not come to their end, by label.
+        metrics: of the nights, by label. Lost nights count as infinitely bad.
+        failed: errors of nights that were not completed, by label.
     """
     rows = [_row(label, metrics.get(label, ()), failed.get(label, ()), labels[0]) for label in labels]
     rows.sort(key=lambda row: row.median)
@@ -65,7 +65,7 @@ def _honest(metrics: Mapping[str, float], name: str) -> float:
 
 
 def _quartiles(values: Sequence[float]) -> tuple[float, float, float]:
-    # of the values themselves: between a number and infinity there is nothing
+    # of the values themselves: interpolation with infinity is impossible
     lower = float(np.percentile(values, 25, method="lower"))
     upper = float(np.percentile(values, 75, method="higher"))
     return lower, float(median(values)), upper

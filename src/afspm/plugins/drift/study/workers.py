@@ -1,4 +1,4 @@
-"""Many independent tasks, on the cores of this computer or on a Dask cluster. A worker that dies costs only time."""
+"""Many independent tasks, on the cores of this computer or on a Dask cluster. A dead worker costs only time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 
 from afspm.basics.errors import AfspmError, ConfigError
 
-_FEW_PIXELS = 100_000  # of all scans: to register these takes no longer than to start a process for it
-_MOST_DEATHS = 3  # of workers one after the other while nothing gets done
+_FEW_PIXELS = 100_000  # of all scans: up to here, starting processes takes longer than the registration
+_MOST_DEATHS = 3  # of workers in a row without a finished task
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class TaskOutcome:
     """The result or the error of a task.
 
     Attributes:
-        index: which one.
-        value: what it returned, None if it failed.
-        error: how it failed, for a person.
+        index: of the task.
+        value: its return value, None if it failed.
+        error: for a person; empty if it succeeded.
     """
 
     index: int
@@ -33,7 +33,7 @@ class TaskOutcome:
 
 
 def processes(asked: int | None, pixels: int) -> int:
-    """Return the number of processes: `jobs`, or one a core where that pays."""
+    """Return the requested number of processes, or by default one per core where that pays."""
     if asked is not None:
         return asked
     return 1 if pixels <= _FEW_PIXELS else os.cpu_count() or 1
@@ -42,7 +42,7 @@ def processes(asked: int | None, pixels: int) -> int:
 def on_cores(
     function: Callable[..., object], tasks: Sequence[tuple[object, ...]], *, jobs: int
 ) -> Iterator[TaskOutcome]:
-    """Yield the outcomes of `function(*task)`, as they come, from `jobs` processes (1: in this one)."""
+    """Yield the outcomes of `function(*task)`, in any order, from `jobs` processes (1: in this one)."""
     if jobs <= 1:
         for index, task in enumerate(tasks):
             yield _done(function, index, task)
@@ -69,7 +69,7 @@ def on_cluster(
     The task of a dead worker goes to another.
 
     Raises:
-        ConfigError: `distributed` is not installed, or nobody answers at the address.
+        ConfigError: `distributed` is not installed, or the address does not answer.
     """
     try:
         distributed: Any = importlib.import_module("distributed")
@@ -89,8 +89,8 @@ def on_cluster(
 def _until_one_dies(
     function: Callable[..., object], left: dict[int, tuple[object, ...]], jobs: int
 ) -> Iterator[TaskOutcome]:
-    # a dead worker ends all others
-    # spawn: the same on all systems, and none of the threads of numpy are copied half
+    # a dead worker breaks the whole pool
+    # spawn: the same on all systems, and no copy of numpy's threads in an undefined state
     with ProcessPoolExecutor(min(jobs, len(left)), mp_context=multiprocessing.get_context("spawn")) as pool:
         try:
             futures = [pool.submit(_done, function, index, task) for index, task in left.items()]
@@ -106,8 +106,8 @@ def _result(future: Any, index: int) -> TaskOutcome:
     # a task is done again if its worker died before the result was fetched
     try:
         outcome: TaskOutcome = future.result()
-    except Exception as error:  # of the cluster: a task tells its own
-        return TaskOutcome(index, error=_told(error))
+    except Exception as error:  # errors of the cluster itself, of any kind: errors of the task are in its outcome
+        return TaskOutcome(index, error=_error_text(error))
     return outcome
 
 
@@ -115,9 +115,9 @@ def _done(function: Callable[..., object], index: int, task: tuple[object, ...])
     # errors are returned as text: not every exception can be pickled
     try:
         return TaskOutcome(index, function(*task))
-    except Exception as error:
-        return TaskOutcome(index, error=_told(error))
+    except Exception as error:  # a task may run a user's own estimator, which may raise anything
+        return TaskOutcome(index, error=_error_text(error))
 
 
-def _told(error: BaseException | None) -> str:
+def _error_text(error: BaseException | None) -> str:
     return str(error) if isinstance(error, AfspmError) else f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Trackers by name, users' own, and forecasts from JSON.
+"""Trackers by name, a user's own, and forecasts from JSON.
 
 tracker("bank", estimator)
 tracker({"class": "paper", "w_update": 0.8}, estimator)
@@ -33,11 +33,12 @@ def tracker(spec: str | PlainMapping = DEFAULT, estimator: Estimator | None = No
     """Return a tracker by name.
 
     Args:
-        spec: a name that a package declares or "module.Name", or a table with that as its `class` and its settings.
-        estimator: that it registers scans with, its first argument; the default one if there is none.
+        spec: a name that a package declares or "module.Name", or a table with such a name as its `class` and its
+            settings.
+        estimator: for its registrations, the tracker's first argument; None: the default one.
 
     Raises:
-        ConfigError: no such name, class or setting, a setting without a meaning, or a library that is missing.
+        ConfigError: no such name, class or setting, a meaningless setting, or a missing library.
     """
     made, name = named("tracker", spec, DEFAULT, default_estimator() if estimator is None else estimator)
     if not all(callable(getattr(made, method, None)) for method in ("add", "state", "restore")):

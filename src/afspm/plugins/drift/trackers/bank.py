@@ -24,7 +24,7 @@ from afspm.plugins.drift.tracking import Forecast, Prediction, Update, require_n
 Array = NDArray[np.float64]
 
 VERSION = 4
-_LIKE = 1.2  # a second surprise may differ from the first by so much of it: a new velocity doubles it
+_LIKE = 1.2  # largest relative difference of a second surprise that confirms the first: a new velocity doubles it
 
 
 @dataclass(eq=False)
@@ -34,14 +34,14 @@ class BankState:
     Attributes:
         filters: None before the first scan.
         similarity: rotation and scale; None: only translations are followed.
-        references: the scans that are kept, in the order of time, as in the filters' state.
-        compensation: with which tip coordinates follow the sample.
+        references: the stored scans, in the order of time, as in the filters' state.
+        compensation: velocity with which tip coordinates follow the sample.
         newest_s: the middle of the newest scan, which may have been dropped.
-        scans: how many there were.
+        scans: number of scans so far.
         unmatched: scans in a row that should have matched.
         proven: whether any two scans have matched; before, the first may be the unusable one.
-        doubted_m: (2,) where the newest scan was found, from where it was expected; None: not in doubt.
-        matched_s: the middle of the newest scan that has a place.
+        doubted_m: (2,) measured minus expected position of the newest scan; None: not in doubt.
+        matched_s: the middle of the newest scan with a measured place.
         lost: see `Update`.
     """
 
@@ -59,7 +59,7 @@ class BankState:
 
 
 class BankTracker:
-    """Filters that each expect drift to move differently, weighted by how well they foresaw it.
+    """A bank of filters with different models of drift, weighted by how well they predicted it.
 
     A scan is registered with several earlier ones: with recent ones, and with an anchor, the scan that first showed its
     part of the sample, for as long as that can be recognised. Each result measures the difference of two positions. The
@@ -67,23 +67,23 @@ class BankTracker:
     A position holds for the middle of a scan; where the overlap lies elsewhere, the time of its rows counts.
 
     A result far from every prediction is believed only if the next scan confirms it. A scan that matches no other is
-    adrift: it is stored at its predicted place, and proves nothing; neither do scans that match only scans adrift.
-    Their places relative to each other are still followed. After several such scans in a row the tracker is lost, as it
-    is after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
+    adrift: it is stored at its predicted place and is no evidence, nor are scans that match only scans adrift. Their
+    places relative to each other are still followed. After several such scans in a row the tracker is lost. It is lost
+    after one if the standard deviation of its position exceeds half of the misplacement at which scans can still be
     compared. A lost tracker searches everywhere. The first scan with a place ends that, and corrects the scans adrift.
 
     A scan that can be compared with no other, such as a zoom too fine for the overview, starts a series of its own. A
-    zoom is searched in an overview only where it is expected, and the tracker is not lost because an overview does not
-    show it clearly: one particle looks like the next.
+    zoom is searched in an overview only at its expected place. A zoom not recognised in an overview does not make the
+    tracker lost: one particle looks like the next.
 
-    With the transform "similarity", scans are straightened before all that: see `Similarity`.
+    With the transform "similarity", scans are first straightened: see `Similarity`.
 
     Args:
         estimator: gets the prediction as prior.
         settings: fields of `BankSettings` and `Choice`.
 
     Raises:
-        ConfigError: a setting without a meaning.
+        ConfigError: a meaningless setting.
     """
 
     def __init__(self, estimator: Estimator, **settings: object) -> None:
@@ -94,13 +94,11 @@ class BankTracker:
 
     @property
     def forecast(self) -> Forecast:
-        """See `Tracker`."""
         if (filters := self._state.filters) is None:
             return replace(BankForecast.at_start(), compensation=self._state.compensation)
         return self._forecast_of(filters)
 
     def add(self, scan: DriftScan) -> Update:
-        """See `Tracker`."""
         state = self._state
         require_newer(scan, state.newest_s)
         state.newest_s = scan.mid_s
@@ -113,19 +111,19 @@ class BankTracker:
             scan = state.similarity.straightened(scan)
         followed_m = state.compensation.followed_m(state.filters.time_s, scan.mid_s)
         filters = state.filters.moved(scan.mid_s, followed_m)
-        before = self._known(filters)
+        before = self._estimate(filters)
         compensated_m_s = state.compensation.velocity_m_s(scan.mid_s)
-        newest = NewestScan(scan, self._turned(filters, scan), compensated_m_s, state.similarity)
+        newest = NewestScan(scan, self._with_shear_velocity(filters, scan), compensated_m_s, state.similarity)
         anywhere = state.lost or self._is_blind(newest)
         tried = self._tried(newest, anywhere=anywhere)
         registrations = {self._references.kept[number].scan.key: found for number, found in tried.items()}
         found = self._compared(newest, tried)
         used = self._believed(newest, found, anywhere=anywhere)
-        placed = used is not None and any(self._proves(one.link.number) for one in used.measured)
+        placed = used is not None and any(self._is_evidence(one.link.number) for one in used.measured)
         state.unmatched = 0 if placed else state.unmatched + self._should_have_matched(scan, tried)
         self._learn(newest, used, tried, placed=placed)
-        after = self._known(state.filters)
-        # a scan that could be compared with none begins a row of its own, which is as far from the others as it is
+        after = self._estimate(state.filters)
+        # a scan without comparable references begins a series of its own, whose distance stays unknown
         if tried:
             state.lost = not placed and after.sd_m > self._limit_m(scan)
         state.lost |= state.unmatched >= self._settings.lost_after
@@ -134,7 +132,7 @@ class BankTracker:
             before=before,
             after=after,
             matched=placed,
-            reason=_coarsely(tried) if placed else _why_not(tried, found, adrift=used is not None),
+            reason=_coarse_reason(tried) if placed else _why_not(tried, found, adrift=used is not None),
             lost=state.lost,
             registrations=registrations,
             forecast=self.forecast,
@@ -145,7 +143,7 @@ class BankTracker:
         )
 
     def set_velocity(self, time_s: float, velocity_m_s: ArrayLike, covariance: ArrayLike) -> None:
-        """Take in a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
+        """Update by a drift velocity (2,) in tip coordinates from another measurement, with its covariance (2, 2).
 
         Raises:
             InvalidValue: before the first scan.
@@ -166,7 +164,7 @@ class BankTracker:
         state = self._state
         if state.newest_s is not None and time_s < state.newest_s:
             raise InvalidValue(
-                f"compensation since {time_s:g} s is told after a scan of {state.newest_s:g} s",
+                f"compensation since {time_s:g} s is reported after a scan of {state.newest_s:g} s",
                 hint="report it before the next scan",
             )
         velocity = np.asarray(velocity_m_s, dtype=np.float64)
@@ -182,24 +180,24 @@ class BankTracker:
         state.matched_s = scan.mid_s
         if settings.transform == "similarity":
             state.similarity = Similarity.at_start(scan)
-        now = self._known(state.filters)
+        now = self._estimate(state.filters)
         compensated_m_s = state.compensation.velocity_m_s(scan.mid_s)
         self._references.kept.append(ReferenceScan(scan, compensated_m_s, anchor=True, used=state.scans))
         return Update(
             scan.key, before, now, matched=True, reason="", lost=False, registrations={}, forecast=self.forecast
         )
 
-    def _turned(self, filters: Filters, scan: DriftScan) -> Filters:
-        # with the velocity from the shear against the scan before, if that was scanned the other way
+    def _with_shear_velocity(self, filters: Filters, scan: DriftScan) -> Filters:
+        # the shear against a scan in the other direction gives the velocity
         last = self._references.kept[-1].scan
         if last.upwards is None or scan.upwards is None or last.upwards == scan.upwards:
             return filters
-        if scan.mid_s - last.mid_s > 3.0 * max(scan.duration_s, last.duration_s):  # too long ago for one velocity
+        if scan.mid_s - last.mid_s > 3.0 * max(scan.duration_s, last.duration_s):  # too long for a constant velocity
             return filters
         found = velocity_from_up_down(last, scan, self._estimator)
         if not found.accepted:
             return filters
-        # The displacement between them will be compared like any other.
+        # only the shear is used here: the displacement is compared like any other later
         velocity = found.by_shear_m_s + self._state.compensation.velocity_m_s(found.time_s)
         return filters.with_velocity(found.time_s, velocity, found.by_shear_covariance, rarest=self._settings.rarest)
 
@@ -209,7 +207,7 @@ class BankTracker:
         return any(self._references.is_alike(number, scan) for number, one in tried.items() if not one.failure)
 
     def _is_blind(self, newest: NewestScan) -> bool:
-        # too uncertain where to look, against each of the scans that it can be compared with
+        # the prediction is too uncertain relative to each comparable reference
         kept = self._references.kept
         comparable = self._references.candidates(newest.scan, *_drifts(newest.filters), anywhere=True)
         spreads = (newest.expected(number, kept[number])[1] for number in comparable)
@@ -220,17 +218,17 @@ class BankTracker:
         widening = self._settings.widening * 4.0 ** min(self._state.unmatched, self._settings.lost_after)
         tried = {}
         for number in self._references.candidates(newest.scan, *_drifts(filters), anywhere=anywhere):
-            # in an overview a zoom fits many places: it is never looked for everywhere there
+            # a zoom fits many places of an overview, so it is never searched everywhere there
             everywhere = anywhere and self._references.is_alike(number, newest.scan)
             prior = None if everywhere else newest.prior(number, kept[number], widening)
             tried[number] = self._estimator.register(kept[number].scan, newest.scan, prior)
-        firm = [number for number in tried if self._proves(number)]
+        firm = [number for number in tried if self._is_evidence(number)]
         if not anywhere and not any(tried[number].accepted for number in firm):
-            # not where it was expected, or not to be recognised: somewhere else?
+            # not found at the expected place: search a few references everywhere
             elsewhere = [number for number in firm if self._references.is_alike(number, newest.scan)]
             for number in elsewhere[: self._settings.second_looks]:
                 again = self._estimator.register(kept[number].scan, newest.scan)
-                if again.accepted or not tried[number].failure:  # an error is not outweighed by a refusal
+                if again.accepted or not tried[number].failure:  # a refusal does not replace an error
                     tried[number] = again
         return tried
 
@@ -242,12 +240,12 @@ class BankTracker:
             for number, found in tried.items()
             if found.accepted
         ]
-        firm = [one for one in measured if self._proves(one.link.number)] or measured
+        firm = [one for one in measured if self._is_evidence(one.link.number)] or measured
         exact = [one for one in firm if not one.found.failure] or firm
         return Comparison(agreeing(exact, newest.filters), newest.filters) if measured else None
 
     def _believed(self, newest: NewestScan, found: Comparison | None, *, anywhere: bool) -> Comparison | None:
-        # a surprise is believed only where everything is possible, or after another like it
+        # a surprise is believed only without a prediction, or after a similar one
         state = self._state
         before, state.doubted_m = state.doubted_m, None
         if found is None or found.surprise <= self._settings.doubt:
@@ -256,7 +254,7 @@ class BankTracker:
         if not (anywhere or again):
             state.doubted_m = found.apart_m
             return None
-        # Either it jumped, or it is faster than was thought: the next scan will tell.
+        # either the sample jumped, or its velocity has changed: the next scan will show
         far_m, since_s = float(np.linalg.norm(found.apart_m)), newest.scan.mid_s - state.matched_s
         return replace(found, filters=found.filters.widened(far_m, far_m / max(since_s, 1.0)))
 
@@ -283,7 +281,7 @@ class BankTracker:
             state.proven = True
             judged = [number for number, one in tried.items() if number in numbers or not one.failure]
             references.judged({number: number in numbers for number in judged}, state.scans)
-            self._vouch(newest, {number: tried[number] for number in tried if tried[number].accepted})
+            self._clear_adrift(newest, {number: tried[number] for number in tried if tried[number].accepted})
         if state.similarity is not None:
             state.similarity = self._straightened(state.similarity, scan, used if placed else None)
         drift_m, drifts_m = _drifts(state.filters)
@@ -310,10 +308,10 @@ class BankTracker:
         adrift = [number for number, one in enumerate(self._references) if one.adrift]
         return filters.widened(self._limit_m(scan), self._settings.start_velocity_sd_m_s, scans=adrift)
 
-    def _proves(self, number: int) -> bool:
+    def _is_evidence(self, number: int) -> bool:
         return not (self._state.proven and self._references.kept[number].adrift)
 
-    def _vouch(self, newest: NewestScan, found: Table[int, Registration]) -> None:
+    def _clear_adrift(self, newest: NewestScan, found: Table[int, Registration]) -> None:
         # clear the adrift flag of references found at their predicted position
         state = self._state
         assert state.filters is not None
@@ -338,15 +336,14 @@ class BankTracker:
         straight = None if state.similarity is None else state.similarity.straight
         return BankForecast.of(filters, state.compensation, straight)
 
-    def _known(self, filters: Filters) -> Prediction:
+    def _estimate(self, filters: Filters) -> Prediction:
         return self._forecast_of(filters).at(filters.time_s)
 
     def _limit_m(self, scan: DriftScan) -> float:
-        # half of how far a scan may be off and still be compared
+        # half of the largest misplacement at which scans can be compared
         return (1.0 - self._references.choice.overlap_min) * min(scan.region.size_m) / 2
 
     def state(self) -> Plain:
-        """See `Tracker`."""
         return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: PlainMapping) -> None:
@@ -378,6 +375,6 @@ def _why_not(tried: Table[int, Registration], found: Comparison | None, *, adrif
     return "no earlier scan of this part of the sample is stored"
 
 
-def _coarsely(tried: Table[int, Registration]) -> str:
+def _coarse_reason(tried: Table[int, Registration]) -> str:
     failures = [one.failure for one in tried.values() if one.accepted]
     return failures[0] if failures and all(failures) else ""

@@ -1,9 +1,9 @@
-"""A bank of Kalman filters that share their measurements and differ in how drift may move.
+"""A bank of Kalman filters that share their measurements and differ in their models of motion.
 
-The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four of the same for
-each scan that is kept: the displacement at which it shows the sample, and the velocity during it. These stay correlated
-with each other and with the drift, so a scan that is compared many times does not count as many, and later knowledge
-counts (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
+The state of each is (x, y, v_x, v_y), the displacement of the sample and its velocity, followed by four states for each
+stored scan: the displacement at which it shows the sample, and the velocity during it. These stay correlated with each
+other and with the drift, so repeated comparisons with one scan are not counted as independent, and later measurements
+correct earlier ones (as landmarks in simultaneous localisation and mapping: Smith, Self and Cheeseman 1990).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SHORT = 1e-2  # of the fading time: below, differences of exponentials lose their digits and a series is exact enough
+_SHORT = 1e-2  # of the fading time: below, differences of exponentials lose digits, and a series is exact enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,8 +25,8 @@ class Models:
 
     Attributes:
         density_m2_s3: (n,) q, spectral density of the acceleration.
-        fading_per_s: (n,) 1 / tau; 0 for a velocity that stays.
-        walk_m2_s: (n,) variance that the position gains in a second by itself.
+        fading_per_s: (n,) 1 / tau; 0 for a constant velocity.
+        walk_m2_s: (n,) variance per second of a random walk of the position.
     """
 
     density_m2_s3: Array
@@ -34,21 +34,20 @@ class Models:
     walk_m2_s: Array
 
     def wandered_m2(self, duration_s: float) -> Array:
-        """Return the (n,) variance between the mean position over the rows of a scan and that in its middle.
+        """Return the (n,) variance between the mean position over the rows of a scan and the position in its middle.
 
         It is the integral of a walk and a random acceleration.
         """
         return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
-        """Return the effect of a time on a state (x, y, v_x, v_y): transition (n, 4, 4) and covariance gained (n, 4,
-        4).
+        """Return transition (n, 4, 4) and added covariance (n, 4, 4) of a state (x, y, v_x, v_y) over a time.
 
-        A negative time goes back in a straight line, and gains as much.
+        A negative time goes back in a straight line, and adds as much.
         """
         a, q, t = self.fading_per_s, self.density_m2_s3, abs(step_s)
-        reach_s = np.full_like(a, step_s)  # by which the velocity has moved the position
-        left = np.ones_like(a)  # of the velocity
+        reach_s = np.full_like(a, step_s)  # distance per initial velocity
+        left = np.ones_like(a)  # remaining share of the velocity
         if step_s > 0.0:
             left = np.exp(-a * t)
             reach_s = np.where(a > 0.0, -np.expm1(-a * t) / np.where(a > 0.0, a, 1.0), t)
@@ -87,7 +86,7 @@ class Filters:
     """Filters, n of them with s states each; immutable.
 
     Attributes:
-        models: how each moves.
+        models: the motion of each.
         time_s: of all of them.
         mean: (n, s), m and m/s.
         covariance: (n, s, s).
@@ -107,7 +106,7 @@ class Filters:
         """Return the filters after the first scan, from which positions are counted.
 
         Args:
-            position_sd_m: of where the sample is when the scan shows it at zero: its location error.
+            position_sd_m: location error of the first scan.
             duration_s: of the scan, through which the sample wandered.
         """
         n = len(models.density_m2_s3)
@@ -156,12 +155,11 @@ class Filters:
         return replace(self, mean=mean, covariance=covariance)
 
     def without_scan(self, number: int) -> Filters:
-        """Remove one of the stored scans."""
         kept = np.delete(np.arange(self.mean.shape[1]), range(4 + 4 * number, 8 + 4 * number))
         return replace(self, mean=self.mean[:, kept], covariance=self.covariance[:, kept][:, :, kept])
 
     def scan_drifts_m(self) -> Array:
-        """Return the (scans, 2) displacement that each scan shows, by all filters together."""
+        """Return the (scans, 2) displacement in each stored scan, averaged over the filters."""
         mean: Array = (self.weight @ self.mean)[4:].reshape(-1, 4)[:, :2]
         return mean
 
@@ -190,7 +188,7 @@ class Filters:
 
         Args:
             forget: share of the logarithm of the old weights that is kept.
-            rarest: least weight beside the largest: a filter that was wrong for long must be able to come back.
+            rarest: least weight relative to the largest: a filter that was wrong for long must be able to recover.
         """
         innovation = measured - self.mean @ rows.T
         crossed = self.covariance @ rows.T

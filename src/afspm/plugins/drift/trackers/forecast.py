@@ -1,4 +1,4 @@
-"""The forecast of a bank of filters: its knowledge, without the scans."""
+"""The forecast of a bank of filters: its prediction, without the scans."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Compensation:
         return followed
 
     def changed(self, since_s: float, velocity_m_s: Array, *, needed_s: float) -> Compensation:
-        """Return the same with another velocity from a time on, without changes older than `needed_s` needs."""
+        """Return the steps with another velocity from a time on, without steps that ended before `needed_s`."""
         before = [change for change in self.changes if change[0] < since_s]
         while len(before) > 1 and before[1][0] <= needed_s:
             del before[0]
@@ -61,12 +61,12 @@ class BankForecast:
 
     Attributes:
         time_s: of the states.
-        models: how they move on.
+        models: of motion.
         weight: (n,) probabilities.
         mean: (n, 4) displacement and velocity of the sample.
         covariance: (n, 4, 4).
-        compensation: with which tip coordinates follow the sample.
-        straight: from tip coordinates to those in which the sample is only displaced; None: they are the same.
+        compensation: velocity with which tip coordinates follow the sample.
+        straight: from tip coordinates to coordinates without rotation and scale of the sample; None: they are the same.
     """
 
     KIND: ClassVar = "bank forecast"
@@ -101,7 +101,6 @@ class BankForecast:
         )
 
     def at(self, time_s: float) -> Prediction:
-        """See `Forecast`."""
         step_s = time_s - self.time_s
         transition, gained = self.models.over(step_s)
         means = (transition @ self.mean[..., None])[..., 0]
@@ -115,5 +114,4 @@ class BankForecast:
         return Prediction(time_s, mapping, covariance[:2, :2], mean[2:], covariance[2:, 2:])
 
     def to_dict(self) -> Plain:
-        """See `Forecast`."""
         return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)

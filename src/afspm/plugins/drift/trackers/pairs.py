@@ -1,8 +1,8 @@
 """A registration as a measurement of the filters' state.
 
-A feature at tip position x of the reference j is found at x + d in the scan k, so d is the displacement of the sample
-when k passed it, less that when j did: d = X_k + t_k v_k - X_j - t_j v_j, with X where a scan shows the sample at its
-middle, v the velocity in tip coordinates, and t how much later than its middle its rows passed the overlap.
+A feature at tip position x of the reference j is found at x + d in the scan k. So d is the displacement of the sample
+when k passed it, minus its displacement when j did: d = X_k + t_k v_k - X_j - t_j v_j. X is the displacement at the
+middle of a scan, v the velocity in tip coordinates, and t the delay from the middle to the rows of the overlap.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from afspm.plugins.drift.trackers.similarity import Similarity
 Array = NDArray[np.float64]
 
 AGREEMENT = 25.0  # chi2 of the difference of two references' results
-_ALIKE = 0.05  # by which part the courses of two scans may differ if drift is to shear them alike
+_ALIKE = 0.05  # largest relative difference in pace at which drift shears two scans alike
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationModel:
-    """How d depends on the state.
+    """The dependence of d on the state.
 
     Attributes:
         number: of the reference.
         scan_delay_s, reference_delay_s: t_k and t_j.
-        offset_m: (2,) what is known of d besides the state.
-        noise_m2: (2, 2) of that.
+        offset_m: (2,) the part of d independent of the state.
+        noise_m2: (2, 2) of the offset.
     """
 
     number: int
@@ -44,8 +44,11 @@ class ObservationModel:
     noise_m2: Array
 
     def rows(self, states: int, scan_at: int) -> Array:
-        """Return the (2, states) rows whose product with the state is d - offset; `scan_at` is the scan's own
-        position."""
+        """Return the (2, states) rows whose product with the state is d - offset.
+
+        Args:
+            scan_at: index of the scan's own position in the state.
+        """
         rows, first = np.zeros((2, states)), 4 + 4 * self.number
         for axis in range(2):
             rows[axis, scan_at + axis] = 1.0
@@ -60,8 +63,8 @@ class NewestScan:
     """The scan under comparison, and the knowledge at that time.
 
     Attributes:
-        compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's is more by that.
-        similarity: rotation and scale, which the scan is straightened by; None: only translations are followed.
+        compensated_m_s: (2,) velocity with which tip coordinates follow the sample; the state's velocity includes it.
+        similarity: rotation and scale for straightening the scan; None: only translations are followed.
     """
 
     scan: DriftScan
@@ -87,7 +90,7 @@ class NewestScan:
 
     def _either_way(self, scan: DriftScan, position_m: Array, number: int | None, compensated_m_s: Array) -> Array:
         # (2, 2) of the displacement between a scan's middle and a position, with its direction unknown
-        delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # as much later as earlier
+        delay_s = row_delay_s(replace(scan, upwards=True), position_m) or 0.0  # later or earlier by the same time
         velocity, covariance = self.filters.velocity(number)
         velocity = velocity - compensated_m_s
         return np.asarray(delay_s**2 * (np.outer(velocity, velocity) + covariance))
@@ -105,7 +108,7 @@ class NewestScan:
         return mean + link.offset_m, covariance + link.noise_m2
 
     def prior(self, number: int, reference: ReferenceScan, widening: float) -> Prior:
-        """Return the prior for an estimator, widened by half a pixel, so that it looks around."""
+        """Return the prior for an estimator, widened by half a pixel so that it searches around the expectation."""
         mean, covariance = self.expected(number, reference)
         half_px_m = max(*self.scan.pixel_m, *reference.scan.pixel_m) / 2
         covariance = widening * covariance + np.eye(2) * half_px_m**2
@@ -131,7 +134,7 @@ class PairMeasurement:
     """The result of an estimator as a measurement.
 
     Attributes:
-        pair_noise_m2, scan_noise_m2: (2, 2) what of its error is the pair's, and what the location error of the scan.
+        pair_noise_m2, scan_noise_m2: (2, 2) the parts of its error from the pair, and from the scan's location error.
     """
 
     link: ObservationModel
@@ -160,7 +163,7 @@ class PairMeasurement:
 
 
 def agreeing(measured: list[PairMeasurement], filters: Filters) -> list[PairMeasurement]:
-    """Return the largest group of results that fit together; of equally large ones the group of the best reference."""
+    """Return the largest consistent group of results; of equally large ones the group of the best reference."""
     if len(measured) < 2:
         return measured
     states = filters.mean.shape[1]

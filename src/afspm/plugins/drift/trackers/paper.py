@@ -28,7 +28,10 @@ TRANSFORMS = ("translation", "euclidean", "similarity", "affine")
 
 
 def transform_between(found: Registration, form: str) -> Mapping:
-    """Return the transform from tip coordinates during the reference to those during the scan, of the nearest form."""
+    """Return the transform from tip coordinates during the reference to tip coordinates during the scan.
+
+    It is the nearest one of the given form.
+    """
     linear = _of_form(np.eye(2) + found.linear, form)
     center = found.center_m if form != "translation" else np.zeros(2)
     return Mapping.of(linear, center + found.displacement_m - linear @ center)
@@ -79,7 +82,7 @@ class PaperForecast:
     Attributes:
         time_s: middle of the newest scan.
         matrix: M_k, 3 x 3.
-        rate: (3, 3) logarithm of the last step by its duration, 1/s.
+        rate: (3, 3) logarithm of the last step over its duration, 1/s.
         covariance_m2: (2, 2) of the newest scan's position.
         rate_covariance: (2, 2), (m/s)².
     """
@@ -93,8 +96,10 @@ class PaperForecast:
     rate_covariance: Array
 
     def at(self, time_s: float) -> Prediction:
-        """M_k times the step that the last rate makes of the time since; of its translation alone once that has gone
-        on for so long that no sample would turn out like it."""
+        """Return M_k times the step of the last rate over the time since.
+
+        Where that would stretch the sample beyond belief, only the translation of the step is used.
+        """
         since_s = time_s - self.time_s
         step = exponential(self.rate * since_s)
         if not np.isfinite(step).all() or unlike_drift(step[:2, :2]):
@@ -107,7 +112,6 @@ class PaperForecast:
         return Prediction(time_s, mapping, covariance, velocity, self.rate_covariance)
 
     def to_dict(self) -> Plain:
-        """See `Forecast`."""
         return snapshot(self, self.KIND, FORECAST_VERSION, lists=True)
 
 
@@ -125,7 +129,7 @@ class PaperState:
 
     Attributes:
         forecast: with the newest scan.
-        newest_s: the middle of that; None: there is none yet.
+        newest_s: the middle of the newest scan; None: there is none yet.
         residual_m2: mean square of the last residuals.
         unmatched: scans in a row that should have matched.
         queue: C, the oldest first.
@@ -139,26 +143,26 @@ class PaperState:
 
 
 class PaperTracker:
-    """The scheme of the paper, as it is written there.
+    """The paper's scheme, unchanged.
 
     Each scan is first predicted, M'_k = M_(k-1) dM^_k with dM^_k the rate of the last step times the time since, and
     then corrected by the residual dM~_k against the oldest scan of the queue for which estimation succeeds:
-    M_k = M'_k dM~_k. What the paper leaves open: times are those of the middle of the scans; without a rate the
-    prediction is the identity; a scan without a match joins the queue where it was predicted. The paper knows no
-    uncertainty: that of a prediction is the mean square of the last residuals.
+    M_k = M'_k dM~_k. Choices that the paper leaves open: times are the middles of the scans; without a rate the
+    prediction is the identity; an unmatched scan joins the queue at its predicted place. The paper has no uncertainty:
+    here the variance of a prediction is the mean square of the last residuals.
 
     Args:
         estimator: gets no prior.
-        transform: what a mapping may do, "translation", "euclidean", "similarity" or "affine".
-        w_update: share of the estimated residual that is believed; 1: all of it, 0: prediction alone.
-        queue: l, scans that are kept.
+        transform: form of the mapping, "translation", "euclidean", "similarity" or "affine".
+        w_update: weight of the estimated residual; 1: all of it, 0: prediction alone.
+        queue: l, number of stored scans.
         f_min: least intersection ratio of a pair, in sample coordinates.
         sr_norm_min: least ratio of their resolutions.
-        lost_after: so many scans one after the other that should have matched and did not mean that it is lost (ours;
-            the paper goes on).
+        lost_after: scans in a row that should have matched and did not, after which the tracker is lost (afspm's; the
+            paper goes on).
 
     Raises:
-        ConfigError: a setting without a meaning.
+        ConfigError: a meaningless setting.
     """
 
     def __init__(
@@ -188,11 +192,9 @@ class PaperTracker:
 
     @property
     def forecast(self) -> Forecast:
-        """See `Tracker`."""
         return self._state.forecast
 
     def add(self, scan: DriftScan) -> Update:
-        """See `Tracker`."""
         state = self._state
         require_newer(scan, state.newest_s)
         first = state.newest_s is None
@@ -200,7 +202,7 @@ class PaperTracker:
         placed, tried, reason = (None, {}, "") if first else self._match(scan, before.mapping)
         matched = first or placed is not None
         mapping = before.mapping if placed is None else self._averaged(before.mapping, placed)
-        # elsewhere there is nothing to be found, and an error of the estimator says nothing about the sample
+        # only a refusal in an overlap counts: an error of the estimator means nothing about the sample
         state.unmatched = 0 if matched else state.unmatched + any(not one.failure for one in tried.values())
         self._step(scan, before, mapping, [one for one in tried.values() if one.accepted])
         state.queue.append(PlacedScan(scan, mapping))
@@ -266,7 +268,6 @@ class PaperTracker:
         state.newest_s = scan.mid_s
 
     def state(self) -> Plain:
-        """See `Tracker`."""
         return snapshot(self._state, "paper", VERSION)
 
     def restore(self, state: PlainMapping) -> None:

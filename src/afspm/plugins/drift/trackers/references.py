@@ -1,4 +1,4 @@
-"""The scans that are kept to compare later ones with, and which of them one is compared with."""
+"""The scans stored for comparison with later ones, and the choice of references for a scan."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class ReferenceScan:
     Attributes:
         compensated_m_s: (2,) velocity with which tip coordinates followed the sample then.
         anchor: whether it stands for its part of the sample.
-        adrift: no scan with a place matched it, so its place is a prediction.
-        refusals: how often in a row it could not be registered while another one could.
+        adrift: no scan with a measured place matched it, so its place is a prediction.
+        refusals: comparisons in a row without success, while another reference succeeded.
         used: number of the scan that was last registered with it.
     """
 
@@ -39,17 +39,17 @@ class ReferenceScan:
 
 @dataclass(frozen=True)
 class Choice:
-    """The settings by which references are stored and chosen.
+    """Settings for storing and choosing references.
 
     Attributes:
-        compared: at most so many references for each scan.
-        recent: scans that are kept besides the anchors.
-        anchors: at most so many.
-        most_bytes: of all values that are kept.
-        overlap_min: least share of the smaller scan that both have seen.
+        compared: largest number of references for each scan.
+        recent: stored scans besides the anchors.
+        anchors: largest number of anchors.
+        most_bytes: of all stored values.
+        overlap_min: least overlap, as share of the smaller scan.
         sr_norm_min: least ratio of the resolutions.
-        stale_after: refusals in a row after which an anchor is given up.
-        alike: share of a scan that an anchor must have seen, at half its resolution at least, to stand for it.
+        stale_after: refusals in a row after which an anchor is removed.
+        alike: share of a scan that an anchor must show, at half its resolution at least, to stand for it.
     """
 
     compared: int = 5
@@ -63,7 +63,7 @@ class Choice:
 
 
 class ReferenceScans:
-    """The stored scans, in the order of time. Displacements (…, 2) are those of the sample, in m."""
+    """The stored scans, in the order of time. Displacements (…, 2) of the sample are in m."""
 
     def __init__(self, choice: Choice) -> None:
         self.choice = choice
@@ -78,16 +78,13 @@ class ReferenceScans:
     def candidates(self, scan: DriftScan, drift_m: Array, drifts_m: Array, *, anywhere: bool) -> list[int]:
         """Return the numbers of the references to compare with a scan, best first.
 
-        Scans adrift, which prove nothing, come last. Anchors of the same resolution come first, then the newest, which
-        show recent changes.
-
-        Those adrift, which prove nothing, come last. Anchors of the same resolution come first, then the newest: the
-        others show what may have changed since.
+        Scans adrift, which are no evidence, come last. Anchors of the same resolution come first, then the newest,
+        which show recent changes.
 
         Args:
             drift_m: (2,) expected in the scan.
             drifts_m: (n, 2) shown by the references.
-            anywhere: the expectation is not to be trusted, so all may overlap.
+            anywhere: ignore the expectation, so all may overlap.
         """
         fitting = []
         for number, kept in enumerate(self.kept):
@@ -107,11 +104,11 @@ class ReferenceScans:
         return [number for _, number in sorted(fitting)][: self.choice.compared]
 
     def is_alike(self, number: int, scan: DriftScan) -> bool:
-        """True if a reference has about the resolution of a scan, not that of an overview of it."""
+        """Return whether a reference has about the resolution of a scan, unlike an overview of a zoom."""
         return _alike(self.kept[number].scan, scan) >= _LIKE
 
     def judged(self, tried: Table[int, bool], step: int) -> None:
-        """Count which references could be registered with the newest scan."""
+        """Count for each reference whether it could be registered with the newest scan."""
         for number, succeeded in tried.items():
             kept = self.kept[number]
             if succeeded:
@@ -125,7 +122,7 @@ class ReferenceScans:
             self.kept[number] = replace(self.kept[number], adrift=False)
 
     def needs_anchor(self, scan: DriftScan, drift_m: Array, drifts_m: Array) -> bool:
-        """True if no anchor stands for the area of a scan."""
+        """Return whether no anchor stands for the area of a scan."""
         return not any(
             kept.anchor
             and self.is_alike(number, scan)

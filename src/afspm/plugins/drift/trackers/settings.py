@@ -21,26 +21,28 @@ TRANSFORMS = ("translation", "similarity")
 
 @dataclass(frozen=True)
 class BankSettings:
-    """Measured on simulated nights with 2 µm scans every 15 minutes; wide enough for most microscopes.
+    """Settings of the bank, tuned on simulated nights with 2 µm scans every 15 minutes.
+
+    They are wide enough for most microscopes.
 
     Attributes:
         densities_m2_s3: of the acceleration: how fast the velocity of drift wanders.
-        fadings_s: after which a velocity is gone to 1/e; inf for one that stays.
-        walks_m2_s: variance that positions gain in a second besides. There is a filter for each density, fading and
+        fadings_s: time constants after which a velocity has decayed to 1/e; inf for a constant velocity.
+        walks_m2_s: variance per second of a random walk of the position. There is a filter for each density, fading and
             walk.
         jitter_m: standard deviation of a scan's position that no registration can measure.
         start_velocity_sd_m_s: standard deviation of the velocity at the start.
-        start_px: standard deviation of where the sample is found in the first scan, in its pixels.
-        forget: share of the logarithm of the weights of the filters that is kept from one scan to the next.
-        rarest: least weight of a filter, beside the largest.
-        inflation: of the covariance that an estimator gives, above 1. What exceeds 1 belongs to the pair, the rest half
+        start_px: standard deviation of the sample's position in the first scan, in its pixels.
+        forget: share of the logarithm of the filters' weights that is kept from one scan to the next.
+        rarest: least weight of a filter, relative to the largest.
+        inflation: factor on an estimator's covariance, above 1. The excess over 1 belongs to the pair, the rest half
             to each of its scans.
-        widening: of the covariance of an expected displacement, where the estimator is told to search.
-        doubt: chi2 above which a result is not believed before the next scan says so too.
-        second_looks: references that are searched without a prediction after none was found with it.
+        widening: factor on the covariance of an expected displacement, for the estimator's search.
+        doubt: chi2 above which a result is not believed until the next scan confirms it.
+        second_looks: references that are searched without a prediction if none matched with it.
         lost_after: scans in a row that should have matched and did not.
         transform: "translation"; or "similarity": rotation and scale are estimated as well.
-        linear_walk_per_s: variance that the angle (rad) and the logarithm of the scale gain in a second.
+        linear_walk_per_s: variance per second of the angle (rad) and of the logarithm of the scale.
     """
 
     densities_m2_s3: tuple[float, ...] = (1e-26, 1e-25, 1e-24, 1e-23, 1e-22, 1e-21)
@@ -79,10 +81,10 @@ class BankSettings:
 
     @classmethod
     def split(cls, settings: Plain) -> tuple[BankSettings, Choice]:
-        """Split settings into those of the bank and those of its references.
+        """Split settings into settings of the bank and settings of its references.
 
         Raises:
-            ConfigError: a name that neither has, or a value without a meaning.
+            ConfigError: a name that neither has, or a meaningless value.
         """
         own, others = ({field.name for field in dataclasses.fields(one)} for one in (cls, Choice))
         for name in settings:

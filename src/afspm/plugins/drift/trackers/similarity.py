@@ -1,8 +1,8 @@
-"""Rotation and scale of the sample, as a Kalman filter of two parameters: their change since the first scan.
+"""Rotation and scale of the sample since the first scan, as a Kalman filter of two parameters.
 
-Both are one complex number, the logarithm of the scale plus i times the angle in rad: those of successive changes add
-up. It wanders as a random walk from zero, so that it stays near zero unless registrations say otherwise. Beside the
-present, the state holds each reference that is kept, as the bank of filters does for positions.
+Both are one complex number, the logarithm of the scale plus i times the angle in rad: successive changes add up. It is
+a random walk from zero, so it stays near zero without evidence. Besides the present, the state holds each stored
+reference, as the bank of filters does for positions.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from afspm.plugins.drift.registration import DriftScan, LinearSeen
 
 Array = NDArray[np.float64]
 
-_SHEAR_SD = 0.03  # displacement per length along the slow axis, by drift during the scans: nothing is known of it
+_SHEAR_SD = 0.03  # displacement per length along the slow axis, by unknown drift during the scans
 _LEAST_SD = 1e-5  # of a measurement
-_DOUBT = 25.0  # chi2 above which a measurement is not believed before the next one is like it
+_DOUBT = 25.0  # chi2 above which a measurement is not believed until the next one confirms it
 _OF_SCALE, _OF_ANGLE = np.array([1.0, 0.0, 0.0, 1.0]), np.array([0.0, -1.0, 1.0, 0.0])
 
 
@@ -32,15 +32,12 @@ class Similarity:
     Scans are registered straightened, with the known rotation and scale of their time undone. In these coordinates, u =
     straight(x_tip), the sample is only displaced, x_sample = u - drift.
 
-    Scans are registered straightened: with the rotation and scale undone that are known of their time. In these
-    coordinates, u = straight(x_tip), the sample is only displaced, x_sample = u - drift.
-
     Attributes:
         straight: from tip coordinates to straightened ones, now.
-        pivot_m: (2,) where the sample was seen last, straightened: what is learned turns about this place.
-        error: (1 + n,) complex, expected rotation and scale that `straight` leaves, and that each reference has left.
+        pivot_m: (2,) the last place of the sample, straightened: later corrections rotate about this place.
+        error: (1 + n,) complex, expected rotation and scale left by `straight` now, and in each reference.
         covariance: (1 + n, 1 + n), of scale and angle alike.
-        doubted: the newest measurement was far from what was expected.
+        doubted: the newest measurement was far from its expectation.
     """
 
     straight: Mapping
@@ -51,7 +48,7 @@ class Similarity:
 
     @classmethod
     def at_start(cls, scan: DriftScan) -> Similarity:
-        """Return the state after the first scan, which is neither turned nor stretched by definition."""
+        """Return the state after the first scan, which by definition has no rotation and scale 1."""
         return cls(Mapping.identity(), np.array(scan.region.center_m), np.zeros(2, complex), np.zeros((2, 2)))
 
     @property
@@ -64,13 +61,13 @@ class Similarity:
         return replace(scan, region=replace(self.straight.to_sample(scan.region), frame=Frame.TIP))
 
     def moved(self, variance: float) -> Similarity:
-        """Return the state later, when the present may have changed by a variance."""
+        """Return a later state, with this variance added to the present."""
         covariance = self.covariance.copy()
         covariance[0, 0] += variance
         return replace(self, covariance=covariance)
 
     def lever_m2(self, number: int, position_m: Array) -> Array:
-        """Return the (2, 2) covariance of a displacement from a reference by the uncertain turn about the pivot."""
+        """Return the (2, 2) covariance of a displacement from a reference by the uncertain rotation about the pivot."""
         row = self._row(number)
         far_m = position_m - self.pivot_m
         return np.asarray(np.eye(2) * (row @ self.covariance @ row) * (far_m @ far_m))
@@ -90,7 +87,7 @@ class Similarity:
         return replace(self, error=error, covariance=(covariance + covariance.T) / 2, doubted=False)
 
     def straight_about(self, position_m: Array) -> Similarity:
-        """Take the expected error out about a place (2,), where displacements stay the same."""
+        """Remove the expected error about a place (2,), where displacements stay the same."""
         error = self.error.copy()
         undone = _turned_about(position_m, -error[0])
         error[0] = 0.0
@@ -102,7 +99,6 @@ class Similarity:
         return replace(self, error=self.error[now], covariance=self.covariance[np.ix_(now, now)])
 
     def without_scan(self, number: int) -> Similarity:
-        """Remove one of the references."""
         kept = np.delete(np.arange(len(self.error)), 1 + number)
         return replace(self, error=self.error[kept], covariance=self.covariance[np.ix_(kept, kept)])
 
@@ -127,12 +123,9 @@ class SimilarityMeasurement:
 
     @classmethod
     def of(cls, seen: LinearSeen, scans: tuple[DriftScan, DriftScan], inflation: float) -> SimilarityMeasurement:
-        """Fit rotation and scale to a linear part by generalised least squares, beside a shear by drift during either
-        scan.
+        """Fit rotation and scale to a linear part by generalised least squares, besides a shear by drift.
 
-        Such a shear displaces whole rows, so changes along a row carry most of the information.
-
-        Such a shear displaces rows as a whole, so what depends on the position along a row tells the most.
+        A shear by drift during a scan displaces whole rows, so changes along a row carry most of the information.
         """
         covariance = seen.covariance + _LEAST_SD**2 * np.eye(4)
         for scan in scans:

@@ -1,4 +1,4 @@
-"""The experiment in the browser: seen by everybody, steered by those who may."""
+"""The experiment in the browser: shown to every viewer, steered by viewers who have signed in."""
 
 from __future__ import annotations
 

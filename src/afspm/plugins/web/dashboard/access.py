@@ -1,4 +1,4 @@
-"""Access to the dashboard: who may look or steer, by a cookie or by a password shown with a request."""
+"""Access to the dashboard: viewers and persons who may steer, by a cookie or by a password with each request."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Visitor:
     """A viewer of the page.
 
     Attributes:
-        person: the name; empty: only looks.
-        cookie: of the session; empty for a program that shows its password with each request.
-        recorded: what is shown is a recorded night, in which nothing can be steered.
+        person: the name; empty: may only look.
+        cookie: of the session; empty for a program that sends its password with each request.
+        recorded: the page shows a recorded night, in which nothing can be steered.
     """
 
     person: str = ""
@@ -33,18 +33,18 @@ class Visitor:
 
 
 class Access:
-    """Decides whom the dashboard lets look, and whom it lets steer; see `Passwords`.
+    """Decides which viewers may look, and which may steer; see `Passwords`.
 
     Args:
-        host: the address that is listened at.
+        host: the address to listen at.
         password_hash: of the common password; the password itself may be in the environment instead
             (AFSPM_DASHBOARD_PASSWORD).
         people: the hash of each person's password.
-        now_s: the time in real seconds, for sessions and for how often an address may try.
-        sessions: who has signed in.
+        now_s: the time in real seconds, for sessions and for the rate of tries.
+        sessions: of viewers who have signed in.
 
     Raises:
-        ConfigError: other computers could reach it, and there is no password; or a hash or a name is none.
+        ConfigError: other computers could reach the page without a password; or a malformed hash or name.
     """
 
     def __init__(
@@ -73,11 +73,11 @@ class Access:
 
     @property
     def lets_look(self) -> bool:
-        """True if everybody may look."""
+        """True if every viewer may look."""
         return self._passwords.lets_look
 
     def visitor(self, cookie: str | None) -> Visitor | None:
-        """Return who shows a cookie; None: nobody who may come in."""
+        """Return the viewer of a cookie; None: access is refused."""
         session = self._sessions.find(cookie or "")
         if session is not None and session.proof == self._passwords.proof_of(session.person):
             return Visitor(session.person, cookie or "")
@@ -88,15 +88,15 @@ class Access:
         return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
 
     def person_of(self, visitor: Visitor) -> str:
-        """Return the name of a visitor who has signed in and not out again; empty for all others."""
+        """Return the name of a visitor who is signed in; empty for all others."""
         return check_name(visitor.person) if self.is_signed_in(visitor) else ""
 
     def by_password(self, person: str, password: str, address: str) -> Visitor | None:
-        """Return who shows a name and a password with a request; None if that is wrong, or was wrong too often."""
+        """Return the visitor with this name and password; None if the password is wrong, or was wrong too often."""
         return Visitor(person) if self._passwords.proves(person, password, address) else None
 
     def wait_s(self, person: str, address: str) -> float:
-        """Return the real seconds until a password of a person is looked at again from an address; 0: it is now."""
+        """Return the real seconds until another password of this person is checked from this address; 0: now."""
         return self._passwords.wait_s(person, address)
 
     def enter(self, person: str, password: str, address: str) -> str | None:
@@ -106,7 +106,7 @@ class Access:
         return self.cookie(person)
 
     def cookie(self, person: str) -> str:
-        """Begin a session; returns what the browser shows next time."""
+        """Begin a session; returns its cookie."""
         return self._sessions.begin(person, self._passwords.proof_of(person))
 
     def leave(self, cookie: str | None, *, everywhere: bool = False) -> None:

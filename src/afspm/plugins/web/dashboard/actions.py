@@ -20,7 +20,7 @@ from afspm.plugins.web.person_commands import PersonCommands
 from afspm.plugins.web.persons import Persons
 from afspm.plugins.web.watch import Watch
 
-_PAGE = ".page"  # no name of a person begins so
+_PAGE = ".page"  # no person's name begins with a dot
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ _NOT_SIGNED_IN = ActionResult("Sign in first: the record keeps the name with eac
 
 
 def not_signed_in() -> Future[ActionResult]:
-    """Return the answer to a person who has not signed in."""
+    """Return the result for a viewer who has not signed in."""
     done: Future[ActionResult] = Future()
     done.set_result(_NOT_SIGNED_IN)
     return done
 
 
 class Actions:
-    """Actions in the name of one person, for one thread. None raises for a refusal; it is in the result."""
+    """Actions in the name of one person, for one thread. A refusal is returned in the result, not raised."""
 
     def __init__(self, commands: PersonCommands, watch: Watch) -> None:
         self._commands = commands
@@ -57,30 +57,26 @@ class Actions:
     # --- the experiment ---
 
     def set_mode(self, mode: ControlMode) -> ActionResult:
-        """Set MANUAL or AUTOMATED."""
         return _result(self._commands.set_mode(mode), f"The mode is {mode.name}")
 
     def end(self) -> ActionResult:
-        """End the experiment for everybody."""
+        """End the experiment for everyone."""
         return _result(self._commands.end(), "The experiment is ending")
 
     def flag(self, problem: int) -> ActionResult:
-        """Flag a problem."""
         return _result(self._commands.flag(problem), f"{self._watch.problems.name(problem)} is flagged")
 
     def clear(self, problem: int) -> ActionResult:
-        """Remove the flag of a problem."""
         return _result(self._commands.clear(problem), f"{self._watch.problems.name(problem)} is cleared")
 
     def clear_all(self, problems: Sequence[int]) -> ActionResult:
-        """Remove the flags of these problems; the first refusal ends it."""
+        """Clear these problems, up to the first refusal."""
         for problem in problems:
             if not (result := self.clear(problem)).ok:
                 return result
         return ActionResult(f"Cleared {counted(len(problems), 'problem')}")
 
     def restart(self, process: str) -> ActionResult:
-        """Have a process ended and started anew."""
         return _result(self._commands.restart(process), f"{process} is being restarted")
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
@@ -90,10 +86,10 @@ class Actions:
     # --- the microscope, in MANUAL ---
 
     def stop_scan(self, *, by_manual: bool = False) -> ActionResult:
-        """Stop the scan or spectrum that runs.
+        """Stop the running scan or spectrum.
 
         Args:
-            by_manual: switch to MANUAL before, which alone lets a person command the microscope.
+            by_manual: first switch to MANUAL, the only mode in which a person commands the microscope.
         """
         if by_manual:
             result = self.set_mode(ControlMode.MANUAL)
@@ -103,13 +99,13 @@ class Actions:
         return _result(self._commands.stop(), f"The {what} is stopped")
 
     def read(self, parameters: Iterable[str]) -> ActionResult:
-        """Return the values of parameters that are in force, with their units; one that is refused is not ok."""
+        """Return the values of parameters in force, with their units; a refused one is not ok."""
         return ActionResult("", each={name: self._read(name) for name in parameters})
 
     def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
-        """Set parameters to quantities as a person writes them: "0.5 V", "2 um/s", "12". Each is asked for by itself.
+        """Set parameters to quantities as a person writes them: "0.5 V", "2 um/s", "12". Each is a request of its own.
 
-        If one of them can't be what is meant, nothing is sent.
+        If one of them is ambiguous, nothing is sent.
 
         Args:
             shown: the values that the person saw, with their units.
@@ -123,14 +119,14 @@ class Actions:
         return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
-        """Begin a scan; `region` and `shape` None: as they are set. It is done when the scan has begun."""
+        """Begin a scan; `region` and `shape` None: those in force. Returns when the scan has begun."""
         if (refused := self._commands.prepare_scan(region, shape)) is not None:
             return _result(refused, "")
         where = "" if region is None else f" at {typeset_position(region.center_m)}"
         return _result(self._commands.act_when_free(names.START_SCAN), f"The scan{where} begins")
 
     def spectrum(self, at_m: XY | None = None) -> ActionResult:
-        """Begin a spectrum at (x, y); None: where the probe stands. It is done when it has begun."""
+        """Begin a spectrum at (x, y); None: at the probe's position. Returns when it has begun."""
         if (refused := self._commands.prepare_spectrum(at_m)) is not None:
             return _result(refused, "")
         where = "" if at_m is None else f" at {typeset_position(at_m)}"
@@ -156,25 +152,25 @@ def _result(response: Response, done: str) -> ActionResult:
 
 
 def refusal(response: Response) -> str:
-    """Return why something was not done, for a person."""
+    """Return the reason of a refusal, for a person."""
     code = ControlResponse(response.code).name if response.code in ControlResponse._value2member_map_ else response.code
     return f"Refused: {response.reason or 'no reason given'} ({code})"
 
 
 def _in_force(parameter: str, response: Response) -> str:
-    """Return a value in SI where it has a unit, with the prefix that reads well."""
+    # in SI where it has a unit, with the prefix that reads well
     if not response.payload:
-        return "not told"
-    said = wire.decode_parameter(response.payload)
-    value = from_parameter(said, None)
-    unit = names.BASE_PARAMETERS.get(parameter) or said.unit or ""
+        return "unknown"
+    parameter_now = wire.decode_parameter(response.payload)
+    value = from_parameter(parameter_now, None)
+    unit = names.BASE_PARAMETERS.get(parameter) or parameter_now.unit or ""
     if isinstance(value, bool) or not isinstance(value, float | int):
         return str(value)
     return f"{math.degrees(value):.6g} deg" if unit == "rad" else quantity(value, unit, 6)
 
 
 def unclear(parameter: str, text: str, shown: str) -> str:
-    """Return why a text can't be the value of a parameter; empty: it can. A number must have its unit, if there is one.
+    """Return why a text is no clear value of a parameter; empty if it is one. A number needs the parameter's unit.
 
     >>> unclear("scan-speed", "8", "4 µm/s")
     'scan-speed: write the unit as well, for example "8 µm/s".'
@@ -209,10 +205,10 @@ Action = Callable[[Actions], ActionResult]
 
 
 class Steering:
-    """Carries out what persons ask for, each in the own name, one thing after the other for each.
+    """Carries out the requests of persons, each under the person's name and in order.
 
     Args:
-        access: knows who has signed in.
+        access: knows which viewers have signed in.
     """
 
     def __init__(self, persons: Persons, watch: Watch, access: Access) -> None:
@@ -222,7 +218,7 @@ class Steering:
         self._log = logging.getLogger("afspm.plugins.web.dashboard")
 
     def do(self, visitor: Visitor, action: Action) -> Future[ActionResult]:
-        """Carry out an action in the name of a person, who must have one and not have signed out."""
+        """Carry out an action in the name of a visitor who is signed in."""
         person = self._access.person_of(visitor)
         return self._submit(person, action) if person else not_signed_in()
 
@@ -231,7 +227,7 @@ class Steering:
         return self._submit(_PAGE, action)
 
     def close(self) -> None:
-        """End all connections; what is under way ends without an answer."""
+        """End all connections; pending actions end without an answer."""
         self._persons.close()
 
     def _submit(self, person: str, action: Action) -> Future[ActionResult]:
@@ -242,7 +238,7 @@ class Steering:
             result = action(Actions(commands, self._watch))
         except AfspmError as error:
             result = ActionResult(str(error), ok=False)
-        except Exception as error:
+        except Exception as error:  # a defect in an action is shown to its person, and must not end the page
             self._log.exception("an action of %s failed", person)
             result = ActionResult(f"The action failed: {type(error).__name__}: {error}", ok=False)
         self._log.debug("%s: %s%s", person, result.text, "" if result.ok else " (not done)")

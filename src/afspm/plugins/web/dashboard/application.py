@@ -1,4 +1,4 @@
-"""The web application: NiceGUI's page, what it fetches by itself, the page to sign in, and the guard before it all."""
+"""The web application: NiceGUI's page, the requests of its scripts, the sign-in page, and the guard before them."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def application(
     page: Callable[[Services, Visitor], object] = Page,
     more: Callable[[FastAPI], None] = lambda _: None,
 ) -> tuple[AsgiApp, Callable[[float], None]]:
-    """Return the application, made once a process, and what waits until all pages know the end, within seconds.
+    """Return the application, one per process, and a function that waits until all pages show the end, within seconds.
 
     Args:
         page: makes the page of a viewer.
-        more: adds what else is served.
+        more: adds further routes.
     """
     bell, access, title = Bell(), services.access, services.title
     services.watch.on_change(bell.ring)
@@ -58,13 +58,13 @@ def application(
     nicegui.on_exception(_log_error)
     ui.run_with(app, root=root, title=title, show_welcome_message=False, tailwind=False, reconnect_timeout=10.0)
 
-    def wait_told(within_s: float) -> None:
-        services.audience.wait_told(within_s)
+    def wait_until_end_shown(within_s: float) -> None:
+        services.audience.wait_until_end_shown(within_s)
         live.close()
 
-    return Guard(app, access, host), wait_told
+    return Guard(app, access, host), wait_until_end_shown
 
 
 def _log_error(error: Exception) -> None:
-    """Log an error of a page, which is no reason to end."""
+    # an error of one page is no reason to end the others
     logging.getLogger("afspm.plugins.web.dashboard").error("the page has an error", exc_info=error)

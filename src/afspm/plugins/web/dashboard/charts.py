@@ -69,7 +69,7 @@ def _drift_words(point: DriftPoint, registered: str) -> str:
 
 
 def spectrum_chart(spectra: Sequence[tuple[int, Spectrum]], variable: str) -> Chart:
-    """Return the last of `spectra`, and behind it those before that have the same variables.
+    """Return the last of `spectra`, with the earlier ones of the same variables behind it.
 
     Args:
         variable: shown against the first; another is taken if the spectrum has none of this name.
@@ -102,7 +102,7 @@ def _line(curve: Curve, across: float, up: float, name: str = "") -> Options:
 
 
 def _pairs(x: Array, y: Array) -> list[list[float | None]]:
-    """Points as JSON has them, which knows no NaN: None is a gap."""
+    # JSON has no NaN: None is a gap
     points = zip(x.tolist(), y.tolist(), strict=True)
     return [[a if math.isfinite(a) else None, float(f"{b:.6g}") if math.isfinite(a + b) else None] for a, b in points]
 

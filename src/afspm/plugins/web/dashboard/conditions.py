@@ -1,4 +1,4 @@
-"""Conditions of scans: parameters that are read when each begins, as no message tells them."""
+"""Conditions of scans: parameters that are read when a scan begins, because no message contains them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ KEPT = 2_000
 
 
 class Conditions:
-    """Asks for a few parameters once a scan has begun: one such question at a time, and a scan meanwhile has none.
+    """Reads a few parameters at the start of each scan, one read at a time.
+
+    A scan that begins during a read has no conditions.
 
     Args:
-        ask: carries out an action in the name of the page, and waits for nothing.
+        ask: carries out an action in the name of the page, without waiting.
     """
 
     def __init__(self, watch: Watch, ask: Callable[[Action], Future[ActionResult]]) -> None:
@@ -35,7 +37,7 @@ class Conditions:
         return {} if began_ns is None else self._read.get(began_ns, {})
 
     def _look(self) -> None:
-        """Take note of a scan that has begun. With the watch's lock held."""
+        # called with the watch's lock held
         running = self._watch.overview.running
         if running is None or running is self._seen or running.began_ns is None or self._asking:
             return
@@ -48,7 +50,7 @@ class Conditions:
         self._asking = False
         if done.cancelled() or done.exception() is not None:
             return  # the dashboard ends
-        told = done.result().each
-        self._read[began_ns] = {LABELS[name]: one.text for name, one in told.items() if one.ok}
+        values = done.result().each
+        self._read[began_ns] = {LABELS[name]: one.text for name, one in values.items() if one.ok}
         while len(self._read) > KEPT:
             self._read.popitem(last=False)

@@ -21,10 +21,10 @@ from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
 from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
 
-ANEW_S = 0.4  # at most that often, however much is published
-SLOWLY_S = 2.0  # for what takes longer to make
-OLD_AFTER_S = 8.0  # a supervisor tells of its processes every 2 s
-NOT_HEARD_OF = "never heard from"
+LEAST_AGE_S = 0.4  # age of the content before it is made again, at any rate of messages
+SLOWLY_S = 2.0  # the same for slow content
+OLD_AFTER_S = 8.0  # a supervisor publishes its processes every 2 s
+NO_REPORT = "no report"
 _STARTING = "starting"
 _AS_USUAL = {_STARTING, "alive", "ended"}
 
@@ -34,7 +34,7 @@ class SlowContent:
     """The parts that take longer to make.
 
     Attributes:
-        sample_map_near: only where something was measured.
+        sample_map_near: only the area of measurements.
         time_line_unfolded: with a row for each process.
     """
 
@@ -51,7 +51,7 @@ class Content:
 
     Attributes:
         trouble: why it should not be trusted; empty: it may be.
-        unheard: for how long, in ns, a process has not been told of while others are.
+        unheard: for each process without reports while others report: for how long, ns.
     """
 
     status: str = ""
@@ -73,9 +73,9 @@ class Contents:
     """Makes the content; from the page's thread.
 
     Args:
-        limits: where scans may lie at all, in tip coordinates; None if it is not known.
+        limits: the allowed region of scans, in tip coordinates; None if it is not known.
         adjustable: parameters that a person may set in AUTOMATED, too.
-        pictures: the address under which there are small pictures of scans.
+        pictures: the address of small pictures of scans.
     """
 
     def __init__(
@@ -91,12 +91,12 @@ class Contents:
         self._revision = 0
 
     def get(self) -> Content:
-        """Return how it is now, or was a moment ago."""
+        """Return the content of now, or of a moment ago."""
         with self._lock:
             now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
             if revision != self._revision:
                 self._revision, self._made_s, self._drawn_s = revision, -math.inf, -math.inf
-            if now_s - self._made_s >= ANEW_S or self._watch.ended != self._content.ended:
+            if now_s - self._made_s >= LEAST_AGE_S or self._watch.ended != self._content.ended:
                 self._made_s = now_s
                 self._content = self._make(now_s)
             return self._content
@@ -149,7 +149,7 @@ class Contents:
         )
 
     def _strip(self, overview: Overview) -> Iterator[tuple[int, str]]:
-        """Yield a picture of each scan for the time line."""
+        # a picture of each scan for the time line
         number = 0
         for one in overview.scans:
             if one.number != number and self._pictures and not one.interrupted:
@@ -169,7 +169,7 @@ def _now_ns(watch: Watch, overview: Overview) -> int:
 
 
 def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
-    """Return for how long, in ns, each process has not been told of while others are: its computer is gone."""
+    """Return for how long, in ns, each process has sent no report while others have: its computer is gone."""
     if watch.ended:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
@@ -178,7 +178,7 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
 
 
 def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
-    """Yield the processes; in a run that is over none is alive, though the last report may say so."""
+    """Yield the processes; after the run all have ended, regardless of their last report."""
     for state in overview.processes.values():
         if not watch.is_over or state.condition in OVER:
             yield state
@@ -188,7 +188,7 @@ def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
 
 
 def trouble(watch: Watch) -> str:
-    """Return why what is shown may not be how it is; empty if it is."""
+    """Return why the page may be out of date; empty if it is up to date."""
     if watch.ended:
         return "The experiment has ended. This page shows its final state."
     if not watch.connected:
@@ -233,7 +233,7 @@ def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = T
 
 
 def _has_failed(spans: Sequence[Span]) -> bool:
-    """Return whether a process was ever anything else than started once, alive and done."""
+    # a process without failure is started once, then alive, then done
     return any(span.label not in _AS_USUAL for span in spans) or any(span.label == _STARTING for span in spans[1:])
 
 
@@ -241,11 +241,11 @@ def _until_told(lane: Timeline, told_ns: int) -> Iterator[Span]:
     for span in lane.spans:
         yield replace(span, end_ns=max(told_ns, span.start_ns)) if span.end_ns is None else span
     if lane.now is not None:
-        yield Span(NOT_HEARD_OF, told_ns)
+        yield Span(NO_REPORT, told_ns)
 
 
 def status_html(watch: Watch, overview: Overview) -> str:
-    """Return mode, holder, the microscope's state, problems, and what time it is in the experiment."""
+    """Return mode, holder, the microscope's state, problems, and the time of the experiment."""
     control = overview.control
     if control is None:
         return '<span class="chip">waiting for the scheduler</span>'
@@ -271,9 +271,8 @@ def _chip(html: str, part: str, style: str = "") -> str:
 
 
 def _microscope(overview: Overview, now_ns: int) -> Iterator[str]:
-    """Yield its state, how far the scan is, where the probe stands, and its feedback."""
     status = overview.status
-    state = status.state.name.lower().replace("_", " ") if status else NOT_HEARD_OF
+    state = status.state.name.lower().replace("_", " ") if status else NO_REPORT
     paused = " (paused)" if status and status.paused else ""
     done = overview.scan_progress(now_ns)
     far = "" if done is None else f" {100 * done[0]:.0f} %<small>ends {time_of_day(now_ns + done[1])}</small>"
@@ -296,7 +295,7 @@ def refusals_html(refusals: Iterable[JournalEntry], most: int = 40) -> str:
 
 
 def notes_html(overview: Overview) -> str:
-    """Return the notes, that of the latest moment first."""
+    """Return the notes, latest moment first."""
     scans = {scan.time_ns: scan for scan in reversed(overview.scans)} if overview.notes else {}
     notes = sorted(overview.notes, key=lambda note: -note.time_ns)
     rows = "".join(_note(note, scans.get(note.scan_ns or 0)) for note in notes)

@@ -18,23 +18,24 @@ from afspm.plugins.web.server import USUAL_PORT
 from afspm.plugins.web.watch import Audience
 from afspm.record.run_json import experiment_name
 
-TOLD_WITHIN_S = 1.5  # how long the pages may take to be told of the end
+END_SHOWN_WITHIN_S = 1.5  # time for the pages to show the end
 
 
 class Dashboard(WebComponent):
-    """Serves one page. It only subscribes, and asks through the scheduler in the names of persons; all others have the
-    processor first.
+    """Serves the page of an experiment. Persons steer through the scheduler, each under the person's name.
+
+    Other processes have the processor first.
 
     Args:
-        host: the address to listen at. At any other than this computer's own a password is needed.
-        port: 0 for any that is free; None: 8080, or any if that is taken. A restart takes the same one.
-        people: who may steer: the hash of each person's password, as `afspm dashboard --make-password` prints it.
-        password_hash: of a common password, with which one may look. The password itself may be in the environment:
+        host: the address to listen at. Any but a loopback address needs a password.
+        port: 0 for any free port; None: 8080, or any if that is taken. A restart takes the same one.
+        people: persons who may steer: the hash of each password, as `afspm dashboard --make-password` prints it.
+        password_hash: of a common password for viewers who only look. The password itself may be in the environment:
             AFSPM_DASHBOARD_PASSWORD.
         certificate, certificate_key: PEM files, for https.
 
     Raises:
-        ConfigError: others could come in without a password, the port is taken …
+        ConfigError: other computers could come in without a password, the port is taken …
     """
 
     served = "dashboard"
@@ -55,6 +56,7 @@ class Dashboard(WebComponent):
         self._people, self._password_hash = dict(people or {}), password_hash
 
     def on_start(self) -> None:
+        # imported here: a file is checked also where the extra `dashboard` is not installed
         from afspm.plugins.web.dashboard.actions import Steering
         from afspm.plugins.web.dashboard.application import application
         from afspm.plugins.web.dashboard.conditions import Conditions
@@ -84,7 +86,7 @@ class Dashboard(WebComponent):
             self.simulated,
             Conditions(self._watch, self._steering.read),
         )
-        app, self._wait_told = application(services, archive, host=self._host, encrypted=self.encrypted)
+        app, self._wait_for_end_shown = application(services, archive, host=self._host, encrypted=self.encrypted)
         self.serve(app, bound)
         if not self.encrypted and not is_loopback(self._host):
             self.log.warning(
@@ -98,6 +100,6 @@ class Dashboard(WebComponent):
         if self._server is None:
             return
         self._watch.end()
-        self._wait_told(TOLD_WITHIN_S)
+        self._wait_for_end_shown(END_SHOWN_WITHIN_S)
         self._steering.close()
         self._server.stop()

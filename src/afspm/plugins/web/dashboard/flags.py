@@ -1,4 +1,4 @@
-"""The flagged problems, each with what a person is to do about it."""
+"""The flagged problems, each with advice for a person."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _OTHER = "solve the problem, then clear it."
 
 @dataclass(frozen=True)
 class Flag:
-    """A flagged problem: its number and name, its flagger and when, and what is to be done."""
+    """A flagged problem: its number and name, its flagger and time, and the advice."""
 
     number: int
     name: str
@@ -39,7 +39,7 @@ def flags(overview: Overview) -> Iterator[Flag]:
 
 
 def advice_for(problem: int, control: ControlState) -> str:
-    """Return what a person is to do about a flagged problem."""
+    """Return the advice for a person about a flagged problem."""
     if control.holder:  # while problems are flagged, only a component that solves one gets control
         return f"{control.holder} is in control to solve it: wait, or take over."
     known = _ADVICE.get(Problem(problem), _OTHER) if problem in Problem._value2member_map_ else _OTHER

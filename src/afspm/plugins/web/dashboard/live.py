@@ -1,7 +1,7 @@
-"""Requests of the browser's scripts: pictures as they come, values, profiles.
+"""Requests of the browser's scripts: live pictures, values, profiles.
 
-The browser asks for the next picture when it has drawn the last, and gets the newest: what it was too slow for is left
-out, and nothing waits for it here.
+The browser asks for the next picture when it has drawn the last, and gets the newest. A slow browser skips pictures,
+and nothing waits for it here.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from afspm.record.drawing.curves import profile
 from afspm.record.drawing.palette import DIVERGING, LEVELS, PALETTES
 from afspm.record.drawing.raster import png
 
-POLL_S = 20.0  # then the browser asks anew: what is in between may close connections that say nothing for longer
+POLL_S = 20.0  # then the browser repeats its request: proxies may close a connection that is silent for longer
 GROWING_S = 0.2  # between two pictures of a growing scan
-FINISHED_S = 0.004  # between two of finished ones, for each who looks on, and ten times that at least
+FINISHED_S = 0.004  # between two pictures of finished scans, per viewer; at least ten times that in total
 
 
 @dataclass(frozen=True)
 class PictureRequest:
-    """The picture that is meant.
+    """The requested picture.
 
     Attributes:
-        time: in ns, of a finished scan; 0: the newest.
-        beside: that of another scan with which it is compared: both get the same range of values; 0: none.
+        time: of a finished scan, ns; 0: the newest.
+        beside: time of another scan for comparison, ns: both get the same range of values; 0: none.
     """
 
     channel: str = ""
@@ -53,8 +53,8 @@ class Live:
     """Answers the requests of the browser's scripts.
 
     Args:
-        archive: where scans are that are not in memory any more.
-        conditions: what was set when each scan began.
+        archive: of scans that are no longer in memory.
+        conditions: parameters at the start of each scan.
     """
 
     def __init__(self, watch: Watch, bell: Bell, archive: Archive, conditions: Conditions) -> None:
@@ -68,7 +68,7 @@ class Live:
         self._closing = False
 
     def close(self) -> None:
-        """Answer all requests that wait for a picture, and let none wait any more. From any thread."""
+        """Answer all requests that wait for a picture, and let no other wait. From any thread."""
         self._closing = True
         self._bell.ring()
 
@@ -81,17 +81,18 @@ class Live:
         app.get("/live/profile", response_model=None)(self._profile)
 
     async def _image(self, asked: Asked, after: int = 0) -> Response:
-        """Answer with a picture newer than number `after`, or of one finished scan. 204: nothing new yet."""
+        # a picture newer than number `after`, or of one finished scan; 204: nothing new yet
         if not asked.time and not await self._wait_for_newer(asked.channel, after):
             return Response(status_code=204)
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return PlainTextResponse("the values of this scan are no longer kept here", 404)
+        # facts in a header of the picture, so that both always belong together
         headers = {"X-Frame": drawn.head(self._facts(drawn.frame)), "Cache-Control": "no-store"}
         return Response(drawn.png, media_type="image/png", headers=headers)
 
     async def _value(self, asked: Asked, column: int, row: int) -> dict[str, object]:
-        """Answer with the value of one pixel, as published and as levelled."""
+        # of one pixel, as published and as levelled
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None or not (0 <= row < drawn.values.shape[0] and 0 <= column < drawn.values.shape[1]):
             return {"value": None, "levelled": None, "unit": ""}
@@ -103,7 +104,7 @@ class Live:
         }
 
     async def _profile(self, asked: Asked, x0: float, y0: float, x1: float, y1: float) -> dict[str, object]:
-        """Answer with levelled values along a line between two (column, row)."""
+        # levelled values along a line between two (column, row)
         drawn = await asyncio.to_thread(self._drawn, asked)
         if drawn is None:
             return {"distances_m": [], "values": [], "unit": ""}
@@ -115,10 +116,8 @@ class Live:
         }
 
     async def _thumbnail(self, start: str, time: int, channel: str) -> Response:
-        """Answer with a small picture of a finished scan, which the browser keeps.
-
-        `start` differs from start to start of the dashboard: another simulated night may have the same times.
-        """
+        # `start` differs with each start of the dashboard: the browser keeps pictures, and another simulated night may
+        # have the same times
         found = await asyncio.to_thread(self._thumbnails.png, time, channel)
         if found is None:
             return PlainTextResponse("the values of this scan are no longer kept here", 404)
@@ -126,7 +125,7 @@ class Live:
         return Response(found, media_type="image/png", headers=headers)
 
     async def _palette(self, name: str) -> Response:
-        """Answer with a colour map as a picture one pixel wide, the highest value on top."""
+        # one pixel wide, the highest value on top
         if name not in (*PALETTES, DIVERGING):
             return Response(status_code=404)
         return Response(png(np.arange(LEVELS, dtype=np.uint8)[:, None], name), media_type="image/png")
@@ -137,7 +136,7 @@ class Live:
         end_s, growing_s = now_s + POLL_S, now_s + GROWING_S
         self._waiting += 1
         try:
-            # many viewers at full speed get fewer pictures each, and not the experiment less time
+            # with many viewers each gets fewer pictures, so that the experiment keeps its processor time
             finished_s = now_s + FINISHED_S * max(10, self._waiting)
             while True:
                 number, complete = self._newest(channel)

@@ -1,4 +1,4 @@
-"""A recorded night at any of its moments: what the page of a running experiment would have shown then."""
+"""A recorded night at any moment, in the form of a running experiment's page."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 
 SPECTRA = 8
-"""The spectra before a moment that are read."""
+"""Spectra read before a moment."""
 
 
 @dataclass(frozen=True, slots=True)
 class NightEvent:
-    """Something that was published; a note counts at the moment that it is about."""
+    """A published message; a note counts at the moment that it describes."""
 
     time_ns: int
     message: str
@@ -36,14 +36,14 @@ class NightEvent:
 
 @dataclass(frozen=True, slots=True)
 class DriftedScan:
-    """The centre of a scan in coordinates of the tip, and of the sample, as drift correction found it."""
+    """The centre of a scan in tip coordinates, and in sample coordinates as drift correction found it."""
 
     tip_m: XY
     sample_m: XY
 
 
 class Night:
-    """The record of a run: all that was published, without the values of scans.
+    """The record of a run: all published messages, without the values of scans.
 
     Args:
         folder: of the run.
@@ -60,7 +60,7 @@ class Night:
         self.reload()
 
     def reload(self) -> None:
-        """Read the record anew, since a note was added."""
+        """Read the record again, after a note was added."""
         with open_run(self.folder) as run:
             self.scans = [row for row in run.scans if row.file]
             self.events = sorted(_events(run), key=lambda event: event.time_ns)
@@ -74,7 +74,7 @@ class Night:
         return self.events[-1].time_ns if self.events else 0
 
     def published_ns(self) -> dict[int, int]:
-        """Return when the last channel of each scan was published, by the time at which the scan was finished."""
+        """Return the publication time of each scan's last channel, by the scan's end time."""
         return {event.thing.time_ns: event.time_ns for event in self.events if event.message == "Scan2d"}
 
     def spectra_until(self, time_ns: int) -> SpectrumStore:
@@ -87,7 +87,7 @@ class Night:
         return store
 
     def drifted(self) -> dict[int, DriftedScan]:
-        """Return the scans of which drift correction knows where they were, by number; empty without one."""
+        """Return by number the scans whose place drift correction determined; empty without drift correction."""
         by_time = {row.time_ns: row for row in self.scans}
         found: dict[int, DriftedScan] = {}
         mapping: Any = None
@@ -103,7 +103,7 @@ class Night:
 
 
 class NightWatch(Watch):
-    """A night as it was at one moment, for one viewer."""
+    """A night at one moment, for one viewer."""
 
     def __init__(self, night: Night) -> None:
         self.moment = StoppedClock(night.end_ns, night.speed)
@@ -140,7 +140,7 @@ class NightWatch(Watch):
             yield self.overview
 
     def go(self, time_ns: int) -> None:
-        """Show the night as it was at a time."""
+        """Show the night at a time."""
         with super().reading():
             self._go(time_ns)
 
@@ -159,7 +159,7 @@ class NightWatch(Watch):
 
 
 class ChannelNames(FrameStore):
-    """The channels of a night, and no pictures: those are in the record."""
+    """The channels of a night, without pictures: those are in the record."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -199,7 +199,7 @@ class StoppedClock:
 def _events(run: Run) -> Iterator[NightEvent]:
     for number, (packet, message, thing) in enumerate(run.messages()):
         if isinstance(thing, Note):
-            yield NightEvent(thing.time_ns, message, thing, f"{message}_{number}")  # two may be about one moment
+            yield NightEvent(thing.time_ns, message, thing, f"{message}_{number}")  # two notes may describe one moment
         else:
             yield NightEvent(packet.time_ns or 0, message, thing, packet.envelope)
 

@@ -1,6 +1,6 @@
-"""The page of a recorded night: that of a running experiment at one moment, with a slider through all of them.
+"""The page of a recorded night: a running experiment's page at one moment, with a slider through the night.
 
-Beside it what its scripts ask for (its scans, the difference of two, its report), and the one action: to write notes.
+Also the requests of its scripts (its scans, the difference of two, its report), and its one action, a note.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module"
 
 
 class NightPage(Page):
-    """The page of one viewer, who has a moment of the own."""
+    """The page of one viewer, at a moment of its own."""
 
     tabs: ClassVar = {**TABS, "two": "Compare"}
 
@@ -79,7 +79,6 @@ class NightPage(Page):
         return super()._state(content) | {"moment": str(self._watch.moment_ns)}
 
     async def _go(self, event: events.GenericEventArguments) -> None:
-        """Show another moment."""
         self._watch.go(int(event.args["time"]))
         await self._refresh()
 
@@ -89,20 +88,19 @@ def _asset(name: str) -> str:
 
 
 class NightRequests:
-    """Answers what only the page of a recorded night asks for."""
+    """Answers the requests of the night page's scripts."""
 
     def __init__(self, night: Night, archive: Archive) -> None:
         self._night = night
         self._archive = archive
 
     def add_to(self, app: FastAPI) -> None:
-        """Serve /night/scans, /night/difference and /night/report."""
         app.get("/night/scans", response_model=None)(self._scans)
         app.get("/night/difference", response_model=None)(self._difference)
         app.get("/night/report", response_model=None)(self._report)
 
     async def _scans(self) -> Plain:
-        """Answer with the ends of the night, its scans and notes. Times are texts: JSON has no numbers of 64 bits."""
+        # times are texts: JavaScript has no exact integers of 64 bits
         night = self._night
         drifted = night.drifted()
         offset = datetime.fromtimestamp(night.end_ns / NS_PER_S).astimezone().utcoffset()
@@ -123,7 +121,7 @@ class NightRequests:
         }
 
     async def _difference(self, first: int, second: int, channel: str, levelling: str = "plane") -> Response:
-        """Answer with second minus first as a picture, and in its head how they were laid over each other."""
+        # second minus first as a picture, with their alignment as text in its head
         how = Levelling(levelling) if levelling in Levelling._value2member_map_ else Levelling.PLANE
         return await asyncio.to_thread(self._compared, first, second, channel, how)
 
@@ -144,7 +142,6 @@ class NightRequests:
         return Response(drawn.png, media_type="image/png", headers=headers)
 
     async def _report(self) -> Response:
-        """Answer with the report of the night."""
         file = self._night.folder / REPORT_FILE
         if not file.is_file():
             return PlainTextResponse(f"the run has no report yet: `afspm report {self._night.folder}` writes it", 404)
@@ -173,7 +170,7 @@ class NightActions(Actions):
         self._who = who
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
-        """Append a note to the record; the report is then written again."""
+        """Append a note to the record, and write the report again."""
         written_ns = ExperimentClock.real().now_ns()
         append_note(self._night.folder, self._who, text, written_ns, scan_ns, time_ns)
         self._night.reload()
@@ -183,7 +180,7 @@ class NightActions(Actions):
 
 
 class NightSteering(Steering):
-    """Carries out notes, one after the other."""
+    """Writes notes, one after the other."""
 
     def __init__(self, night: Night, access: Access, name: str) -> None:
         self._night = night
@@ -207,12 +204,12 @@ class NightSteering(Steering):
 
 
 def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tuple[ChannelFrame, str]:
-    """Return second minus first as a frame at the place of the first, and in words how they were laid over each other.
+    """Return second minus first as a frame at the place of the first, and a text about their alignment.
 
-    What both have in common is found by registration, where their sizes match; it has NaN where only one was measured.
+    Frames of equal size are aligned by registration. The difference is NaN where only one frame was measured.
 
     Raises:
-        InvalidValue: they have not the same pixels, or other units.
+        InvalidValue: they have different pixels or units.
     """
     if first.values.shape != second.values.shape:
         (rows, columns), (others, along) = first.values.shape, second.values.shape
@@ -228,7 +225,7 @@ def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tup
 
 
 def _displacement(first: Region, second: Region, before: Array, after: Array) -> tuple[tuple[float, float], str]:
-    """Return by how much the second picture lies elsewhere than the first, within the frame; and that in words."""
+    # within the frame of the first, with a text that explains it
     unmoved = (0.0, 0.0)
     if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(first.size_m, second.size_m, strict=True)):
         return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
@@ -241,7 +238,7 @@ def _displacement(first: Region, second: Region, before: Array, after: Array) ->
 
 
 def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
-    """Return values with a displacement taken back; NaN where nothing is known."""
+    # takes the displacement back; NaN where nothing is known
     from scipy import ndimage
 
     if displacement_m == (0.0, 0.0):

@@ -1,4 +1,4 @@
-"""The one page: its sections, and what keeps them up to date for one viewer."""
+"""The page: its sections, and their updates for one viewer."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.content import Content, Contents
-from afspm.plugins.web.dashboard.notes_panel import NotesPanel
-from afspm.plugins.web.dashboard.panels import ChartPanel, HealthPanel, LogPanel, SpectraPanel
+from afspm.plugins.web.dashboard.panels import ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
 from afspm.plugins.web.dashboard.sign_in import SIGN_IN
 from afspm.plugins.web.dashboard.steering_panel import ModeButtons, ProblemBar, SteeringPanel
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
@@ -28,12 +27,12 @@ from afspm.record.drawing.palette import PALETTES
 
 ASSETS = Path(__file__).with_name("assets")
 REFRESH_S = 0.5
-ANSWER_S = 5.0  # a browser that has not drawn the last for so long gets nothing more until it has
+ANSWER_S = 5.0  # a browser that has not drawn the last update within this time gets no more until it has
 THEMES = {"": None, "light": False, "dark": True}
 _HEAD = f"""<style>{timeline.CSS}</style><link rel="stylesheet" href="/assets/dashboard.css">
 <script type="module" src="/assets/page.js"></script>"""
 LEVELLINGS = {Levelling.LINES: "line by line"}
-"""How levellings are called where their value is no word."""
+"""Labels of levellings whose value is no word."""
 SIMULATED = "SIMULATED: this is not a real microscope"
 
 
@@ -43,8 +42,8 @@ class Services:
 
     Attributes:
         title: the name of the experiment.
-        simulated: True if the microscope is none.
-        conditions: what was set when each scan began.
+        simulated: True if the microscope is simulated.
+        conditions: parameters at the start of each scan.
     """
 
     watch: Watch
@@ -58,7 +57,7 @@ class Services:
 
 
 TABS = {"scan": "Scan", "sample": "Sample", "steer": "Steer", "time": "Night", "log": "Log"}
-"""Of a phone: where each section is then is in the style sheet."""
+"""Tabs on a phone; the style sheet assigns the sections to them."""
 
 
 class Page:
@@ -85,7 +84,8 @@ class Page:
         self._timer = ui.timer(REFRESH_S, self._refresh)
 
     def _add_more(self) -> None:
-        """Add the sections that only another kind of page has."""
+        # for sections of a subclass
+        ...
 
     def _header(self) -> None:
         services = self._services
@@ -114,7 +114,7 @@ class Page:
         )
 
     async def _refresh(self) -> None:
-        """Bring the page up to date, and wait until the browser has drawn that: nothing is queued for a slow one."""
+        # waits until the browser has drawn the update, so that nothing is queued for a slow one
         if not self._services.access.is_signed_in(self._visitor):
             self._stop()
             ui.navigate.to(SIGN_IN)
@@ -129,13 +129,13 @@ class Page:
         try:
             theme = await ui.run_javascript(f"return window.afspm?.update({json.dumps(state)})", timeout=ANSWER_S)
         except TimeoutError:
+            # a slow or sleeping browser: the next refresh tries again
             return
         self._theme.remember(theme)
         if content.ended:
             self._stop()
 
     def _state(self, content: Content) -> dict[str, object]:
-        """Return what the browser's scripts have to know."""
         return {
             "channels": content.channels,
             "trouble": content.trouble,
@@ -156,13 +156,12 @@ class Theme:
         self._name = ""
 
     def next(self) -> None:
-        """Choose the next of the three."""
         names = list(THEMES)
         self._set(names[(names.index(self._name) + 1) % len(names)])
         ui.run_javascript(f"window.afspm?.keepTheme({json.dumps(self._name)})")
 
     def remember(self, name: object) -> None:
-        """Take what the browser has kept."""
+        """Take the choice that the browser kept."""
         if isinstance(name, str) and name != self._name and name in THEMES:
             self._set(name)
 
@@ -204,7 +203,7 @@ class Sections:
                 self._refusals = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
 
     async def show(self, content: Content) -> None:
-        """Bring all of them up to date."""
+        """Update all sections."""
         self._content = content
         self._draw()
         self._drift.show(content.slow.drift)
@@ -240,7 +239,7 @@ def section(title: str, name: str) -> Iterator[ui.element]:
 
 
 def _image_html() -> str:
-    """Return what assets/image.js brings to life."""
+    # assets/image.js finds these elements by their names
     offered = {
         "palettes": {name: name for name in PALETTES},
         "levellings": {how.value: LEVELLINGS.get(how, how.value) for how in sorted(Levelling, key=_plane_first)},

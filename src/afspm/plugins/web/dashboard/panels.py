@@ -1,17 +1,20 @@
-"""Parts of the page that keep something of their own for one viewer: the log's filter, rows of processes, spectra."""
+"""Parts of the page with state for one viewer: the log's filter, rows of processes, spectra, a note being written."""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
-from nicegui import events, ui
+from nicegui import context, events, ui
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import duration_text, time_of_day
 from afspm.model import LogLine, ProcessCondition, ProcessState
+from afspm.plugins.web.dashboard.access import Visitor
+from afspm.plugins.web.dashboard.actions import ActionResult, Steering
 from afspm.plugins.web.dashboard.charts import Chart, spectrum_chart
-from afspm.plugins.web.dashboard.content import NOT_HEARD_OF
+from afspm.plugins.web.dashboard.content import NO_REPORT
 from afspm.plugins.web.dashboard.steering_panel import ask_restart
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 from afspm.plugins.web.watch import Watch
@@ -19,6 +22,8 @@ from afspm.record.drawing.timeline import tint_class
 
 MOST_LINES = 300
 LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
+MOMENT, SCAN = "this moment", "the scan shown"
+_SHOWN = "return window.afspm?.image?.head?.time_ns ?? ''"
 _EVERYTHING = "all"
 _BAD = {ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.GIVEN_UP}
 
@@ -33,7 +38,6 @@ class ChartPanel:
         self._chart.set_visibility(False)
 
     def show(self, chart: Chart) -> None:
-        """Bring it up to date."""
         if chart == self._shown:
             return
         self._shown = chart
@@ -46,7 +50,7 @@ class ChartPanel:
 
 
 class SpectraPanel:
-    """The newest spectrum with those before it, or the one picked in the map."""
+    """The newest spectrum with earlier ones, or the one selected in the map."""
 
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
@@ -57,7 +61,7 @@ class SpectraPanel:
         ui.on("spectrum_picked", self._pick)
 
     def show(self) -> bool:
-        """Bring it up to date; returns whether there is a spectrum."""
+        """Update the chart; returns whether there is a spectrum."""
         with self._watch.reading():
             store = self._watch.spectra
             picked = None if self._picked_ns is None else store.at(self._picked_ns)
@@ -78,7 +82,7 @@ class SpectraPanel:
 
 
 class LogPanel:
-    """The log, newest lines first, filtered as one viewer wants it."""
+    """The log, newest lines first, with a filter for one viewer."""
 
     def __init__(self) -> None:
         self._shown: tuple[object, ...] = ()
@@ -92,7 +96,6 @@ class LogPanel:
         self._html = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0" role="log" aria-live="off"')
 
     def show(self, lines: Sequence[LogLine], names: Iterable[str]) -> None:
-        """Bring it up to date."""
         every = [_EVERYTHING, *sorted({*names, *(line.name for line in lines)})]
         if every != self._name.options:
             self._name.set_options(every, value=self._name.value)
@@ -114,8 +117,8 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 
     Args:
         names: of components; empty: all.
-        level: the least that is shown.
-        text: that a line has to contain, in lower or upper case.
+        level: the lowest level shown.
+        text: filter for lines, in any case.
     """
     least = LEVELS.index(level) if level in LEVELS else 0
     wanted = [
@@ -137,7 +140,7 @@ def log_html(lines: Iterable[LogLine], names: frozenset[str], level: str, text: 
 
 
 def _level_html(level: str) -> str:
-    """Return the level of a line that is not as usual."""
+    # INFO is the usual level, and not shown
     return "" if level == "INFO" else f"<i>{escape(level)}</i> "
 
 
@@ -151,7 +154,7 @@ class HealthPanel:
         self._list = ui.element("div").classes("processes").props('role="table" aria-label="Processes"')
 
     def show(self, processes: Sequence[ProcessState], unheard: Mapping[str, int]) -> None:
-        """Bring the rows up to date; `unheard` as in `Content`."""
+        """Update the rows; `unheard` as in `Content`."""
         self._nothing.set_visibility(not processes)
         for state in processes:
             row = self._rows.get(state.name)
@@ -178,11 +181,10 @@ class HealthRow:
         self._style = ""
 
     def show(self, state: ProcessState, unheard_ns: int | None) -> None:
-        """Bring it up to date."""
         words = process_words(state, unheard_ns)
         for cell, text in zip(self._cells, words, strict=True):
             cell.set_text(text)
-        style = "bad" if state.condition in _BAD or words[0] == NOT_HEARD_OF else words[0].replace(" ", "-")
+        style = "bad" if state.condition in _BAD or words[0] == NO_REPORT else words[0].replace(" ", "-")
         if style != self._style:
             self._dot.classes(remove=f"is-{self._style}", add=f"is-{style}")
             self._style = style
@@ -193,16 +195,56 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
     """Return (condition, since when or busy for how long, restarts) of a process, in words.
 
     Args:
-        unheard_ns: for how long it has not been told of, if others are told of.
+        unheard_ns: time without a report, while other processes report.
     """
     condition = state.condition.name.lower().replace("_", " ")
     since = f"since {time_of_day(state.since_ns)}"
     if unheard_ns is not None:
         gone = f"for {duration_text(unheard_ns / NS_PER_S)}: its supervisor has ended or can't be reached"
-        condition, since = NOT_HEARD_OF, gone
+        condition, since = NO_REPORT, gone
     elif state.step_age_s >= 1.0:
         since = f"in the same step for {duration_text(state.step_age_s)}"
     restarts = "" if state.starts <= 1 else f"restarted {state.starts - 1} time{'s' if state.starts > 2 else ''}"
     if state.last_exit and state.starts > 1:
         restarts += f" (last: {state.last_exit})"
     return condition, since, restarts
+
+
+class NotesPanel:
+    """Lists the notes, and lets a viewer who has signed in write one."""
+
+    def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
+        self._watch = watch
+        self._steering = steering
+        self._visitor = visitor
+        self._client = context.client
+        if visitor.person:
+            with ui.element("div").classes("acts"):
+                self._text = ui.input("note").props("dense outlined").classes("text").on("keydown.enter", self._write)
+                self._on = ui.select([SCAN, MOMENT], value=SCAN, label="on").props("dense outlined")
+                ui.button("Note", on_click=self._write, color=None).props("no-caps outline")
+        else:
+            ui.html('<p class="quiet"><a href="/login">Sign in</a> to write a note.</p>', sanitize=False)
+        self._list = ui.html("", sanitize=False).classes("scrolled").props('tabindex="0"')
+
+    def show(self, notes: str) -> None:
+        self._list.set_content(notes)
+
+    async def _write(self) -> None:
+        text, time_ns, scan_ns = str(self._text.value or "").strip(), self._watch.moment_ns, None
+        if self._on.value == SCAN:
+            shown = await ui.run_javascript(_SHOWN)
+            if not shown:
+                self._say(ActionResult("The scan shown is not finished: write the note on this moment.", ok=False))
+                return
+            scan_ns, time_ns = int(shown), None
+        doing = self._steering.do(self._visitor, lambda actions: actions.note(text, scan_ns, time_ns))
+        result = await asyncio.wrap_future(doing)
+        if not self._client.is_deleted:
+            self._say(result)
+
+    def _say(self, result: ActionResult) -> None:
+        with self._client:
+            ui.notify(result.text, type="positive" if result.ok else "negative", position="bottom-right")
+            if result.ok:
+                self._text.set_value("")

@@ -1,4 +1,4 @@
-"""The parameters of the microscope with their values: those that were edited are set together."""
+"""The parameters of the microscope with their values: edited ones are set together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PARAMETERS = tuple(names.BASE_PARAMETERS)
 
 
 class ParameterForm:
-    """A field for each parameter that the microscope has: all in MANUAL, in AUTOMATED those that may be adjusted."""
+    """A field for each parameter of the microscope: all in MANUAL, the adjustable ones in AUTOMATED."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -29,7 +29,7 @@ class ParameterForm:
         self._box.set_visibility(False)
 
     async def show(self) -> None:
-        """Offer what may be set now."""
+        """Show the parameters that may be set now."""
         content = self._session.content
         offered = () if content.ended else PARAMETERS if content.is_manual else content.adjustable
         if offered == self._offered:
@@ -48,7 +48,7 @@ class ParameterForm:
             self._take(result.each)
 
     def _take(self, told: Mapping[str, ActionResult]) -> None:
-        """Show values that were told; a parameter that is refused is none that this microscope has."""
+        # a refused parameter does not exist on this microscope
         for name, one in told.items():
             if not one.ok:
                 continue

@@ -21,7 +21,7 @@ SIDE_PX = 128
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """Levelling, contrast and colours in which a viewer wants to see a scan."""
+    """Levelling, contrast and colours of a viewer's picture."""
 
     levelling: Levelling = Levelling.PLANE
     contrast: Contrast = Contrast.ROBUST
@@ -29,7 +29,7 @@ class Look:
 
     @classmethod
     def named(cls, levelling: str, contrast: str, palette: str) -> Look:
-        """Return the look that the page names; what it doesn't name, or is not known, is as by default."""
+        """Return the look with these names; unknown names mean the default."""
         usual = cls()
         return cls(
             Levelling(levelling) if levelling in Levelling._value2member_map_ else usual.levelling,
@@ -54,7 +54,7 @@ class RenderedFrame:
     png: bytes
 
     def head(self, facts: Facts) -> str:
-        """Return what has to be known to draw it with axes, and facts to show beside it, as ASCII JSON in SI."""
+        """Return the data for drawing it with axes, and facts to show beside it, as ASCII JSON in SI."""
         frame, region = self.frame, self.frame.region
         return json.dumps(
             {
@@ -78,15 +78,15 @@ class RenderedFrame:
 
 
 class PictureCache:
-    """Draws, from any thread; keeps the newest few pictures. A frame is known by its number."""
+    """Draws, from any thread; keeps the newest few pictures. A frame is identified by its number."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._drawn = lru_cache(KEPT)(_draw)
 
     def draw(self, frame: ChannelFrame, look: Look, beside: ChannelFrame | None = None) -> RenderedFrame:
-        """Return the picture of a frame; with the same range of values as that of a frame beside it."""
-        with self._lock:  # two that want the same wait for one; two that want others share a core anyway
+        """Return the picture of a frame, with the range of values of a frame beside it, if there is one."""
+        with self._lock:  # requests for the same picture wait for one drawing; others would share a core anyway
             return self._drawn(frame, look, beside)
 
 
@@ -120,5 +120,6 @@ class Thumbnails:
     def _draw(self, time_ns: int, channel: str) -> bytes:
         frame = self._frame(time_ns, channel)
         if frame is None:
+            # raised, so that the cache does not keep a missing picture
             raise LookupError(time_ns)
         return shown(flattened(frame.values), SIDE_PX).image

@@ -1,7 +1,7 @@
 """`python -m afspm.plugins.web.dashboard.recorded`: serves the page of a recorded night until Ctrl-C.
 
-A process of its own, since a process has one NiceGUI, and since `afspm run` needs none of it before the end. Its
-settings are a line on standard input; when that is closed, it ends.
+A process of its own, since a process has one NiceGUI, and `afspm run` does not load it before the end. Its settings are
+a line on standard input; it ends when standard input is closed.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
 
     Raises:
         FileError: there is no record, or it is damaged.
-        ConfigError: the address can't be used, or others could come in without a password.
+        ConfigError: the address can't be used, or other computers could come in without a password.
     """
     from afspm.plugins.web.dashboard.application import application
     from afspm.plugins.web.dashboard.conditions import Conditions
@@ -78,7 +78,7 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
         night.title, night.simulated, Conditions(watch, partial(steering.do, Visitor())),
     )  # fmt: skip
     encrypted = settings.certificate is not None
-    app, wait_told = application(
+    app, wait_until_end_shown = application(
         services, archive, host=settings.host, encrypted=encrypted,
         page=partial(NightPage, night, pictures), more=NightRequests(night, archive).add_to,
     )  # fmt: skip
@@ -92,13 +92,13 @@ def serve(settings: RecordedSettings, tell: Callable[[str], object], stopped: th
     tell(f"the dashboard is at {url}; press Ctrl-C to close it")
     while not stopped.wait(1.0):  # on Windows a signal does not end a wait without a limit
         pass
-    wait_told(0.0)
+    wait_until_end_shown(0.0)
     steering.close()
     server.stop()
 
 
 def _port_before(state: Path, name: str) -> tuple[int, ...]:
-    """Return the port that the page had while the experiment ran, where a browser looks for it."""
+    # an open browser looks for the page at the port of the running experiment
     try:
         port = Memory(state / f"{name}.json").get("port")
     except FileError:

@@ -1,4 +1,4 @@
-"""The sample as a map: where everything of the run lies."""
+"""The sample as a map of all scans, spectra and targets of the run."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ _SAME = 200.0  # places that differ by less than this part of their size are one
 
 @dataclass(frozen=True)
 class MapContent:
-    """The content of the map, in the coordinates of components (of the sample, where drift is corrected).
+    """The content of the map, in the coordinates of components (sample coordinates where drift is corrected).
 
     Attributes:
-        current: the region that is set.
-        limits: where scans may lie at all, in tip coordinates.
-        tip_to_sample: 2 x 3; None where the two are the same.
-        probe_m: where the probe stands.
+        current: the region in force.
+        limits: the allowed region of scans, in tip coordinates.
+        tip_to_sample: 2 x 3; None if both coordinates are equal.
+        probe_m: the probe's position.
         shown_ns: time of the newest scan.
-        targets: places that components have found.
-        pictures: the address under which there are pictures of scans; empty: only outlines are drawn.
+        targets: places found by components.
+        pictures: the address of pictures of scans; empty: only outlines are drawn.
     """
 
     scans: Sequence[ScanSummary] = ()
@@ -52,7 +52,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
     """Return the map; scans have their time and channel as data-time and data-channel, spectra their time.
 
     Args:
-        whole: all of what the limits allow; else the part where something was measured, and what is set now.
+        whole: the whole region of the limits; else only the area of measurements and of the region in force.
     """
     places, left_out = places_of(content.scans)
     spectra = [one for one in content.spectra if one.position_m is not None][-MOST_PLACES:]
@@ -92,7 +92,7 @@ def map_html(content: MapContent, *, whole: bool = True) -> str:
 def _shown_points(
     content: MapContent, places: Sequence[tuple[ScanSummary, int]], spectra: Sequence[SpectrumSummary]
 ) -> list[Array]:
-    """Return the points that the map has to show, whatever part of it is wanted."""
+    # points in every view of the map
     points = [one.region.corners_m() for one, _ in places] + [np.array([one.position_m]) for one in spectra]
     if content.current is not None:
         points.append(content.current.corners_m())
@@ -112,7 +112,7 @@ def _keys(content: MapContent, spectra: Sequence[SpectrumSummary], *, whole: boo
 
 
 def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int]], int]:
-    """Return ([(newest scan, how many) for each place], how many older places are left out); the newest last."""
+    """Return ([(newest scan, how many) for each place], number of older places left out); the newest last."""
     found: dict[tuple[int, ...], tuple[ScanSummary, int]] = {}
     seen: dict[tuple[int, ...], int] = {}
     for scan in scans:
@@ -130,10 +130,8 @@ def _area_m2(place: tuple[ScanSummary, int]) -> float:
 
 
 def _place_key(region: Region) -> tuple[int, ...]:
-    """Return a key that is the same for regions alike in size, place and angle.
-
-    Sizes count by their logarithm: divided by the size, those of all squares would be the same.
-    """
+    # The same for regions alike in size, place and angle. Sizes count by their logarithm: divided by the size itself,
+    # all squares would be the same.
     step_m = max(region.size_m) / _SAME
     sizes = (round(math.log(side_m) * _SAME) for side_m in region.size_m)
     return (*(round(v / step_m) for v in region.center_m), *sizes, round(region.angle_rad * 500))
@@ -141,7 +139,7 @@ def _place_key(region: Region) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class MapView:
-    """The part of the plane that is shown, in a unit that makes handy numbers. y is upwards, unlike on the screen."""
+    """The visible part of the plane, in a unit that gives short numbers. y is upwards, unlike on the screen."""
 
     left_m: float
     low_m: float
@@ -151,11 +149,11 @@ class MapView:
 
     @classmethod
     def around(cls, points_m: Array) -> MapView:
-        """Return the view that has all points in it, with a margin."""
+        """Return the view that contains all points, with a margin."""
         low, high = points_m.min(axis=0), points_m.max(axis=0)
         side = max(*(high - low), 1e-10)
         low, high = low - _MARGIN * side, high + _MARGIN * side
-        # never narrower than the page has room for, nor so flat that nobody could click in it
+        # fits the page's width, and is high enough for clicks
         lacking = np.maximum(_LEAST * (high - low).max() - (high - low), 0.0)
         low, high = low - lacking / 2, high + lacking / 2
         per_m = 1000.0 / float((high - low).max())
@@ -176,13 +174,13 @@ class MapView:
 
 
 def _over_the_sample(limits: Region, tip_to_sample: Array | None) -> Array:
-    """Return the corners of what is allowed, moved along with the tip over a sample that drifts."""
+    # limits are in tip coordinates: on the map they move over a drifting sample
     corners = limits.corners_m()
     return corners if tip_to_sample is None else np.asarray(corners @ tip_to_sample[:, :2].T + tip_to_sample[:, 2])
 
 
 def _picture(view: MapView, one: ScanSummary, pictures: str) -> str:
-    """Return the scan itself, in its place; where its values are not kept, nothing is seen."""
+    # nothing is shown where the values are no longer kept
     (x, y), (width, height) = view.at(one.region.center_m), (side_m * view.per_m for side_m in one.region.size_m)
     turned = f"rotate({-math.degrees(one.region.angle_rad):.3f} {x:.2f} {y:.2f})"
     return (
@@ -192,7 +190,7 @@ def _picture(view: MapView, one: ScanSummary, pictures: str) -> str:
 
 
 def picture_url(pictures: str, scan: ScanSummary) -> str:
-    """Return the address of a small picture of a scan, as text of an attribute."""
+    """Return the address of a small picture of a scan, escaped for an attribute."""
     return escape(f"{pictures}/{scan.time_ns}?channel={quote(scan.channel)}")
 
 
@@ -229,7 +227,7 @@ def _probe(view: MapView, probe_m: XY) -> str:
 
 
 def _away(view: MapView, probe_m: XY) -> str:
-    """Return an arrow at the edge that points to the probe, with how far it is from there."""
+    # an arrow at the edge for a probe outside the view, with its distance
     x, y = view.at(probe_m)
     edge = min(max(x, 0.0), view.width), min(max(y, 0.0), view.height)
     distance_m = math.dist((x, y), edge) / view.per_m

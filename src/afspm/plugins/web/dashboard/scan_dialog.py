@@ -21,7 +21,7 @@ Shape = tuple[int, int]
 
 @dataclass(frozen=True)
 class ScanChoice:
-    """A scan that a person is about to ask for.
+    """A scan that a person may request.
 
     Attributes:
         shape: (rows, columns).
@@ -31,12 +31,14 @@ class ScanChoice:
     shape: Shape
 
     def squared(self) -> ScanChoice:
-        """Return the square of the longer side, with pixels as many along both."""
+        """Return the square of the longer side, with the larger number of pixels along both."""
         side_m, pixels = max(self.region.size_m), max(self.shape)
         return ScanChoice(replace(self.region, size_m=(side_m, side_m)), (pixels, pixels))
 
     def edited(self, width: str, height: str, pixels: str, angle: str = "") -> ScanChoice:
-        """Return it with sizes and angle as a person writes them, and square pixels, `pixels` along the longer side.
+        """Return the choice with sizes and angle as a person writes them, and `pixels` along the longer side.
+
+        Pixels are square.
 
         Raises:
             UnitError, InvalidValue: a text that is no length, no angle, or no number of pixels.
@@ -57,13 +59,13 @@ class ScanDialog:
 
     @classmethod
     def of_place(cls, place: PlainMapping) -> ScanDialog:
-        """Return the dialog for what the picture's script tells: x, y, width, height, angle, rows, columns."""
+        """Return the dialog for a place from the picture's script: x, y, width, height, angle, rows, columns."""
         x, y, width, height, angle = (float(place[name]) for name in ("x", "y", "width", "height", "angle"))
         pixels = max(int(place["rows"]), int(place["columns"]))
         return cls(ScanChoice(Region((x, y), (width, height), angle), _shape(pixels, (width, height))))
 
     async def ask(self) -> tuple[Region, Shape] | None:
-        """Return what the person wants; None: no scan."""
+        """Return the person's choice; None: no scan."""
         wanted = await ask_in_dialog("Scan here?", self._fields, "Scan", may=lambda: self._read() is not None)
         choice = self._read() if wanted else None
         return None if choice is None else (choice.region, choice.shape)
@@ -90,12 +92,12 @@ class ScanDialog:
             self._fill(choice.squared())
 
     def _read(self) -> ScanChoice | None:
-        """Return what the fields say, and tell it; None if they say nothing that can be scanned."""
+        # None, with an explanation in the dialog, if the fields describe no scan
         try:
             width = str(self._width.value or "")
             height = width if self._square.value else str(self._height.value or "")
             pixels, angle = str(self._pixels.value or ""), str(self._angle.value or "")
-            if angle == _degrees(self._choice.region):  # as exact as it is set, not as it is shown
+            if angle == _degrees(self._choice.region):  # unedited: as exact as set, not as shown
                 angle = ""
             choice = self._choice.edited(width, height, pixels, angle)
         except (UnitError, InvalidValue) as error:
@@ -124,6 +126,6 @@ def _length_m(text: str) -> float:
 
 
 def _shape(most: int, size_m: tuple[float, float]) -> Shape:
-    """Return so many pixels along the longer side, and square ones."""
+    # `most` pixels along the longer side, and square ones
     longest = max(size_m)
     return max(1, round(most * size_m[1] / longest)), max(1, round(most * size_m[0] / longest))

@@ -1,4 +1,4 @@
-"""Facts beside the picture of a scan: its number, time and place, and what was set when it was taken."""
+"""Facts beside the picture of a scan: its number, time and place, and the parameters at its start."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Facts = list[tuple[str, str]]
 
 
 def scan_facts(frame: ChannelFrame, overview: Overview, conditions: Mapping[str, str], now_ns: int) -> Facts:
-    """Return what a person wants to know of a scan.
+    """Return the facts about a scan, by label.
 
     Args:
         conditions: label and text of the parameters that were read when it began; empty where no page was open then.
@@ -48,13 +48,13 @@ def _when(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
 
 
 def _recorded(frame: ChannelFrame, overview: Overview) -> Mapping[str, str]:
-    """Return what the record has of the parameters: a number without a unit, which no message tells."""
+    # the record has a setpoint without its unit, which no message contains
     summary = None if frame.time_ns is None else summary_of(frame.time_ns, overview)
     return {} if summary is None or summary.setpoint is None else {"Setpoint": f"{summary.setpoint:.4g}"}
 
 
 def began_ns(frame: ChannelFrame, overview: Overview) -> int | None:
-    """Return when the scan of a frame began; None if that was not seen."""
+    """Return the start of a frame's scan; None if it was not seen."""
     if frame.time_ns is not None:
         summary = summary_of(frame.time_ns, overview)
     elif overview.running is not None:
@@ -70,7 +70,7 @@ def _centre(xy_m: XY) -> str:
 
 
 def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
-    # one that was interrupted is in the list already
+    # an interrupted scan is already in the list
     number = (overview.scans[-1].number if overview.scans else 0) + (overview.running is not None)
     facts = [("Scan", f"no. {number}")]
     if frame.began_ns is not None:
@@ -81,10 +81,10 @@ def _growing(frame: ChannelFrame, overview: Overview, now_ns: int) -> Facts:
 
 
 def ends_text(left_ns: int, now_ns: int) -> str:
-    """Return when something ends, and in how long: "22:14 (in 12 min)"."""
+    """Return the time of an end, and the time left: "22:14 (in 12 min)"."""
     return f"{time_of_day(now_ns + left_ns, seconds=left_ns < 600 * NS_PER_S)} (in {duration_text(left_ns / NS_PER_S)})"
 
 
 def summary_of(time_ns: int, overview: Overview) -> ScanSummary | None:
-    """Return the summary of the finished scan of a time; None if there is none."""
+    """Return the summary of the scan finished at a time; None if there is none."""
     return next((one for one in reversed(overview.scans) if one.time_ns == time_ns), None)

@@ -1,4 +1,4 @@
-"""Sessions: signed cookies, and which of them ended before their time."""
+"""Sessions: signed cookies, and a list of sessions that were ended early."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Session:
     """The content of a cookie.
 
     Attributes:
-        person: empty for one who only looks.
-        proof: stands for the password that it was begun with.
+        person: empty for a viewer who only looks.
+        proof: derived from the password at its beginning.
         generation: of the person's sessions: signing out everywhere begins the next.
-        since_s: when it began, real time.
+        since_s: its beginning, real time.
     """
 
     person: str
@@ -51,7 +51,8 @@ class Sessions:
     """Signs cookies and checks them. From any thread.
 
     Args:
-        file: keeps key and endings over a restart, readable by its owner alone; None: they end with this process.
+        file: keeps the key and ended sessions over a restart, readable by its owner alone; None: sessions end with this
+            process.
         now_s: the time in real seconds.
     """
 
@@ -72,10 +73,10 @@ class Sessions:
     def find(self, cookie: str) -> Session | None:
         """Return the session of a cookie; None if it was not signed here, or has ended."""
         with self._lock:
-            is_signed, said = self._signer().loads_unsafe(cookie)
-            if not is_signed or not cookie.isascii():  # base64 passes over letters that it doesn't know
+            is_signed, content = self._signer().loads_unsafe(cookie)
+            if not is_signed or not cookie.isascii():  # base64 skips unknown letters
                 return None
-            session, kept = Session(*said), self._kept
+            session, kept = Session(*content), self._kept
             is_over = session.number in kept.ended or session.generation != kept.generations.get(session.person, 0)
             return None if is_over or self._now_s() - session.since_s >= REMEMBERED_S else session
 
@@ -91,6 +92,7 @@ class Sessions:
             oldest_s = self._now_s() - REMEMBERED_S
             kept.ended = {number: since_s for number, since_s in kept.ended.items() if since_s > oldest_s}
             kept.ended[session.number] = session.since_s
+            # forgetting single sessions would revive them: a new key ends them all
             if len(kept.ended) > MOST_ENDED:
                 self._kept = _Kept()
             self._save()
@@ -102,7 +104,8 @@ class Sessions:
 
     def _save(self) -> None:
         if self._file is not None:
-            with contextlib.suppress(OSError):  # on a full disk they end with this process
+            # on a full disk, ended sessions are remembered only until this process ends
+            with contextlib.suppress(OSError):
                 replace_file(self._file, [json.dumps(asdict(self._kept)).encode()], mode=0o600)
 
 
@@ -112,4 +115,4 @@ def _read(file: Path | None) -> _Kept:
     try:
         return _Kept(**json.loads(file.read_bytes()))
     except (OSError, ValueError, TypeError):
-        return _Kept()  # none yet, or damaged: everybody signs in anew
+        return _Kept()  # missing or damaged: every person signs in again

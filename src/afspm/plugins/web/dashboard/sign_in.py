@@ -1,4 +1,4 @@
-"""The page to sign in on, and the guard before everything: who may not come in gets no further than that page."""
+"""The sign-in page, and the guard before everything: without access a viewer sees only the sign-in page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _HEADERS = {
     "x-frame-options": "DENY",
     "x-content-type-options": "nosniff",
     "referrer-policy": "same-origin",
-    # nothing comes from anywhere else, and nothing goes there
+    # the page loads nothing from other sites, and sends nothing there
     "content-security-policy": "default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
     "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; font-src 'self' data:; "
     "connect-src 'self' ws: wss:; frame-ancestors 'none'",
@@ -41,7 +41,7 @@ _PASSWORD = """<label for="password">Password</label>
 class Guard:
     """ASGI middleware: checks each request and each websocket, and sets scope["state"][VISITOR].
 
-    Besides the cookie it checks where a request comes from.
+    Besides the cookie it checks the origin of a request.
     """
 
     def __init__(self, app: AsgiApp, access: Access, host: str) -> None:
@@ -73,7 +73,7 @@ class Guard:
 
 
 def add_sign_in(app: FastAPI, access: Access, title: str, *, encrypted: bool, only_here: bool) -> None:
-    """Serve /login, which sets the cookie, and /logout, which takes it away."""
+    """Serve /login, which sets the cookie, and /logout, which removes it."""
 
     def page(person: str = "", wrong: str = "", status: int = 200) -> HTMLResponse:
         text = _page(access, title, person, wrong, hint="" if encrypted or only_here else TLS_HINT)
@@ -117,7 +117,7 @@ def _page(access: Access, title: str, person: str, wrong: str, hint: str) -> str
 
 
 def _set_cookie(answer: Response, cookie: str, *, secure: bool) -> Response:
-    """Set our cookie in the browser; an empty one takes it away."""
+    # an empty cookie removes it
     answer.set_cookie(
         COOKIE, cookie, max_age=REMEMBERED_S if cookie else 0, httponly=True, samesite="strict", secure=secure
     )
@@ -125,7 +125,7 @@ def _set_cookie(answer: Response, cookie: str, *, secure: bool) -> Response:
 
 
 def _password_in(asked: HTTPConnection) -> tuple[str, str] | None:
-    # of a program; not in a link: any page could hold one, and a person who follows it would steer under another name
+    # for programs; not accepted in a link: any page could contain one, and its reader would steer under another name
     shown = asked.headers.get("authorization", "")
     if not shown.startswith("Bearer "):
         return None

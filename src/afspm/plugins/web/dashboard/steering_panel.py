@@ -1,4 +1,4 @@
-"""Buttons and dialogs for what a person can do."""
+"""Buttons and dialogs for a person's actions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ADJUST = "Changes hold from the next line on. In MANUAL you can set all paramet
 
 
 class ModeButtons:
-    """Take over and hand back, which are always to be seen."""
+    """Take over and hand back, always visible."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -35,7 +35,6 @@ class ModeButtons:
             self._automated.set_visibility(False)
 
     def show(self) -> None:
-        """Bring them up to date."""
         if self._manual is not None and self._automated is not None:
             is_manual, may = self._session.content.is_manual, self._session.may_steer
             self._manual.set_visibility(may and not is_manual)
@@ -46,7 +45,7 @@ class ModeButtons:
 
 
 class ProblemBar:
-    """A line for each flagged problem: what to do about it, and a button to clear it."""
+    """A line for each flagged problem: the advice, and a button to clear it."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -55,7 +54,6 @@ class ProblemBar:
         self._box.set_visibility(False)
 
     def show(self) -> None:
-        """Bring it up to date."""
         flags, may = self._session.content.problems, self._session.may_steer
         if (flags, may) == self._shown:
             return
@@ -114,7 +112,7 @@ class SteeringPanel:
         ui.on("spectrum_here", self._ask_spectrum)
 
     async def show(self, content: Content) -> None:
-        """Bring it up to date."""
+        """Show the buttons and parameters that apply now."""
         for one in self._by_hand:
             one.set_visibility(content.is_manual)
         self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
@@ -151,6 +149,5 @@ class SteeringPanel:
 
 
 async def ask_restart(session: SteeringSession, name: str) -> None:
-    """Start a process anew, after a question."""
     if await asked(f"Restart {name}?", "The process is ended and restarted. Its data on disk is kept.", "Restart"):
         session.do(lambda a: a.restart(name))

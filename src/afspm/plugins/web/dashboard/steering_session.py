@@ -18,7 +18,7 @@ _CLOSE = [{"label": "Close", "color": "white"}]
 
 
 class SteeringSession:
-    """Carries out what a viewer asks for, and shows the result, with the reason of a refusal."""
+    """Carries out a viewer's actions, and shows the result, with the reason of a refusal."""
 
     def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
         self.watch = watch
@@ -39,7 +39,7 @@ class SteeringSession:
 
     @property
     def may_measure(self) -> bool:
-        """True if the viewer can ask the microscope for something."""
+        """True if the viewer can command the microscope."""
         return self.may_steer and self.content.is_manual
 
     def results(self) -> None:
@@ -51,6 +51,7 @@ class SteeringSession:
 
         async def doing() -> None:
             result = await self.carry_out(action)
+            # the viewer may have closed the page meanwhile; a background task has no page of its own
             if not self._client.is_deleted:
                 with self._client:
                     self.say(result)
@@ -92,7 +93,7 @@ async def asked(title: str, text: str, yes: str) -> bool:
 async def ask_in_dialog(
     title: str, body: Callable[[], object], yes: str, may: Callable[[], bool] = lambda: True
 ) -> bool:
-    """Ask the viewer in a dialog with a body of its own, which can only be agreed to while `may()`."""
+    """Ask the viewer in a dialog with a body of its own; the answer yes is enabled while `may()` is true."""
 
     def agree() -> None:
         if may():
@@ -105,7 +106,7 @@ async def ask_in_dialog(
             ui.button("Cancel", on_click=lambda: dialog.submit(None), color=None).props("no-caps flat autofocus")
             ui.button(yes, on_click=agree).props("no-caps unelevated")
     answer = await dialog
-    if not dialog.is_deleted:  # it is with the page, if the browser was closed
+    if not dialog.is_deleted:  # a closed browser has already deleted it
         dialog.clear()
         dialog.delete()
     return bool(answer)

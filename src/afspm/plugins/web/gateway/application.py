@@ -1,4 +1,4 @@
-"""The web application: routes by what they are about, and the same model for every refusal."""
+"""The web application: routes by subject, and one model for every refusal."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from afspm.plugins.web.gateway.services import GatewayServices
 from afspm.plugins.web.passwords import Passwords
 
 PREFIX = "/v1"
-ABOUT = """The experiment over HTTP. Everybody who may look reads; to command, send a name and its token, request
-control, and renew its lease. The scheduler decides about each request as it does for every component: limits hold, and
-what is done is in the record under `<gateway>:<name>`. Everything is in SI units."""
+ABOUT = """The experiment over HTTP. Every client that may look can read. To command, send a name and its token, request
+control, and renew its lease. The scheduler treats each request like one of a component: limits hold, and the record
+keeps each action under `<gateway>:<name>`. All values are in SI units."""
 _REFUSED: dict[int | str, dict[str, object]] = {
-    "4XX": {"model": RefusalModel, "description": "It was not done, and why."},
-    "5XX": {"model": RefusalModel, "description": "No answer, or a fault."},
-    422: {"model": RefusalModel, "description": "The request makes no sense, or a limit refuses it."},
+    "4XX": {"model": RefusalModel, "description": "The request was refused, with the reason."},
+    "5XX": {"model": RefusalModel, "description": "No answer, or an error of the gateway."},
+    422: {"model": RefusalModel, "description": "The request is invalid, or a limit refuses it."},
 }
 
 
@@ -55,6 +55,7 @@ def application(
     app.add_exception_handler(HTTPException, _no_route)
     for error in (RefusedRequest, Exception):
         app.add_exception_handler(error, _refused)
+    # outside of FastAPI: an unauthorised request must not reach a validator
     guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)
     if not origins:
         return guarded
@@ -92,7 +93,7 @@ async def _no_route(asked: Request, error: Exception) -> Response:
 
 
 def _methods(paths: Plain, path: str) -> list[str]:
-    """Return the methods of a path, of which each has a route of its own."""
+    # each method of a path is a route of its own
     for template, of_path in paths.items():
         if re.fullmatch(re.sub(r"{\w+}", "[^/]+", template), path):
             return [method.upper() for method in of_path]

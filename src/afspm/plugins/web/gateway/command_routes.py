@@ -1,4 +1,4 @@
-"""Routes for who has a name: control, measurements, settings, actions, problems, mode, notes and the end."""
+"""Routes for clients with a name: control, measurements, settings, actions, problems, mode, notes and the end."""
 
 from __future__ import annotations
 
@@ -39,23 +39,22 @@ from afspm.plugins.web.gateway.views import parameter_model
 from afspm.plugins.web.person_commands import PersonCommands
 
 LONGEST_WAIT_S = 25.0
-"""What is in between often cuts off what waits for 30 s."""
+"""Proxies often cut off requests after 30 s."""
 PUBLISHED_WITHIN_S = 1.0
-Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT_S, description="for so many seconds at most")]
+Wait = Annotated[float, Query(ge=0.0, le=LONGEST_WAIT_S, description="longest wait, s")]
 Name = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$")]
 _SECURITY = (Depends(HTTPBasic(auto_error=False)), Depends(HTTPBearer(auto_error=False)))
 _CONTROL, _LEASE, _SCAN, _SPECTRUM = ControlAsked(), LeaseModel(), ScanAsked(), SpectrumAsked()  # without a body
 
 
 class CommandRoutes:
-    """Has the scheduler asked, in the name of who asks."""
+    """Sends requests to the scheduler, each under the client's name."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
         self._bell = services.bell
 
     def router(self) -> APIRouter:
-        """Return the routes."""
         router = APIRouter(dependencies=[*_SECURITY, Depends(self._services.who)])
         accepted: Plain = {"status_code": 202, "response_model": MeasurementModel}
         router.post("/control", response_model=ControlModel)(self.request_control)
@@ -78,7 +77,7 @@ class CommandRoutes:
     async def request_control(
         self, asked: Request, wanted: ControlAsked = _CONTROL, wait_s: Wait = 0.0
     ) -> ControlModel:
-        """Request control, with a lease. Renew it: when it runs out, control is taken as from a process that died."""
+        """Request control, with a lease. Renew it in time: after its end, you lose control as a dead process does."""
         problem = self._problem(wanted.solving) if wanted.solving is not None else 0
         until_s = asyncio.get_running_loop().time() + wait_s
 
@@ -97,12 +96,12 @@ class CommandRoutes:
             await self._control_changed(left_s)
 
     async def renew_control(self, asked: Request, lease: LeaseModel = _LEASE) -> ControlModel:
-        """Begin the lease anew. It fails with `not-in-control` once control is lost."""
+        """Renew the lease. It fails with `not-in-control` once control is lost."""
         await self._services.command(asked, lambda commands: commands.renew(lease.lease_s))
         return ControlModel(holder=self._services.who(asked), lease_s=lease.lease_s)
 
     async def release_control(self, asked: Request) -> DoneModel:
-        """Give control back."""
+        """Release control."""
         await self._services.command(asked, lambda commands: commands.release_control())
         await self._published(lambda control: control.holder != self._services.who(asked))
         return DoneModel()
@@ -110,7 +109,7 @@ class CommandRoutes:
     # --- measurements ---
 
     async def take_scan(self, asked: Request, answer: HttpResponse, wanted: ScanAsked = _SCAN) -> MeasurementModel:
-        """Begin a scan, in control. The answer comes when it has begun; then ask for the measurement."""
+        """Begin a scan, in control. The answer comes when the scan has begun; then ask for the measurement."""
         given = wanted.region
         region = None if given is None else Region(xy_of(given.center_m), xy_of(given.size_m), given.angle_rad)
         shape = None if wanted.shape is None else (wanted.shape[0], wanted.shape[1])
@@ -120,12 +119,12 @@ class CommandRoutes:
     async def take_spectrum(
         self, asked: Request, answer: HttpResponse, wanted: SpectrumAsked = _SPECTRUM
     ) -> MeasurementModel:
-        """Begin a spectrum, in control. The answer comes when it has begun; then ask for the measurement."""
+        """Begin a spectrum, in control. The answer comes when the spectrum has begun; then ask for the measurement."""
         target = SpectrumTarget.of(wanted.position_m, None, self._services.frame)
         return await self._measure(asked, answer, wanted.key, target)
 
     async def measurement(self, asked: Request, key: Annotated[KEY, Path()], wait_s: Wait = 0.0) -> MeasurementModel:
-        """Return a measurement of yours, at its end or when the time to wait is over."""
+        """Return a measurement of yours, at its end or when the waiting time is over."""
         who, until_s = self._services.who(asked), asyncio.get_running_loop().time() + wait_s
         while True:
             found = self._services.measurements.find(who, key)
@@ -139,15 +138,15 @@ class CommandRoutes:
     # --- the microscope ---
 
     async def set_parameter(self, asked: Request, name: Parameter, wanted: ParameterChange) -> ParameterModel:
-        """Set a parameter, in control; returns what is then in force."""
+        """Set a parameter, in control; returns the value then in force."""
         value, unit = wanted.value, wanted.unit
         response = await self._services.command(asked, lambda commands: commands.set(name, value, unit))
         return parameter_model(name, response, value)
 
     async def act(self, asked: Request, name: Name) -> DoneModel:
-        """Have the microscope do something, in control; returns when it has accepted it. `stop-scan` stops a scan."""
+        """Start an action of the microscope, in control; returns when it is accepted. `stop-scan` stops a scan."""
         if name in (names.START_SCAN, names.START_SPEC):
-            raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"{name} is asked for by POST /v1/scans or /v1/spectra")
+            raise RefusedRequest(RefusalCode.NOT_SUPPORTED, f"request {name} by POST /v1/scans or /v1/spectra")
         await self._services.command(asked, lambda commands: commands.act(name))
         return DoneModel()
 
@@ -161,7 +160,7 @@ class CommandRoutes:
         return ProblemModel(name=name, flagged=True)
 
     async def clear_problem(self, asked: Request, name: Name) -> ProblemModel:
-        """Remove the flag of a problem."""
+        """Clear a problem."""
         number = self._problem(name)
         await self._services.command(asked, lambda commands: commands.clear(number))
         await self._published(lambda control: number not in control.problems)
@@ -181,11 +180,11 @@ class CommandRoutes:
         return DoneModel()
 
     async def end_experiment(self, asked: Request) -> DoneModel:
-        """End the experiment for everybody."""
+        """End the experiment for everyone."""
         try:
             await self._services.command(asked, lambda commands: commands.end())
         except RefusedRequest as error:
-            if error.model.code is not RefusalCode.EXPERIMENT_ENDED:  # which may come before the answer
+            if error.model.code is not RefusalCode.EXPERIMENT_ENDED:  # the end may be published before the answer
                 raise
         return DoneModel()
 
@@ -204,7 +203,7 @@ class CommandRoutes:
             raise RefusedRequest(RefusalCode.NOT_FOUND, str(error)) from error
 
     async def _published(self, holds: Callable[[ControlState], bool]) -> None:
-        """Wait until what was answered is published, so that a client reads what it has done; not for long."""
+        # a client must read what it has set; bounded, in case the publication does not arrive
         loop, watch = asyncio.get_running_loop(), self._services.watch
         until_s = loop.time() + PUBLISHED_WITHIN_S
         while (left_s := until_s - loop.time()) > 0.0:
@@ -213,7 +212,7 @@ class CommandRoutes:
             await self._bell.wait(left_s)
 
     async def _control_changed(self, within_s: float) -> None:
-        """Wait until who is in control has changed; not for ever, should that not reach us."""
+        # bounded, in case the change of control does not arrive
         loop, watch = asyncio.get_running_loop(), self._services.watch
         until_s, before = loop.time() + min(within_s, 5.0), watch.overview.control
         while (left_s := until_s - loop.time()) > 0.0 and watch.overview.control is before:

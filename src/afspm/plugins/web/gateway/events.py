@@ -1,4 +1,4 @@
-"""The events of an experiment, numbered by their times, so that a client goes on where it was cut off."""
+"""The events of an experiment, numbered by their times, so that a client continues after a lost connection."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
 from afspm.storage.packet_log import log_folder, logged_packets
 
+# both bounds: notes and log lines may be long
 MOST_EVENTS, MOST_BYTES = 20_000, 16 << 20
 
 
 class Event(NamedTuple):
-    """An event as it is sent; `time_ns` is its id."""
+    """An event in the form in which it is sent; `time_ns` is its id."""
 
     time_ns: int
     kind: str
@@ -46,11 +47,11 @@ class Event(NamedTuple):
 
 @dataclass(frozen=True)
 class EventBatch:
-    """Events to be sent.
+    """Events to send.
 
     Attributes:
         newest_ns: continue after this.
-        missed_until_ns: events up to this time are not kept any more; None: nothing was missed.
+        missed_until_ns: events up to this time are no longer stored; None: nothing was missed.
     """
 
     events: tuple[Event, ...]
@@ -62,7 +63,7 @@ class EventHistory:
     """The newest events, bounded. From any thread.
 
     Args:
-        complete_since_ns: what was published before this is not known to be all here.
+        complete_since_ns: events before this time may be incomplete.
     """
 
     def __init__(self, problems: ProblemNames, complete_since_ns: int = -1) -> None:
@@ -80,18 +81,19 @@ class EventHistory:
             return self._events[-1].time_ns if self._events else None
 
     def incomplete_before(self, time_ns: int) -> None:
-        """Note that of what was published before, only a part is here."""
+        """Note that events before this time may be incomplete."""
         with self._lock:
             self._complete_since_ns = max(self._complete_since_ns, time_ns)
 
     def take(self, message: str, thing: object, time_ns: int) -> None:
-        """Add what was published; what is not newer (a replay) is passed over."""
+        """Add a published message; a replayed one (not newer) is ignored."""
         kind = wire.declaration(message).event
         with self._lock:
             if not kind or (self._events and time_ns <= self._events[-1].time_ns):
                 return
             if isinstance(thing, ProcessStates) and not self._has_changed(thing):
                 return
+            # encoded once for all streams
             data = {"time": iso_utc(time_ns), "data": _data(thing, time_ns, self._problems)}
             event = Event(time_ns, kind, json.dumps(data, allow_nan=False))
             self._events.append(event)
@@ -100,7 +102,7 @@ class EventHistory:
                 self._drop_oldest()
 
     def after(self, time_ns: int, kinds: Collection[str], most: int) -> EventBatch:
-        """Return the events after a time, of some kinds, as far as they are kept."""
+        """Return the stored events after a time, of some kinds."""
         with self._lock:
             start = bisect_right(self._events, time_ns, key=lambda event: event.time_ns)
             found = self._events[start : start + most]
@@ -109,7 +111,7 @@ class EventHistory:
         return EventBatch(tuple(one for one in found if one.kind in kinds), newest_ns, missed)
 
     def _has_changed(self, states: ProcessStates) -> bool:
-        # a supervisor publishes all its processes every 2 s: as events they were most of a night's memory
+        # a supervisor publishes all its processes every 2 s: as events they took most of a night's memory
         now = tuple(replace(one, step_age_s=0.0) for one in states.processes)
         before, self._processes[states.supervisor] = self._processes.get(states.supervisor), now
         return now != before
@@ -122,9 +124,9 @@ class EventHistory:
 
 
 def fill(history: EventHistory, run_dir: Path, state_dir: Path | None, now_ns: int) -> None:
-    """Add what is on disk of the run so far: the journal, then what of the packet log is not in it yet.
+    """Add the run's events on disk: the journal, then later ones from the packet log.
 
-    Where neither is on this computer, only what the scheduler's cache replays will be known of the past.
+    If neither is on this computer, only the replay of the scheduler's cache is known of the past.
     """
     oldest_ns = None
     for message, thing, time_ns in _recorded(run_dir, state_dir):
@@ -143,7 +145,7 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, obje
                     newest_ns = packet.time_ns or newest_ns
                     yield message, thing, newest_ns
         except AfspmError:
-            pass  # the recorder is just making it; the log has it
+            pass  # the recorder is just creating the file; the packet log has the events
     for entry in () if state_dir is None else logged_packets(log_folder(state_dir)):
         packet = entry.packet
         try:
@@ -155,7 +157,7 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, obje
 
 
 def _data(thing: object, time_ns: int, problems: ProblemNames) -> dict[str, object]:
-    """Return what was published in JSON's types, without the values of scans and spectra."""
+    # without the values of scans and spectra
     match thing:
         case ControlState():
             return {
@@ -206,7 +208,7 @@ def _entry(entry: JournalEntry, problems: ProblemNames) -> dict[str, object]:
 
 
 def _without_large_numbers(value: object) -> Any:
-    """Return plain data with times in nanoseconds as texts, and None for what JSON has no number for."""
+    # JSON has no exact integers of 64 bits in every language, and no NaN
     if isinstance(value, dict):
         return {key: _without_large_numbers(one) for key, one in value.items()}
     if isinstance(value, list):

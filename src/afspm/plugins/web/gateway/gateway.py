@@ -1,4 +1,4 @@
-"""`Gateway`: the component that lets whatever speaks HTTP take part in an experiment."""
+"""`Gateway`: the component that lets HTTP clients take part in an experiment."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ MOST_REQUESTS = 200
 class Gateway(WebComponent):
     """Serves a JSON API over HTTP: state, parameters, scans, control, measurements, events.
 
-    Each name acts as `<gateway>:<name>`, with the roles and limits of that. Control has a lease, which the scheduler
-    keeps: a client that vanishes loses control as a process that dies does. It asks for nothing by itself; all others
-    have the processor first.
+    A client with a name acts as `<gateway>:<name>`, with the roles and limits of that name. Control has a lease, which
+    the scheduler keeps: a client that vanishes loses control as a process that dies does. Other processes have the
+    processor first.
 
     Args:
-        host: the address to listen at. At any other than this computer's own, `people` and a certificate are needed.
-        port: 0 for any that is free; None: 8090, or any if that is taken. A restart takes the same one.
-        people: who may command: the hash of each name's token, as `afspm dashboard --make-password` prints it. Without
+        host: the address to listen at. Any but a loopback address needs `people` and a certificate.
+        port: 0 for any free port; None: 8090, or any if that is taken. A restart takes the same one.
+        people: names that may command: the hash of each token, as `afspm dashboard --make-password` prints it. Without
             any, every name may, from this computer.
         certificate, certificate_key: PEM files, for https.
-        origins: of pages elsewhere that may ask, e.g. "http://localhost:3000"; by default none may.
+        origins: of pages elsewhere that may send requests, e.g. "http://localhost:3000"; by default none may.
 
     Raises:
-        ConfigError: others could come in without a token, or listen in; the port is taken …
+        ConfigError: other computers could come in without a token, or listen in; the port is taken …
     """
 
     served = "gateway"
@@ -57,12 +57,14 @@ class Gateway(WebComponent):
                 where="gateway",
                 hint="`afspm dashboard --make-password` makes a line of people; or listen on 127.0.0.1",
             )
+        # "*" lets every page in, and "null" is the origin of any local file or sandboxed frame
         if any(one in ("*", "null") for one in origins):
             raise ConfigError("origins names pages one by one", where="gateway", hint='e.g. ["http://localhost:3000"]')
         self._passwords = Passwords(host, "", people or {}, ExperimentClock.real().now_s)
         self._origins = tuple(origins)
 
     def on_start(self) -> None:
+        # imported here: a file is checked also where the extra `gateway` is not installed
         from afspm.plugins.web.gateway.application import application
         from afspm.plugins.web.gateway.events import EventHistory, fill
         from afspm.plugins.web.gateway.measurements import Measurements
@@ -92,7 +94,7 @@ class Gateway(WebComponent):
         name = envelope.partition("_")[0]
         self._measurements.on_packet(message, time_ns)
         self._history.take(name, message, time_ns)
-        self._watch.take(name, message, time_ns, envelope)  # which wakes those who wait: last
+        self._watch.take(name, message, time_ns, envelope)  # last: it wakes waiting requests
 
     def on_end(self) -> None:
         if self._server is not None:

@@ -1,4 +1,4 @@
-"""The guard before everything: where a request comes from, who asks, and how much is sent."""
+"""The guard before everything: origin, name and size of a request."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ MOST_BODY_BYTES = 64 << 10
 
 
 class GatewayGuard:
-    """ASGI middleware: checks each request, and sets scope["state"][PERSON] to the name, empty for who only looks.
+    """ASGI middleware: checks each request, and sets scope["state"][PERSON] to the name; empty: may only look.
 
     Args:
-        origins: of pages elsewhere that may ask.
+        origins: of pages elsewhere that may send requests.
     """
 
     def __init__(self, app: AsgiApp, passwords: Passwords, host: str, origins: Collection[str]) -> None:
@@ -51,7 +51,7 @@ class GatewayGuard:
         why = wrong_origin(asked.headers, only_here=self._only_here, what="gateway", allowed=self._origins)
         is_foreign = asked.headers.get("sec-fetch-site") == "cross-site"
         if why is None and is_foreign and asked.headers.get("origin") not in self._origins:
-            why = "a page of another site may not ask this gateway"
+            why = "a page of another site may not send requests to this gateway"
         if why is not None:
             raise RefusedRequest(RefusalCode.WRONG_ORIGIN, why)
 
@@ -73,7 +73,6 @@ class GatewayGuard:
 
 
 def answer(refused: RefusedRequest) -> JSONResponse:
-    """Return a refusal as a response."""
     headers = {"Cache-Control": "no-store"}
     if refused.status == 401:
         headers["WWW-Authenticate"] = 'Basic realm="afspm", charset="UTF-8"'
@@ -81,7 +80,7 @@ def answer(refused: RefusedRequest) -> JSONResponse:
 
 
 class _Body:
-    """Counts what is sent, also where its length is not told before."""
+    """Limits the size of a request's body, also without a declared length."""
 
     def __init__(self, receive: Receive) -> None:
         self._receive = receive
@@ -89,9 +88,9 @@ class _Body:
 
     @classmethod
     async def bounded(cls, asked: HTTPConnection, receive: Receive) -> Receive:
-        told = asked.headers.get("content-length", "0")
-        if not told.isdecimal() or int(told) > MOST_BODY_BYTES:
-            raise RefusedRequest(RefusalCode.TOO_LARGE, f"a body of {told[:20]} bytes")
+        length = asked.headers.get("content-length", "0")
+        if not length.isdecimal() or int(length) > MOST_BODY_BYTES:
+            raise RefusedRequest(RefusalCode.TOO_LARGE, f"a body of {length[:20]} bytes")
         return cls(receive).next
 
     async def next(self) -> Message:
@@ -103,7 +102,7 @@ class _Body:
 
 
 def _name_and_token(shown: str) -> tuple[str, str]:
-    """Return the parts of an Authorization header: Basic, or Bearer with the two and a colon in between."""
+    # Basic, or Bearer with name and token joined by a colon
     scheme, _, said = shown.partition(" ")
     if scheme.lower() == "basic":
         try:

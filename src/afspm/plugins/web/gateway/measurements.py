@@ -1,6 +1,6 @@
-"""Scans and spectra that clients asked for: each is begun once for its key, and followed to its end.
+"""Scans and spectra requested by clients: each is begun once for its key, and followed to its end.
 
-They are on disk before they are begun: a gateway that is killed goes on with them, by what the scheduler replays.
+They are on disk before they are begun: a restarted gateway continues with them, using the scheduler's replay.
 """
 
 from __future__ import annotations
@@ -29,20 +29,23 @@ _RUNNING, _DONE, _FAILED = (one.value for one in MeasurementState)
 _WHY = {
     CycleOutcome.INTERRUPTED: (RefusalCode.INTERRUPTED, "it was stopped before its end"),
     CycleOutcome.VANISHED: (RefusalCode.NO_RESULT, "the microscope is free again without a result"),
-    CycleOutcome.ANOTHER: (RefusalCode.NO_RESULT, "not what was asked for was measured: who else sets the microscope?"),
+    CycleOutcome.ANOTHER: (
+        RefusalCode.NO_RESULT,
+        "another measurement than requested was taken: does another program set the microscope?",
+    ),
 }
 
 
 @dataclass
 class Measurement:
-    """A scan or spectrum that a client asked for, as it is kept on disk.
+    """A scan or spectrum requested by a client, as it is kept on disk.
 
     Attributes:
-        who: the name that asked, as the scheduler knows it.
+        who: the client's name, as the scheduler knows it.
         plan: the target in JSON's types.
         attempt: number of the last; the same id is executed once.
-        since_ns: results that are not newer belong to something earlier.
-        refusal: as a `RefusalModel`, of one that failed.
+        since_ns: older results belong to earlier measurements.
+        refusal: as a `RefusalModel`, of a failed measurement.
     """
 
     who: str
@@ -76,7 +79,7 @@ class _Following:
     result_ns: int = 0
 
     def take(self, thing: object, time_ns: int) -> None:
-        """Take in what was published."""
+        """Process a published message."""
         if isinstance(thing, ScopeStatus):
             self.cycle.on_state(thing.state, time_ns)
         elif isinstance(thing, Scan if isinstance(self.target, ScanTarget) else Spectrum):
@@ -107,21 +110,21 @@ class Measurements:
                 self._follow(one, resumed=True)
 
     def find(self, who: str, key: str) -> Measurement | None:
-        """Return a measurement of a client by its key; None: it has none of that."""
+        """Return a measurement of a client by its key; None: the client has none with this key."""
         with self._lock:
             if (one := self._followed.get((who, key))) is not None:
                 self._settle_if_never_begun(one)
             return self._kept.get((who, key))
 
     def take(self, who: str, key: str | None, target: Target) -> Callable[[PersonCommands], Measurement]:
-        """Return what begins a measurement, for the thread of the person; it raises RefusedRequest.
+        """Return a function that begins a measurement, for the person's thread; it raises RefusedRequest.
 
-        One that was begun before under its key is not begun again, unless it failed.
+        A measurement already begun under its key is not begun again, unless it failed.
         """
         return lambda commands: self._begin(commands, who, key or secrets.token_hex(8), target)
 
     def on_packet(self, thing: object, time_ns: int) -> None:
-        """Take in what was published."""
+        """Process a published message."""
         with self._lock:
             for key, one in list(self._followed.items()):
                 one.take(thing, time_ns)
@@ -133,6 +136,7 @@ class Measurements:
 
     def _begin(self, commands: PersonCommands, who: str, key: str, target: Target) -> Measurement:
         plan = target.facts()
+        # the key with another target would return another measurement than requested
         with self._lock:
             known = self.find(who, key)
             if known is not None and known.plan != plan:
@@ -150,13 +154,13 @@ class Measurements:
         return self._begun(one, response)
 
     def _attempts(self, one: Measurement) -> Iterator[str]:
-        """Yield an id for each attempt; asked for another, the one before was refused."""
+        # a caller takes another id only after a refusal of the one before
         while True:
             yield self._next_attempt(one)
             one.is_certain = True
 
     def _next_attempt(self, one: Measurement) -> str:
-        """Write the next attempt down, and return its id; one of unknown outcome is asked for again by its own."""
+        # on disk before its use; an attempt of unknown outcome is repeated under its own id
         with self._watch.reading() as overview:
             newest_ns = overview.newest_ns
         with self._lock:
@@ -172,6 +176,7 @@ class Measurements:
         key = (one.who, one.key)
         with self._lock:
             followed = self._followed.get(key)
+            # the measurement may begin, or even end, before the answer arrives
             is_seen = followed is None or followed.cycle.begun
             if response.ok or is_seen:
                 one.is_certain = True

@@ -1,6 +1,6 @@
-"""The documents of the gateway: what it answers and takes, in SI units. The OpenAPI description is made of these.
+"""The documents of the gateway, in SI units: answers and request bodies. The OpenAPI description is made from these.
 
-Ids are texts: they are times in nanoseconds, and JSON has no numbers of 64 bits in every language.
+Ids are texts: they are times in nanoseconds, and not every language has exact 64-bit numbers in JSON.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ LONGEST_LEASE_S = 3600.0
 
 def _no_truth(value: object) -> object:
     if isinstance(value, bool):
-        raise ValueError("a number, not true or false")  # which Python would take for 1 and 0
+        raise ValueError("a number, not true or false")  # Python would take them for 1 and 0
     return value
 
 
-NUMERIC = BeforeValidator(_no_truth)  # last: what comes after it is not in the description
+NUMERIC = BeforeValidator(_no_truth)  # last: later validators are missing in the description
 NUMBER = Annotated[float, Field(allow_inf_nan=False), NUMERIC]
 PLACE = Annotated[float, Field(ge=-1.0, le=1.0), NUMERIC]
 LENGTH = Annotated[float, Field(gt=0.0, le=1.0), NUMERIC]
@@ -53,7 +53,7 @@ class _Asked(BaseModel):
 
 
 class RegionModel(_Asked):
-    """A rectangle turned about its centre; x to the right, y upwards."""
+    """A rectangle rotated about its centre; x to the right, y upwards."""
 
     center_m: PlacePair = Field(description="(x, y)", examples=[[0.0, 0.0]])
     size_m: LengthPair = Field(description="(width, height)", examples=[[1e-6, 1e-6]])
@@ -61,7 +61,7 @@ class RegionModel(_Asked):
 
 
 class MicroscopeModel(_Answer):
-    """The activity of the microscope. None: it has not told."""
+    """The activity of the microscope. None: not published yet."""
 
     state: str = Field(examples=["FREE"])
     region: RegionModel | None = Field(default=None, description="of the next scan")
@@ -84,7 +84,7 @@ class StateModel(_Answer):
     you: str | None = Field(description="the name that the scheduler knows you by; None: you only look")
     in_control: bool = Field(description="you are the holder")
     ended: bool
-    silent_s: float = Field(description="real seconds since the experiment was heard of")
+    silent_s: float = Field(description="real seconds since the last message of the experiment")
     last_event: str | None = Field(description="id of the newest event, for Last-Event-ID")
 
 
@@ -149,7 +149,7 @@ class ValueFormat(Enum):
 class ArrayModel(_Answer):
     """Values as text: float64, little endian, row after row; of a scan the first row is the lowest.
 
-    NaN is what was not measured.
+    NaN means not measured.
     """
 
     shape: Shape = Field(description="of a scan (rows, columns), of a spectrum (points, variables)")
@@ -166,7 +166,7 @@ class SpectrumFormat(Enum):
 
 
 class LeaseModel(_Asked):
-    """For how long you keep control without a command or a renewal, in real seconds, whatever the microscope does."""
+    """How long you keep control without a command or a renewal, in real seconds, also during a measurement."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"lease_s": 60}]})
 
@@ -184,14 +184,14 @@ class ControlAsked(LeaseModel):
 
 
 class ControlModel(_Answer):
-    """Control as you have it."""
+    """Your control."""
 
     holder: str
     lease_s: float = Field(description="renew it in half of that")
 
 
 class ScanAsked(_Asked):
-    """A scan to take. What is left out is as it is set."""
+    """A scan to take. Omitted fields stay as they are set."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -208,7 +208,7 @@ class ScanAsked(_Asked):
 
 
 class SpectrumAsked(_Asked):
-    """A spectrum to take. What is left out is as it is set."""
+    """A spectrum to take. Omitted fields stay as they are set."""
 
     model_config = ConfigDict(json_schema_extra={"examples": [{"position_m": [0, 0], "key": "iv-1"}, {}]})
 
@@ -225,7 +225,7 @@ class MeasurementState(Enum):
 
 
 class MeasurementModel(_Answer):
-    """A scan or spectrum that was asked for."""
+    """A requested scan or spectrum."""
 
     id: KEY = Field(description="its key; one is made up where none was given")
     kind: Literal["scan", "spectrum"]
@@ -235,13 +235,13 @@ class MeasurementModel(_Answer):
 
 
 class ActionModel(_Answer):
-    """An action that the microscope has."""
+    """An action of the microscope."""
 
     name: str = Field(examples=["x-retract"])
 
 
 class ProblemModel(_Answer):
-    """A problem that the experiment knows."""
+    """A problem of the experiment, flagged or not."""
 
     name: str = Field(examples=["tip-shape-changed"])
     flagged: bool
@@ -263,7 +263,7 @@ class NoteAsked(_Asked):
 
 
 class DoneModel(_Answer):
-    """It was done."""
+    """The request was carried out."""
 
     done: Literal[True] = True
 
@@ -287,7 +287,7 @@ EventKind = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "stri
 
 
 class EventModel(_Answer):
-    """The data of an event: of a `missed` one `after` and `until`, between which events were left out."""
+    """The data of an event. A `missed` event has `after` and `until`, between which events were left out."""
 
     time: TIME | None
     data: dict[str, object]

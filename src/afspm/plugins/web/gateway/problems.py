@@ -1,4 +1,4 @@
-"""Refusals of the gateway: one model with a code, a reason and what to do, whatever refused."""
+"""Refusals of the gateway: one model with a code, a reason and advice, for every source of a refusal."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.transport.process.parent import StopRequested
 
 
 class RefusalCode(Enum):
-    """The reasons why something was not done."""
+    """The reasons of refusals."""
 
     INVALID = "invalid"
     TOO_LARGE = "too-large"
@@ -103,7 +103,7 @@ _BY_RESPONSE = {
 
 
 class RefusalModel(BaseModel):
-    """Why something was not done. Programs go by `code`; `reason` and `advice` are for people."""
+    """A refusal. Programs go by `code`; `reason` and `advice` are for people."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -139,7 +139,7 @@ class RefusedRequest(Exception):
 
 
 def refused(response: Response) -> RefusedRequest:
-    """Return a response that is no success as a refusal."""
+    """Return an unsuccessful response as a refusal."""
     if response.detail is ResponseDetail.EXPERIMENT_ENDED:
         return RefusedRequest(_C.EXPERIMENT_ENDED, response.reason)
     is_known = response.code in ControlResponse._value2member_map_

@@ -1,4 +1,4 @@
-"""Routes for everybody who may look: state, parameters, scans, spectra, events."""
+"""Routes for every client that may look: state, parameters, scans, spectra, events."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 
 from afspm.basics.clock import iso_utc
-from afspm.model import ControlMode, ControlState, Spectrum, names
+from afspm.model import ControlMode, ControlResponse, ControlState, Spectrum, names
+from afspm.model import Response as ModelResponse
 from afspm.model.line_levelling import Levelling
 from afspm.plugins.web.gateway import views
 from afspm.plugins.web.gateway.models import (
@@ -29,14 +30,17 @@ from afspm.plugins.web.gateway.models import (
     ValueFormat,
     event_kinds,
 )
-from afspm.plugins.web.gateway.parameter_cache import ParameterCache
-from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, refused
 from afspm.plugins.web.gateway.services import GatewayServices
 from afspm.plugins.web.gateway.stream import MOST_STREAMS, server_sent
 from afspm.plugins.web.person_commands import PersonCommands
 from afspm.record.overview import ScanSummary, SpectrumSummary
 
 NEWEST = "newest"
+FRESH_S = 1.0
+MOST_KEPT = 200
+_KNOWN = (*names.BASE_PARAMETERS, *names.EXTENSION_PARAMETERS)
+_LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
 _ACTIONS = (*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)
 Which = Annotated[str, Path(pattern=r"^([0-9]{1,20}|newest)$", examples=[NEWEST], description="an id, or `newest`")]
 Parameter = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$", examples=["scan-speed"])]
@@ -57,8 +61,43 @@ _EVENTS: dict[int | str, dict[str, object]] = {
 }
 
 
+class ParameterCache:
+    """Values of parameters, read from the microscope at most once a second for all clients together."""
+
+    def __init__(self, services: GatewayServices) -> None:
+        self._services = services
+        self._asked: dict[str, tuple[float, asyncio.Task[ModelResponse]]] = {}
+        self._lacking: set[str] = set()
+
+    async def all(self) -> list[ParameterModel]:
+        """Return the known parameters that the microscope has."""
+        wanted = [name for name in _KNOWN if name not in self._lacking]
+        responses = await asyncio.gather(*map(self._response, wanted))
+        self._lacking.update(name for name, one in zip(wanted, responses, strict=True) if one.code in _LACKING)
+        return [views.parameter_model(name, one) for name, one in zip(wanted, responses, strict=True) if one.ok]
+
+    async def one(self, name: str) -> ParameterModel:
+        """Return a parameter. Raises RefusedRequest if it can't be read."""
+        response = await self._response(name)
+        if not response.ok:
+            raise refused(response)
+        return views.parameter_model(name, response)
+
+    async def _response(self, name: str) -> ModelResponse:
+        # a program that polls must not keep the microscope busy: one read serves all clients for a second
+        now_s = asyncio.get_running_loop().time()
+        known = self._asked.get(name)
+        if known is None or now_s - known[0] >= FRESH_S:
+            while len(self._asked) >= MOST_KEPT:
+                del self._asked[next(iter(self._asked))]
+            task = asyncio.ensure_future(self._services.read(lambda commands: commands.get(name)))
+            known = self._asked[name] = now_s, task
+        # shielded: other clients may wait for the same read
+        return await asyncio.shield(known[1])
+
+
 class ReadingRoutes:
-    """Answers from what was published; only parameters are asked for."""
+    """Answers from published messages; only parameters and actions are read from the microscope."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services
@@ -66,7 +105,6 @@ class ReadingRoutes:
         self._parameters = ParameterCache(services)
 
     def router(self) -> APIRouter:
-        """Return the routes."""
         router = APIRouter()
         for path, answers, model in (
             ("/state", self.state, StateModel),
@@ -86,7 +124,7 @@ class ReadingRoutes:
         return router
 
     async def state(self, asked: Request) -> StateModel:
-        """Return what the experiment and the microscope do."""
+        """Return the state of the experiment and the microscope."""
         services, watch = self._services, self._watch
         person = services.person_of(asked)
         who = services.persons.name_of(person) if person else None
@@ -109,15 +147,15 @@ class ReadingRoutes:
             )
 
     async def parameters(self) -> list[ParameterModel]:
-        """Return the parameters that the microscope has, as they are in force."""
+        """Return the parameters of the microscope with the values in force."""
         return await self._parameters.all()
 
     async def parameter(self, name: Parameter) -> ParameterModel:
-        """Return a parameter as it is in force."""
+        """Return a parameter with its value in force."""
         return await self._parameters.one(name)
 
     async def actions(self) -> list[ActionModel]:
-        """Return the actions of the known ones that the microscope has."""
+        """Return the known actions that the microscope has."""
 
         def supported(commands: PersonCommands) -> list[str]:
             return [name for name in _ACTIONS if commands.supports(name).ok]
@@ -158,7 +196,7 @@ class ReadingRoutes:
         format: ValueFormat = ValueFormat.NPY,
         levelling: Levelling = Levelling.PLANE,
     ) -> Response:
-        """Return the values of a channel, by default the first; a picture is levelled, the others are not."""
+        """Return the values of a channel, by default the first; a picture is levelled, other formats are not."""
         channels = self._scan(which)
         wanted = next((one for one in channels if channel in ("", one.channel)), None)
         if wanted is None:
@@ -183,7 +221,7 @@ class ReadingRoutes:
             str | None, Header(pattern=r"^[0-9]{1,19}$", description="sent by EventSource")
         ] = None,
     ) -> Response:
-        """Stream what is published: from now on, or after an event."""
+        """Stream the published events: from now on, or after an event."""
         services = self._services
         if services.streams.is_full:
             raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_STREAMS} streams of events are open")

@@ -24,14 +24,14 @@ from afspm.transport.process.parent import StopRequested
 
 T = TypeVar("T")
 MOST_WAITING = 16
-"""Requests of one name that wait for their turn."""
+"""Largest number of waiting requests of one name."""
 READER = ".reader"
-"""Asks for values in nobody's name; no name of a person begins so."""
+"""Name for reads without a person's name; no person's name begins with a dot."""
 
 
 @dataclass
 class GatewayServices:
-    """The parts that the routes share, and the ways in which they ask."""
+    """The shared parts of the routes, and their ways to send requests."""
 
     watch: Watch
     bell: Bell
@@ -46,27 +46,27 @@ class GatewayServices:
     waiting: Counter[str] = field(default_factory=Counter)
 
     def person_of(self, asked: Request) -> str:
-        """Return the name that a request was sent with; empty: it only looks."""
+        """Return the name in a request; empty: it only looks."""
         person: str = getattr(asked.state, PERSON, "")
         return person
 
     def who(self, asked: Request) -> str:
-        """Return the name by which the scheduler knows who asks. Raises RefusedRequest for who has none."""
+        """Return the scheduler's name for a request's client. Raises RefusedRequest for a request without a name."""
         if not (person := self.person_of(asked)):
-            raise RefusedRequest(RefusalCode.NAME_NEEDED, "what is done is in the record with a name")
+            raise RefusedRequest(RefusalCode.NAME_NEEDED, "the record keeps a name with each action")
         return self.persons.name_of(person)
 
     async def do(self, asked: Request, action: Callable[[PersonCommands], T]) -> T:
-        """Have an action carried out in the name of who asks. Raises RefusedRequest."""
+        """Carry out an action under the client's name. Raises RefusedRequest."""
         self.who(asked)
         return await self._carry_out(self.person_of(asked), action)
 
     async def command(self, asked: Request, action: Callable[[PersonCommands], Response]) -> Response:
-        """Carry out a request to the scheduler. Raises RefusedRequest where it is no success."""
+        """Carry out a request to the scheduler. Raises RefusedRequest if it is unsuccessful."""
         return _success(await self.do(asked, action))
 
     async def read(self, action: Callable[[PersonCommands], T]) -> T:
-        """Have the microscope asked for what anybody may know."""
+        """Carry out an action that only reads, under the gateway's own name for readers."""
         return await self._carry_out(READER, action)
 
     async def _carry_out(self, person: str, action: Callable[[PersonCommands], T]) -> T:
@@ -74,9 +74,12 @@ class GatewayServices:
             raise RefusedRequest(RefusalCode.TOO_MANY, f"{MOST_WAITING} requests of {person} wait already")
         self.waiting[person] += 1
         try:
-            # a client that goes away in between does not call off what the scheduler is asked for
+            # shielded: a client that disconnects does not cancel its request to the scheduler
             return await asyncio.shield(asyncio.wrap_future(self.persons.submit(person, action)))
-        except (Exception, StopRequested) as error:  # the second: the experiment ended meanwhile
+        except (
+            Exception,
+            StopRequested,
+        ) as error:  # any error becomes a refusal; StopRequested: the experiment ended meanwhile
             raise of_error(error) from error
         finally:
             self.waiting[person] -= 1

@@ -9,7 +9,7 @@ from afspm.plugins.web.gateway.events import EventHistory
 from afspm.plugins.web.gateway.models import END, MISSED
 from afspm.plugins.web.watch import Bell, Watch
 
-ALIVE_S = 10.0  # then a comment is sent, so that what is in between keeps the connection
+ALIVE_S = 10.0  # interval of comments, so that proxies keep the connection
 AT_ONCE = 200
 RETRY_MS = 1000
 MOST_STREAMS = 64
@@ -18,9 +18,9 @@ MOST_STREAMS = 64
 async def server_sent(
     history: EventHistory, watch: Watch, bell: Bell, after_ns: int, kinds: Collection[str]
 ) -> AsyncIterator[str]:
-    """Yield what was published after a time, and then whatever is, until the experiment ends.
+    """Yield the events after a time, and all later ones, until the experiment ends.
 
-    A client that reads slowly holds up only this: what has left the history meanwhile is told as missed.
+    A slow client delays only its own stream: events that have left the history are reported as `missed`.
     """
     yield f"retry: {RETRY_MS}\n\n"
     while True:
@@ -29,6 +29,7 @@ async def server_sent(
         if batch.missed_until_ns is not None:
             missed = {"after": str(after_ns), "until": str(batch.missed_until_ns)}
             yield _event(str(max(after_ns, 0)), MISSED, json.dumps({"time": None, "data": missed}))
+        # one piece for all: each piece is a write to the socket
         if batch.events:
             yield "".join(_event(str(one.time_ns), one.kind, one.text) for one in batch.events)
         is_behind = batch.newest_ns > after_ns
@@ -45,7 +46,7 @@ def _event(id_: str, kind: str, text: str) -> str:
 
 
 class StreamCount:
-    """The streams that are open, each of which takes memory and time."""
+    """Counts open streams, because each takes memory and time."""
 
     def __init__(self) -> None:
         self._open = 0
@@ -55,7 +56,7 @@ class StreamCount:
         return self._open >= MOST_STREAMS
 
     async def counted(self, stream: AsyncIterator[str]) -> AsyncIterator[str]:
-        """Yield what a stream yields, which counts as open meanwhile."""
+        """Yield from a stream, which counts as open meanwhile."""
         self._open += 1
         try:
             async for one in stream:

@@ -1,4 +1,4 @@
-"""From what was published to the documents of the gateway."""
+"""Converts published data to the documents of the gateway."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ CHUNK_BYTES = 3 << 16  # a multiple of three, so that pieces of base64 fit toget
 
 
 def region_model(region: Region) -> RegionModel:
-    """Return a region; what the microscope says is not judged."""
+    """Return a region without validation: it comes from the microscope."""
     return RegionModel.model_construct(
         center_m=list(region.center_m), size_m=list(region.size_m), angle_rad=region.angle_rad
     )
 
 
 def microscope(overview: Overview) -> MicroscopeModel:
-    """Return what the microscope does."""
+    """Return the activity of the microscope."""
     readings = overview.readings
     parameters, probe, feedback = readings.scan_parameters, readings.probe_position, readings.feedback
     region = None if parameters is None or not isinstance(parameters.region, Region) else parameters.region
@@ -56,7 +56,7 @@ def microscope(overview: Overview) -> MicroscopeModel:
 
 
 def scans(overview: Overview) -> list[list[ScanSummary]]:
-    """Return the scans in the order in which they came, each as its channels."""
+    """Return the scans in the order of their arrival, each as its channels."""
     return [list(channels) for _, channels in groupby(overview.scans, lambda scan: scan.number)]
 
 
@@ -66,7 +66,7 @@ def scan_id(channels: Sequence[ScanSummary]) -> str:
 
 
 def scan_model(channels: Sequence[ScanSummary]) -> ScanModel:
-    """Return a scan by its channels."""
+    """Return a scan from its channels."""
     first = channels[0]
     return ScanModel.model_construct(
         id=scan_id(channels),
@@ -97,7 +97,7 @@ def spectrum_model(spectrum: SpectrumSummary) -> SpectrumModel:
 
 
 def parameter_model(name: str, response: Response, asked: Any = None) -> ParameterModel:
-    """Return the value that a response reports; where it reports none, the one that was asked for."""
+    """Return the value in a response; without one, the requested value."""
     if not response.payload:
         return ParameterModel(name=name, value=asked, unit=names.BASE_PARAMETERS.get(name) or "")
     said = wire.decode_parameter(response.payload)
@@ -111,7 +111,7 @@ def parameter_model(name: str, response: Response, asked: Any = None) -> Paramet
 
 
 def as_npy(values: NDArray[np.float64]) -> Iterator[bytes]:
-    """Yield an array as a .npy file, piece by piece: it may be large, and many may want it."""
+    """Yield an array as a .npy file, piece by piece: it may be large, with many clients at once."""
     header = io.BytesIO()
     np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": values.shape})
     yield header.getvalue()
