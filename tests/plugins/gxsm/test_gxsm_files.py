@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from afspm.plugins.gxsm.emulator import files
-from afspm.plugins.gxsm.emulator.channels import CHANNELS
 from afspm.plugins.gxsm.emulator.file_writer import FAULT_KINDS, GxsmFileWriter
+from afspm.plugins.gxsm.emulator.files import CHANNELS
 from afspm.simulation.faults import Faults
 from afspm.storage.formats import netcdf, read
 

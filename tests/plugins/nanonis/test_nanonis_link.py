@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from vendor_bench import answering
 
 from afspm.plugins.nanonis.emulator import wire
-from afspm.plugins.nanonis.link import Link
 from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.session import Link
 from afspm.translator.driver_base import ControllerLost
 
 GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -12,7 +13,7 @@ from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.units import Duration
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plugins.gxsm import bridge
-from afspm.plugins.gxsm.activity import SHOWS_S, GxsmActivity, Saving
+from afspm.plugins.gxsm.activity import SHOWS_S, ConnectedGxsm, GxsmActivity, Saving
 from afspm.plugins.gxsm.hardware import (
     ABORT,
     APPROACH,
@@ -90,8 +91,8 @@ class Gxsm(Driver):
             raise ConfigError(f"{saving!r} is not a way of saving", where="saving", hint=f"{' or '.join(_SAVERS)}")
         self.controller_at = address
         Address.parse(address)
-        folders = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
-        self._saving = Saving(saving == "afspm", *folders)
+        scans, probes = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._saving = Saving(saving == "afspm", scans, probes)
         self._given_hardware = hardware
         self._feedback_actions: Sequence[str] = feedback_actions or ()
         secret = None if secret_file is None else Path(secret_file)
@@ -129,7 +130,8 @@ class Gxsm(Driver):
         self._find_parameters()
         self.lacking = self._missing_actions()
         scan_frame = ScanFrame(ask, user_unit_m(ask))
-        switches_autosave = self._saving.by_us and self._offered.actions.issuperset(AUTOSAVE.values())
+        can_switch = self._offered.actions.issuperset(AUTOSAVE.values())
+        saving = replace(self._saving, switches_autosave=self._saving.by_us and can_switch)
         self._kept.kept_in(self.memory)
         self._files = GxsmFiles(
             self.memory,
@@ -139,21 +141,18 @@ class Gxsm(Driver):
             late_s=self.patience_s(LATE_S),
         )
         self._activity = GxsmActivity(
-            ask,
-            hardware,
-            scan_frame,
+            ConnectedGxsm(ask, hardware, scan_frame),
             self._files,
             self.memory,
             self.clock,
             self.log,
             set_frame=lambda: frame(self.in_force(FRAME)),
             shows_s=self.patience_s(SHOWS_S),
-            saving=self._saving,
-            switches_autosave=switches_autosave,
+            saving=saving,
         )
         self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
         own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
-        feedback = FeedbackSwitch(ask, self._activity.doing, self._feedback_actions)
+        feedback = FeedbackSwitch(ask, self._activity.gxsm.doing, self._feedback_actions)
         self.groups = (own, self._tip, self._kept, feedback)
 
     def _find_parameters(self) -> None:
@@ -244,7 +243,7 @@ class Gxsm(Driver):
         done = self._activity.lines_done()
         found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)
         # of a scan that is stopped meanwhile GXSM says that it is at its last line
-        return found if self._activity.doing().measuring else ()
+        return found if self._activity.gxsm.doing().measuring else ()
 
     # --- actions ---
 

@@ -35,11 +35,13 @@ class Saving:
     Attributes:
         by_us: True if the translator has GXSM save its own scans at their end. GXSM saves all others by itself.
         scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
+        switches_autosave: True if GXSM's Auto Save is off while a scan of the translator's runs.
     """
 
     by_us: bool
     scan_dir: Path | None = None
     probe_dir: Path | None = None
+    switches_autosave: bool = False
 
 
 @dataclass
@@ -90,6 +92,25 @@ class ScanProgress:
     follows: bool = False
 
 
+@dataclass(frozen=True)
+class ConnectedGxsm:
+    """A connected GXSM.
+
+    Attributes:
+        ask: calls its functions.
+        hardware: the kind of its driver, which decides how its status bits are read.
+        frame: of the next scan.
+    """
+
+    ask: Asking
+    hardware: Hardware
+    frame: ScanFrame
+
+    def doing(self) -> Doing:
+        """Return the state that GXSM reports. Raises BadReply: it is no set of bits."""
+        return decoded(self.hardware, self.ask.numbers("rtquery", STATUS))
+
+
 class AutosaveSwitch:
     """GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped.
 
@@ -112,20 +133,16 @@ class GxsmActivity(Activity):
     """See the module.
 
     Args:
-        ask: GXSM.
-        frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
+        set_frame: gives the frame of the next scan as it was set, and (rows, columns).
         kept: JSON-able, and lasts: when the tip arrives that was sent away.
         shows_s: how long what was begun may take to be seen running, in experiment time.
-        switches_autosave: GXSM's Auto Save is off while a scan of the translator's runs.
     """
 
     program: ClassVar[str] = "GXSM"
 
     def __init__(
         self,
-        ask: Asking,
-        hardware: Hardware,
-        frame: ScanFrame,
+        gxsm: ConnectedGxsm,
         files: GxsmFiles,
         kept: Kept,
         clock: Clock,
@@ -134,17 +151,14 @@ class GxsmActivity(Activity):
         set_frame: Callable[[], tuple[Region, tuple[int, int]]],
         shows_s: float,
         saving: Saving,
-        switches_autosave: bool,
     ) -> None:
         super().__init__(files, clock, log)
-        self._ask = ask
-        self._hardware = hardware
-        self._frame = frame
+        self.gxsm = gxsm
         self._set_frame = set_frame
         self._files = files
         self._shows_s = shows_s
         self._saving = saving
-        self._autosave = AutosaveSwitch(ask, is_used=switches_autosave)
+        self._autosave = AutosaveSwitch(gxsm.ask, is_used=saving.switches_autosave)
         self._way = TipWay(kept, clock)
         self._looked_ns = 0  # at the last look
         self._shows_until_s = 0.0
@@ -158,11 +172,11 @@ class GxsmActivity(Activity):
         self._autosave.on = None  # a person may have switched it at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
-        self._scan.y_before = int(self._ask.number("y_current"))
+        self._scan.y_before = int(self.gxsm.ask.number("y_current"))
         rows, columns = self._set_frame()[1]
-        self._files.looked(looked_at(self._ask, len(self._channels()), (0, rows - 1), columns), None)
+        self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
-        self._ask.call("startscan")
+        self.gxsm.ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
         """Send the tip to where a spectrum is to be taken, and take it when it is there.
@@ -173,20 +187,20 @@ class GxsmActivity(Activity):
         Raises:
             Refused: the position is out of the tip's reach.
         """
-        self._frame.move_tip(position_m)
+        self.gxsm.frame.move_tip(position_m)
         self.sets_out(way_s)
         self._begin_curve(kind, position_m)
         self.curve_awaited = kind
 
     def stop_scan(self) -> None:
         """Break the scan off."""
-        self._ask.call("stopscan")
+        self.gxsm.ask.call("stopscan")
         self.stopped()
 
     def stop_curve(self) -> None:
         """Break the spectrum off."""
         if not self.curve_awaited:
-            self._ask.call("action", ABORT)
+            self.gxsm.ask.call("action", ABORT)
         self.stopped()
 
     def sets_out(self, way_s: float) -> None:
@@ -213,21 +227,17 @@ class GxsmActivity(Activity):
 
     def lines_done(self) -> int:
         """Return how many lines of the running scan are complete; until the first is, GXSM tells of the scan before."""
-        y = int(self._ask.number("y_current"))
+        y = int(self.gxsm.ask.number("y_current"))
         if self._scan.y_before is None:
             self._scan.y_before = y
         self._scan.y_moved = self._scan.y_moved or y != self._scan.y_before
         return y if self._scan.y_moved else 0
 
-    def doing(self) -> Doing:
-        """Return what GXSM says."""
-        return decoded(self._hardware, self._ask.numbers("rtquery", STATUS))
-
     def status(self) -> ScopeStatus:
         """Return what GXSM is doing now; what has ended is awaited from here on."""
-        doing, now_s = self.doing(), self._clock.now_s()
+        doing, now_s = self.gxsm.doing(), self._clock.now_s()
         # a RedPitaya does not tell measuring from a program of its own that may lead the tip
-        led = self._hardware is Hardware.RPSPMC and self._way.is_on
+        led = self.gxsm.hardware is Hardware.RPSPMC and self._way.is_on
         if self.curve_awaited and doing.measuring and not led:
             return self._forestalled()
         if self.curve_awaited:
@@ -272,13 +282,13 @@ class GxsmActivity(Activity):
         Repeated by GXSM, or by a person, scans follow in less time than passes between two looks. GXSM then has a new
         number in the names of the files, and begins with its lines again.
         """
-        before, name = self._scan.name, self._ask.text("chfname", 0)
+        before, name = self._scan.name, self.gxsm.ask.text("chfname", 0)
         self._scan.name = name
         # once GXSM has saved, it reports another number in place of one that was taken
         is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
         if self._files.is_own:  # Repeat was switched off for it
             return is_another
-        line, watch = int(self._ask.number("y_current")), self._scan.watch
+        line, watch = int(self.gxsm.ask.number("y_current")), self._scan.watch
         if watch is None:
             self._scan.watch = LineWatch(line)
             return is_another
@@ -300,8 +310,8 @@ class GxsmActivity(Activity):
     def _look_at_memory(self) -> None:
         """Keep the first and last row of a scan that was found running, unless its last line may have been scanned."""
         rows, columns = self._files.scanning[1]
-        found = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
-        line = int(self._ask.number("y_current"))
+        found = looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns)
+        line = int(self.gxsm.ask.number("y_current"))
         if abs(line - self._last_row()) > 1:
             self._files.looked(found, line)
 
@@ -336,12 +346,12 @@ class GxsmActivity(Activity):
     def _take_curve(self, now_s: float) -> None:
         action, self.curve_awaited = execute(self.curve_awaited), ""
         self._shows_until_s = now_s + self._shows_s
-        self._ask.call("action", action)
+        self.gxsm.ask.call("action", action)
 
     def begin(self, what: str) -> None:
         """Note a measurement that was begun at the panel, since the last look."""
         if what != SCAN:
-            self._begin_curve(what, self._frame.tip())
+            self._begin_curve(what, self.gxsm.frame.tip())
             return
         self._begin_scan(self._looked_ns, own=False)
         self._autosave.switch(on=True)
@@ -371,7 +381,7 @@ class GxsmActivity(Activity):
         is_whole = self._is_whole()
         if is_whole and not self._files.is_saved_by_gxsm:
             try:
-                self._ask.call("autosave")
+                self.gxsm.ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
         # only now: before, GXSM may still tell of the folder of the scan before
@@ -387,7 +397,7 @@ class GxsmActivity(Activity):
         if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
             before = self._seen_last[1]
         columns = shape[1] if before is None else before["columns"]
-        after = looked_at(self._ask, len(self._channels()), (0, shape[0] - 1), columns)
+        after = looked_at(self.gxsm.ask, len(self._channels()), (0, shape[0] - 1), columns)
         self._seen_last = shape, after
         if before is None:
             return None if self._scan.follows else True
@@ -398,13 +408,13 @@ class GxsmActivity(Activity):
         if self._saving.scan_dir:
             return self._saving.scan_dir
         channels = self._channels(1)
-        return Path(channels[0]).parent if channels else self._ask.working_folder()
+        return Path(channels[0]).parent if channels else self.gxsm.ask.working_folder()
 
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         """Where GXSM would save each channel."""
         found: list[str] = []
         for channel in range(most):
-            path = self._ask.text("chfname", channel)
+            path = self.gxsm.ask.text("chfname", channel)
             if path.startswith(_NO_CHANNEL):
                 break
             found.append(self._absolute(path))
@@ -412,5 +422,5 @@ class GxsmActivity(Activity):
 
     def _absolute(self, path: str) -> str:
         """Return a path that does not depend on where GXSM was started, if that can be told."""
-        folder = None if path.startswith("/") else self._ask.working_folder()
+        folder = None if path.startswith("/") else self.gxsm.ask.working_folder()
         return path if folder is None else str(folder / path)

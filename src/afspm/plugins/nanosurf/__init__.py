@@ -10,10 +10,10 @@ from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.plugins.nanosurf import commands, lines
+from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
-from afspm.plugins.nanosurf.session import Session
+from afspm.plugins.nanosurf.session import Session, new_lines
 from afspm.plugins.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
 from afspm.translator.driver import Driver
 from afspm.translator.driver_base import action, connected
@@ -60,7 +60,7 @@ class Nanosurf(Driver):
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
         self.controller_at = address
-        self._level = max(commands.level(release), 0 if image_buffer is None else lines.LEVEL)
+        self._level = max(commands.level(release), 0 if image_buffer is None else commands.BUFFER_LEVEL)
         self._release, self._session_name = release, session
         self._gallery_dir, self._image_buffer = gallery_dir, image_buffer
         self._reply_timeout_s = reply_timeout_s
@@ -122,7 +122,7 @@ class Nanosurf(Driver):
             return ()
         region, shape = frame(self.in_force(FRAME))
         upwards = self._studio().values([DIRECTION])[DIRECTION] != direction(names.DOWN)
-        return lines.new_lines(self._studio(), self._image_buffer, region, shape, start, upwards=upwards)
+        return new_lines(self._studio(), self._image_buffer, region, shape, start, upwards=upwards)
 
     # --- actions ---
 

@@ -78,6 +78,22 @@ return 0
 """
 """Sets values; if Studio refuses one, puts back those that were set."""
 
+BUFFER_LEVEL: Final = 2
+"""The level of a session from which on the low-level buffers are there."""
+BUFFER_LINES: Final = """
+local found, acquisition, buffer = {}, root.core.acquisition, %d
+acquisition.synchronize_lu_data_buffer(buffer)
+if acquisition.lu_data_buffer_state(buffer) ~= 3 then return found end
+for channel = 0, acquisition.lu_data_buffer_channel_count(buffer) - 1 do
+  found[#found + 1] = {
+    acquisition.lu_data_buffer_channel_name(buffer, channel), acquisition.lu_data_buffer_channel_unit(buffer, channel),
+    acquisition.lu_data_buffer_channel_range(buffer, channel), acquisition.lu_data_buffer_channel_data(buffer, channel),
+  }
+end
+return found
+"""
+"""Returns name, unit, range and values of each channel of a low-level buffer; nothing if it is not synchronized."""
+
 STOP_ALL: Final = f"""
 local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
 pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)

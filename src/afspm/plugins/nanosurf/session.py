@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Final
 
+import numpy as np
+
 from afspm.basics.errors import ConfigError, Refused
-from afspm.model import ControlResponse
+from afspm.model import ControlResponse, Region, ScanLines
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.commands import WORKFLOW
 from afspm.plugins.nanosurf.link import Link, StudioError
@@ -19,6 +21,7 @@ from afspm.translator.parameters import Value
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
 """Paths whose value is a number that stands for a choice."""
+_LARGEST_BUFFERED: Final = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -171,3 +174,29 @@ class Session:
 
 def _field(path: str) -> str:
     return "value_raw" if path in ENUMS else "value"
+
+
+def new_lines(
+    session: Session, buffer: int, region: Region, shape: tuple[int, int], start: int, *, upwards: bool
+) -> list[ScanLines]:
+    """Return the complete lines beyond the first `start` that all channels have, in the order of the scan."""
+    # (!) which buffer holds the image, and that its values are the lines as they were scanned, is not known
+    found = session.run(commands.BUFFER_LINES % buffer)[0]
+    channels = [_buffered_channel(one, shape[1]) for one in found.values()]
+    done = min((len(values) for _, _, values in channels), default=0)
+    if done <= start:
+        return []
+    first = start if upwards else shape[0] - done
+    lines = []
+    for name, unit, values in channels:
+        rows = values[start:done] if upwards else values[start:done][::-1]
+        lines.append(ScanLines(region, shape, name, unit, first, np.ascontiguousarray(rows)))
+    return lines
+
+
+def _buffered_channel(told: dict[int, Any], columns: int) -> tuple[str, str, np.ndarray]:
+    """Name, unit and complete lines of a channel."""
+    name, unit, span, raw = (told[number] for number in (1, 2, 3, 4))
+    values = np.array(list(raw.values()), dtype=np.float64) / _LARGEST_BUFFERED * float(span)
+    rows = len(values) // columns
+    return str(name), str(unit), values[: rows * columns].reshape(rows, columns)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
-from afspm.plugins.asylum.emulator import ibw
 from afspm.plugins.asylum.emulator.values import IgorValues
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 
 AMPLITUDE_M_PER_V = 1e-7
+_SINCE_1904_S: Final = 2_082_844_800
+_LABEL: Final = 32
+_FLOAT32: Final = 2
 
 Entries = Mapping[str, float | str]
 Made = Callable[[str], bytes]
@@ -30,7 +35,7 @@ def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> by
     rows, columns = scan.shape
     width, height = scan.region.size_m
     steps = [(width / (columns - 1), "m"), (height / (rows - 1), "m")]
-    return ibw.wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
+    return igor_wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
 
 
 def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: float) -> bytes:
@@ -44,7 +49,7 @@ def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: floa
     columns = np.column_stack([*there_and_back, there_and_back[0]])
     step_s = (spectrum.end_s - spectrum.start_s) / len(columns)
     noted = _of_curve(spectrum, float(np.ptp(extension)), columns.shape[0], values)
-    return ibw.wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
+    return igor_wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
 
 
 def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values: IgorValues) -> Entries:
@@ -69,7 +74,7 @@ def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values
 
 
 def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
-    local, seconds = ibw.moment(now_s)
+    local, seconds = igor_moment(now_s)
     texts = {
         "StartHeadTemp": "32.125 °C",
         "Date": f"{local:%Y-%m-%d}",
@@ -81,4 +86,57 @@ def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})
         "BaseName": values.text("BaseName"),
     }
     numbers = ((name, value) for name, value in values.noted() if name not in more)
-    return ibw.note([*numbers, *more.items(), *texts.items()])
+    return igor_note([*numbers, *more.items(), *texts.items()])
+
+
+def igor_moment(time_s: float) -> tuple[datetime, float]:
+    """Return the local time of the controller's computer, and Igor's: seconds of local time since 1904."""
+    local = datetime.fromtimestamp(time_s, UTC).astimezone()
+    offset = local.utcoffset()
+    return local, time_s + _SINCE_1904_S + (offset.total_seconds() if offset else 0.0)
+
+
+def igor_note(entries: Iterable[tuple[str, float | str]]) -> bytes:
+    """The note: numbers with five digits, lines that end with CR, and no Unicode."""
+    lines = (f"{key}: {value if isinstance(value, str) else _printed(value)}" for key, value in entries)
+    return "".join(f"{line}\r" for line in lines).encode("latin-1", "replace")
+
+
+def igor_wave(
+    name: str,
+    values: np.ndarray,
+    unit: str,
+    steps: Sequence[tuple[float, str]],
+    labels: Sequence[str],
+    note: bytes,
+    time_s: float,
+) -> bytes:
+    """The bytes of a file.
+
+    Args:
+        values: all but the last dimension are axes, the last one is of channels.
+        steps: of each axis, and its unit.
+        labels: of each channel.
+        time_s: when it was saved, experiment time.
+    """
+    body = np.asarray(values, dtype="<f4").tobytes(order="F")
+    text = b"".join(label.encode("latin-1", "replace")[: _LABEL - 1].ljust(_LABEL, b"\0") for label in ("", *labels))
+    channels = values.ndim - 1
+    label_sizes = [len(text) if axis == channels else 0 for axis in range(4)]
+    binary = struct.pack("<3i 4x 16x 4i 12x", 320 + len(body), 0, len(note), *label_sizes)
+    seconds = round(igor_moment(time_s)[1]) & 0xFFFFFFFF
+    units = [unit, *(axis_unit for _, axis_unit in steps)]
+    wave_header = struct.pack(
+        "<4x 2I i h 8x h 32s 8x 4i 4d 32x",
+        seconds, seconds, values.size, _FLOAT32, 1, name.encode("latin-1", "replace")[: _LABEL - 1],
+        *[*values.shape, 0, 0, 0][:4], *[*(step for step, _ in steps), 1.0, 1.0, 1.0, 1.0][:4],
+    )  # fmt: skip
+    wave_header += b"".join(one.encode().ljust(4, b"\0") for one in [*units, "", "", "", ""][:5])
+    header = bytearray(struct.pack("<hH", 5, 0) + binary + wave_header.ljust(320, b"\0"))
+    struct.pack_into("<H", header, 2, -int(np.frombuffer(header, "<i2").sum(dtype=np.int64)) & 0xFFFF)
+    return bytes(header) + body + note + text
+
+
+def _printed(value: float) -> str:
+    """Format as Igor does: 5e-06, 3.7407e+05, and whole numbers up to five digits in full."""
+    return f"{value:.5g}"

@@ -15,9 +15,9 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
-from afspm.plugins.gxsm.emulator.channels import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
+from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import Instrument

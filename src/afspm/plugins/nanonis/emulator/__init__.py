@@ -14,7 +14,6 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Length
 from afspm.plugins.nanonis.emulator import logger, wire
 from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, Results
-from afspm.plugins.nanonis.emulator.faults import FAULT_KINDS, senseless_value
 from afspm.plugins.nanonis.emulator.software import NanonisSoftware
 from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
 from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
@@ -81,7 +80,34 @@ class NanonisEmulator(Emulator):
 
     vendor = "Nanonis"
     usual: ClassVar[Mapping[str, object]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
-    fault_kinds: ClassVar[Mapping[str, str]] = FAULT_KINDS
+    fault_kinds: ClassVar[Mapping[str, str]] = {
+        "no-reply": "a request is not answered",
+        "slow": "a reply comes later, by the duration",
+        "dialog": "a dialog waits on the screen: nothing is answered for the duration",
+        "cut": "the connection is cut instead of a reply",
+        "truncated": "half a reply, then the connection is cut",
+        "error": "a reply with an error",
+        "refused": "an error in reply to what sets or starts something",
+        "wrong-name": "the reply to another function",
+        "wrong-release": "for the duration, replies have the fields of another release",
+        "garbage": "bytes that are not a reply",
+        "huge": "a reply that announces two gigabytes",
+        "not-utf8": "texts that are not UTF-8",
+        "nan": "NaN for every number",
+        "nonsense": "for the duration, well-formed replies with absurd values",
+        "crash": "the software crashes",
+        "file-late": "a file appears only after the duration",
+        "half-file": "a file is half written, and whole only after the duration",
+        "file-missing": "a file is announced but never written",
+        "stale-name": "the file of the previous scan is announced for a scan",
+        "autosave-off": "scans and spectra are not saved for the duration, whatever is set",
+        "late-start": "a scan begins, and is reported as running, only after the duration",
+        "no-start": "a scan does not begin, without an error",
+        "ends-at-once": "for the duration, waiting for the end of a scan returns at once if none runs",
+        "safe-tip": "the safe tip withdraws the tip and ends the scan",
+        "safe-tip-unnoticed": "the safe tip withdraws the tip, and the scan goes on in the air",
+        "panel-stop": "the scan is stopped at the panel",
+    }
 
     def __init__(
         self,
@@ -270,7 +296,7 @@ class NanonisEmulator(Emulator):
         fields = wire.functions()[asked.name].results
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
         if self.faults.lasts("nonsense", now_s):
-            padded = tuple(senseless_value(field.code, self._chance) for field in fields)
+            padded = tuple(wire.senseless_value(field.code, self._chance) for field in fields)
         self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
 
     def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:

@@ -6,6 +6,7 @@ Written apart from the translator's, which it is to be tested against.
 from __future__ import annotations
 
 import math
+import random
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -29,6 +30,20 @@ ZEROS: Final[Mapping[str, object]] = {
     **dict.fromkeys(("A", "2S", *(f"[{code}]" for code in _SIZES), *(f"*{code}" for code in (*_SIZES, "S"))), ()),
     "2f": np.zeros((0, 0)),
 }
+_SENSELESS_NUMBERS: Final = (float("nan"), float("inf"), -float("inf"), 0.0, -1.0, 1e-38, 3e38, -3e38, 1e9)
+_SENSELESS_INTEGERS: Final = (0, 1, 2, 3, 7, 127, 500, 65535, 2**31 - 1, -1, -(2**31))
+_SENSELESS_TEXTS: Final = (
+    "",
+    "\0",
+    "../..",
+    "x" * 3000,
+    "Z (m)",
+    "Current (A)",
+    "(",
+    "ä€",
+    "C:\\nowhere\\at all.sxm",
+    "/nowhere/a.dat",
+)
 
 
 class MalformedRequest(Exception):
@@ -223,3 +238,22 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
         size = _SIZES[code.replace("n", "i")]
         return (int(value) % (1 << 8 * size)).to_bytes(size, "big")
     return struct.pack(f">{code}", value)
+
+
+def senseless_value(code: str, chance: random.Random) -> object:
+    """A value of the field, by its code."""
+    if code in "fd":
+        return chance.choice(_SENSELESS_NUMBERS)
+    if code in "BHIin":
+        return chance.choice(_SENSELESS_INTEGERS)
+    if code == "S":
+        return chance.choice(_SENSELESS_TEXTS)
+    if code == "2f":
+        shape = chance.randrange(4), chance.randrange(4)
+        return np.reshape([chance.choice(_SENSELESS_NUMBERS) for _ in range(shape[0] * shape[1])], shape)
+    if code == "2S":
+        return [
+            [chance.choice(_SENSELESS_TEXTS) for _ in range(chance.randrange(3))] for _ in range(chance.randrange(3))
+        ]
+    item = "S" if code == "A" else code[1]
+    return [senseless_value(item, chance) for _ in range(chance.randrange(4))]

@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Literal, NoReturn
+from typing import Any, ClassVar, Final, Literal, NoReturn, cast
+
+import zmq
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration
 from afspm.plugins.park.emulator.engine import Script
 from afspm.plugins.park.emulator.smartscan import GEOMETRY, SmartScanProgram
-from afspm.plugins.park.emulator.wire import SmartRemoteWire
+from afspm.simulation.emulation.emulator import LOOPBACK
 from afspm.simulation.emulation.program import MakerProgram
 from afspm.simulation.emulation.scripted import (
     Client,
@@ -26,6 +28,7 @@ from afspm.simulation.emulation.scripted import (
 _DONE: Final = "Done"
 _FAILED: Final = -32000
 _NO_JSON: Final = -32700
+LONGEST_REQUEST: Final = 1 << 20
 
 
 class ParkEmulator(ScriptedEmulator):
@@ -183,3 +186,49 @@ def _parsed(request: bytes) -> Plain | None:
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON")
+
+
+class SmartRemoteWire:
+    """The socket. See `ScriptWire`."""
+
+    def __init__(self, port: int, on_request: OnRequest, wakes: object) -> None:
+        self._on_request = on_request
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDTIMEO, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST)
+        try:
+            self._socket.bind(f"tcp://{LOOPBACK}:{port or '*'}")
+        except zmq.ZMQError as error:
+            self.close()
+            raise OSError(error.errno, str(error)) from error
+        self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+        self._poller = zmq.Poller()
+        self._poller.register(wakes, zmq.POLLIN)
+        self._poller.register(self._socket, zmq.POLLIN)
+
+    @property
+    def address(self) -> str:
+        return f"tcp://{LOOPBACK}:{self.port}"
+
+    def poll(self, timeout_s: float) -> None:
+        if self._socket not in dict(self._poller.poll(max(0, round(timeout_s * 1000)))):
+            return
+        while True:
+            try:
+                client, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            if len(frames) == 2 and not frames[0]:
+                self._on_request(client, frames[1])
+
+    def send(self, client: Client, reply: bytes) -> None:
+        self._socket.send_multipart([cast(bytes, client), b"", reply])
+
+    def send_half(self, client: Client, reply: bytes) -> None:
+        """Half a reply: a message of ZeroMQ's is never cut, but what is in it may be."""
+        self.send(client, reply[: len(reply) // 2])
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)
