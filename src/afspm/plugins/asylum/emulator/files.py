@@ -1,4 +1,4 @@
-"""The files of scans and force curves: made as Asylum makes them, and written late and in parts."""
+"""Files of scans and force curves: Igor binary waves of version 5, little endian, with a note."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Made = Callable[[str], bytes]
 
 
 def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> bytes:
-    """The file of a scan; lines that were not scanned are NaN."""
+    """Encode the file of a scan; lines not scanned are NaN."""
     channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
     layers, labels = [], []
     for channel, (unit, found) in channels.items():
@@ -39,7 +39,7 @@ def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> by
 
 
 def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: float) -> bytes:
-    """The file of a force curve: towards the sample and back, over time."""
+    """Encode the file of a force curve: approach, then retract, over time."""
     table = dict(zip(spectrum.names, spectrum.values.T, strict=True))
     extension = table["Z"].max() - table["Z"]
     there_and_back: Sequence[np.ndarray] = [
@@ -53,7 +53,6 @@ def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: floa
 
 
 def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values: IgorValues) -> Entries:
-    """Return the entries of a force curve's note that describe its acquisition."""
     duration_s = spectrum.end_s - spectrum.start_s
     velocity_m_s = distance_m / (duration_s / 2)
     place = zip(("XLVDT", "YLVDT"), spectrum.position_m, strict=True)
@@ -90,14 +89,14 @@ def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})
 
 
 def igor_moment(time_s: float) -> tuple[datetime, float]:
-    """Return the local time of the controller's computer, and Igor's: seconds of local time since 1904."""
+    """Return local time of the controller's computer, and Igor's time: local seconds since 1904."""
     local = datetime.fromtimestamp(time_s, UTC).astimezone()
     offset = local.utcoffset()
     return local, time_s + _SINCE_1904_S + (offset.total_seconds() if offset else 0.0)
 
 
 def igor_note(entries: Iterable[tuple[str, float | str]]) -> bytes:
-    """The note: numbers with five digits, lines that end with CR, and no Unicode."""
+    """Encode a note: numbers with five digits, lines end with CR, Latin-1 instead of Unicode."""
     lines = (f"{key}: {value if isinstance(value, str) else _printed(value)}" for key, value in entries)
     return "".join(f"{line}\r" for line in lines).encode("latin-1", "replace")
 
@@ -111,13 +110,13 @@ def igor_wave(
     note: bytes,
     time_s: float,
 ) -> bytes:
-    """The bytes of a file.
+    """Encode a wave as an .ibw file.
 
     Args:
-        values: all but the last dimension are axes, the last one is of channels.
-        steps: of each axis, and its unit.
-        labels: of each channel.
-        time_s: when it was saved, experiment time.
+        values: the last dimension is channels, the others are axes.
+        steps: increment and unit of each axis.
+        labels: names of the channels.
+        time_s: time of saving, experiment time.
     """
     body = np.asarray(values, dtype="<f4").tobytes(order="F")
     text = b"".join(label.encode("latin-1", "replace")[: _LABEL - 1].ljust(_LABEL, b"\0") for label in ("", *labels))
@@ -138,5 +137,5 @@ def igor_wave(
 
 
 def _printed(value: float) -> str:
-    """Format as Igor does: 5e-06, 3.7407e+05, and whole numbers up to five digits in full."""
+    # Igor's format: 5e-06, 3.7407e+05, and whole numbers of up to five digits in full.
     return f"{value:.5g}"

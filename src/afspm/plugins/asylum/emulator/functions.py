@@ -1,4 +1,4 @@
-"""The functions that can be called: Asylum's own, and those of the procedures that a user includes."""
+"""Igor functions that a client can call: Asylum's own, and those of included procedures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NOTHING: Final = math.nan
 
 
 class DialogOpen(Exception):
-    """A window waits for somebody to press OK; the function gives `result` then."""
+    """A modal dialog blocks Igor; the function returns `result` after OK."""
 
     def __init__(self, text: str, result: float) -> None:
         super().__init__(text)
@@ -31,7 +31,7 @@ class AsylumFunctions:
         self._settings = settings
 
     def table(self) -> dict[str, IgorFunction]:
-        """Return the functions by name in lower case, since Igor ignores case."""
+        """Return the functions by lower-case name, since Igor ignores case."""
         values = self._controller.values
         table = {
             "GV": IgorFunction(self._get, "s"),
@@ -101,7 +101,7 @@ class AsylumFunctions:
     # --- what is done ---
 
     def _do_scan(self, button: str) -> float:
-        """The command is cut out of the name of a button."""
+        # Asylum's own code cuts the command out of the name of the pressed button, at the last "_" and at "Button".
         name = button[: button.rfind("_")] if "_" in button else button
         name = name[: name.rfind("Button")] if "Button" in name else name
         now_s = self._now_s()
