@@ -1,4 +1,4 @@
-"""GXSM, versions 3 and 4: over Gxsm4's shared memory, or a script in the console. See the README beside this."""
+"""Driver of GXSM 3 and 4, over Gxsm4's shared memory or a script in its console. See the README in this folder."""
 
 from __future__ import annotations
 
@@ -52,15 +52,15 @@ class Gxsm(Driver):
 
     Args:
         address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
-            "shm:BLOCK@PROCESS" if that or its process is not called as usual.
-        saving: "afspm": while a scan of this translator runs, GXSM's Auto Save is off, and the translator has GXSM save
-            once at its end; else Auto Save is on. "gxsm": Auto Save is left on, and its files are waited for.
-        hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
-        scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
-        feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.
+            "shm:BLOCK@PROCESS" if the block or the process has another name.
+        saving: "afspm": Auto Save is off during this translator's scans, which are saved once at their end, and on at
+            other times. "gxsm": Auto Save is left on.
+        hardware: "SRanger", "RPSPMC" or "simulator", if detection is wrong.
+        scan_dir, probe_dir: folders of scans and spectra, if not the folder that GXSM reports for channels.
+        feedback_actions: names of the actions that switch the feedback on and off, if the hardware has them.
         secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
-        reply_timeout_s: how long an answer may take, in real time.
-        common: as for every microscope.
+        reply_timeout_s: longest wait for a reply, real time.
+        common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -107,7 +107,7 @@ class Gxsm(Driver):
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:
-        """Return what GXSM's own simulator does otherwise than GXSM itself says."""
+        """Return the conformance checks that GXSM's own simulator fails, with the reason."""
         if not controller.endswith(f"({Hardware.SIMULATOR.value})"):
             return {}
         return {
@@ -115,7 +115,7 @@ class Gxsm(Driver):
         }
 
     def connect(self) -> None:
-        """The link; what this GXSM has, in which unit it has it, and how it saves."""
+        """Open the link, and find out the hardware, the unit of lengths and the way of saving."""
         self.close()
         address = Address.parse(self.controller_at)
         ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
@@ -166,7 +166,8 @@ class Gxsm(Driver):
         self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
 
     def _missing_actions(self) -> dict[str, str]:
-        """GXSM says 0 to actions that it does not have."""
+        # GXSM returns 0 also for unknown actions and does nothing, so the actions are checked against its list at the
+        # start.
         needed = {names.ENGAGE: [APPROACH], names.STOP_SPEC: [ABORT]}
         if names.TIP_BIAS_VOLTAGE not in self.table:
             needed[names.PULSE] = [names.TIP_BIAS_VOLTAGE]
@@ -207,15 +208,14 @@ class Gxsm(Driver):
             send(self._ask, self._there(vendor), float(value))
 
     def _there(self, vendor: str) -> str:
-        """Return the name that this GXSM has, of those that a parameter may have: of others it does not say that it has
-        them not."""
+        # `get` returns -inf or uninitialised memory for an unknown name, `set` 0: neither reports that the name is
+        # unknown.
         there = available({"": vendor}, self._offered.refnames)
         if not there:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"this GXSM has no parameter {vendor!r}")
         return there[""]
 
     def _way_s(self, way_m: float) -> float:
-        """Return the time that the tip takes for so long a way; none if GXSM does not tell its speed."""
         if names.MOVE_SPEED not in self.table:
             return 0.0
         speed_m_s = float(self.read_rows([names.MOVE_SPEED])[names.MOVE_SPEED])
@@ -236,7 +236,7 @@ class Gxsm(Driver):
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """Return what is new in GXSM's memory; of channels that a scan was saved of."""
+        """Return new lines from GXSM's memory, for channels that were in the files of an earlier scan."""
         endings = self._activity.endings()
         if not endings:
             return ()
@@ -249,7 +249,7 @@ class Gxsm(Driver):
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Scan the frame once, with the channels and the direction of GXSM's panel."""
+        """Scan the frame once, with the channels and direction set on GXSM's panel."""
         if REPEAT_OFF in self._offered.actions:  # it would never end
             self._ask.call("action", REPEAT_OFF)
         self._activity.start_scan()
@@ -260,8 +260,7 @@ class Gxsm(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a spectrum of the kind `x-spec-kind` where the probe was sent to last: it is sent there again, since a
-        scan has moved it."""
+        """Take a spectrum of the kind `x-spec-kind` at the probe position. A scan moves the tip: it goes back first."""
         kind = str(self._kept[names.SPEC_KIND])
         if execute(kind) not in self._offered.actions:
             reason = f"this GXSM has no {execute(kind)} with its hardware ({self._offered.kind}): see x-spec-kind"
@@ -279,9 +278,9 @@ class Gxsm(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """The auto approach."""
+        """Start the auto approach."""
         self._ask.call("action", APPROACH)
 
     def command(self, text: str) -> None:
-        """One of GXSM's actions, e.g. "DSP_CMD_STOPALL"."""
+        """Execute a GXSM action, e.g. "DSP_CMD_STOPALL"."""
         self._ask.call("action", text)

@@ -1,7 +1,7 @@
-"""Reads what Gxsm4 pickles with an allow-list: numbers, texts, bytes, containers and numpy arrays of numbers.
+"""Restricted unpickler for Gxsm4's results: numbers, texts, bytes, containers and numpy arrays of numbers.
 
-Nothing is imported, and nothing called but the stand-ins for numpy's types here, whatever the bytes say. Python's own
-unpickler in Python is used, since that in C sets aside as much memory as a damaged pickle asks for.
+Nothing is imported, and only the stand-ins for numpy's types below are called. The unpickler is Python's own one
+written in Python: the one in C allocates as much memory as a damaged pickle announces.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MOST_PARTS: Final = 1_000_000
 
 
 class _DType:
-    """Stands for numpy's dtype of plain numbers."""
+    """Stand-in for numpy's dtype of plain numbers."""
 
     def __init__(self, code: object, *_: object) -> None:
         if code not in _NUMBERS:
@@ -31,7 +31,7 @@ class _DType:
 
 
 class _Array:
-    """Stands for numpy's array, filled from (version, shape, type, True if by columns, bytes)."""
+    """Stand-in for numpy's array, filled from (version, shape, type, True for column-major, bytes)."""
 
     values: np.ndarray | None = None
 
@@ -74,7 +74,7 @@ def loads(content: bytes) -> object:
     """Return the value of a pickle.
 
     Raises:
-        BadReply: it is none, or of something that GXSM does not reply.
+        BadReply: malformed, or a type that GXSM does not send.
     """
     try:
         return _Values().of(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
@@ -87,7 +87,7 @@ def loads(content: bytes) -> object:
 
 
 class _Values:
-    """Puts arrays in place of their stand-ins; it ends also where a list holds itself, or many times the same."""
+    """Replaces stand-ins by arrays. Counts parts, so that it ends for a list that contains itself."""
 
     def __init__(self) -> None:
         self._left = _MOST_PARTS

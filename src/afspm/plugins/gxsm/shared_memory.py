@@ -1,7 +1,7 @@
-"""The link to Gxsm4 by way of the shared memory that it serves to other programs of the same user (Linux).
+"""Link to Gxsm4 through the shared memory that it serves to other programs of the same user (Linux).
 
-A call is written into the block and announced by a signal; the answer appears in the block. Whoever calls holds the
-lock that GXSM's own tools take, too: two callers at once would get each other's answers.
+A call is written into the block and announced by a signal; the answer appears in the block. A caller holds the lock
+that GXSM's own tools also take: two callers at once would receive each other's answers.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class SharedMemoryLink:
     """The block of a running Gxsm4. For one thread.
 
     Args:
-        block: the name of the shared memory.
-        process: the name of GXSM's process, or its number.
-        timeout_s: how long an answer may take, in real time.
-        monotonic_s: real time.
+        block: name of the shared memory.
+        process: name or number of GXSM's process.
+        timeout_s: longest wait for an answer, real time.
+        monotonic_s: returns real time.
 
     Raises:
-        ControllerLost: no block, or no process that serves it. ConfigError: this computer runs no Linux.
+        ControllerLost: no block, or no process serves it. ConfigError: the system is not Linux.
     """
 
     def __init__(self, block: str, process: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
@@ -89,7 +89,6 @@ class SharedMemoryLink:
             raise ControllerLost(f"no shared memory: {error}", where=self._where, hint=hint) from error
 
     def call(self, method: str, *arguments: str | int | float) -> object:
-        """Call a function of GXSM (see `Link`)."""
         if self._closed.is_set():
             raise ControllerLost("the link was closed", where=self._where)
         try:
@@ -103,7 +102,6 @@ class SharedMemoryLink:
             raise
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which GXSM was started."""
         folder = self._process.working_folder()
         with self._trace.asking("getcwd", bridge_client.message("getcwd")) as traced:
             traced.add(bridge_client.value_line(str(folder)))
@@ -111,7 +109,6 @@ class SharedMemoryLink:
         return folder
 
     def close(self) -> None:
-        """Let go of the block."""
         if not self._closed.is_set():
             self._closed.set()
             self._memory.close()
@@ -151,7 +148,6 @@ class SharedMemoryLink:
         return int(struct.unpack_from("<q", self._memory, _STATUS)[0])
 
     def _wait(self, until_s: float, complaint: str) -> None:
-        """Until the status is no request any more. Raises ControllerLost."""
         looks = 0
         while self._status() == _REQUEST:
             looks += 1
@@ -164,19 +160,19 @@ class SharedMemoryLink:
             self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
 
     def _see_alive(self) -> None:
-        """Raise ControllerLost if GXSM has ended. The next one would find, and never answer, what it was asked."""
+        # A request left in the block of an ended GXSM would stay there for the next instance, which never answers it.
         if not self._process.lives():
             self._withdraw_request()
             raise ControllerLost("Gxsm4 has ended", where=self._where)
 
     def _withdraw_request(self) -> None:
-        """Take back what nobody is there to answer. Only under the lock."""
+        # Call only under the lock.
         if self._status() == _REQUEST:
             struct.pack_into("<q", self._memory, _STATUS, 0)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """While nobody else calls GXSM. Raises ControllerLost: somebody does not stop to."""
+        # The lock of GXSM's own tools: two callers at once receive each other's answers.
         import fcntl
 
         path = Path(tempfile.gettempdir()) / _LOCK

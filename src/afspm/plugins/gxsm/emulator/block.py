@@ -1,4 +1,4 @@
-"""The other end of Gxsm4's shared memory: what programs of its users write there reaches the emulator."""
+"""Gxsm4's shared memory, from GXSM's side: passes the calls of other programs to the emulator."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ _NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
 
 
 class SharedMemoryBlock:
-    """The shared memory and the process that has it.
+    """The shared memory and its process.
 
     Args:
-        name: of the memory.
-        process: what the process calls itself.
-        folder: in which it was started.
-        post: takes the calls; `take` must be called when `fileno` is readable.
+        name: name of the memory.
+        process: name that the process gives itself.
+        folder: folder in which the process starts.
+        post: receives the calls. `take` must be called when `fileno` is readable.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class SharedMemoryBlock:
 
     @property
     def pid(self) -> int:
-        """Process id to send the signal to."""
+        """Id of the process that receives the signals."""
         return self._process.pid
 
     def fileno(self) -> int:
@@ -66,7 +66,7 @@ class SharedMemoryBlock:
         return self._process.stdout.fileno()
 
     def take(self) -> None:
-        """Post one call that has come. Raises Crashed: somebody has killed the process."""
+        """Post one received call. Raises Crashed: the process was killed."""
         frame = self._frame()
         if not frame:
             raise Crashed("its process is gone")
@@ -79,10 +79,10 @@ class SharedMemoryBlock:
         self._post(ScriptCall(method, arguments if isinstance(arguments, tuple) else (arguments,), self._answer))
 
     def end(self, *, remains: bool = False) -> None:
-        """GXSM is closed.
+        """End the process.
 
         Args:
-            remains: the memory stays, as it does when the real one has ended.
+            remains: True leaves the memory in place, as the real program does.
         """
         self._process.kill()
         self._process.wait()
@@ -134,7 +134,7 @@ class SharedMemoryBlock:
 
 
 class _MaliciousPickle:
-    """Makes a folder called `evil` where it is unpickled."""
+    """A pickle that makes a folder `evil` when a careless reader loads it."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, ("evil",)

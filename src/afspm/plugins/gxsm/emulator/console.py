@@ -1,4 +1,4 @@
-"""GXSM's Python console: it runs a script of its user in a thread, whose calls of `gxsm` GXSM answers one by one."""
+"""GXSM's Python console: runs a user's script in a thread, whose calls of `gxsm` GXSM answers one at a time."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
 
 class ConsoleClosed(BaseException):
-    """GXSM is no more, nor is what runs in it."""
+    """GXSM was closed while a script ran."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScriptCall:
-    """A call of a function of GXSM.
+    """A call of a GXSM function.
 
     Attributes:
-        answered: told what it returned, or the exception that it raised.
+        answered: receives the result, or the exception to raise.
     """
 
     method: str
@@ -33,7 +33,7 @@ class ScriptCall:
 
 
 class GxsmModule:
-    """The module `gxsm`, as a script sees it."""
+    """The module `gxsm` as a script sees it."""
 
     def __init__(self, post: Callable[[ScriptCall], None]) -> None:
         self._post = post
@@ -56,7 +56,7 @@ class GxsmModule:
         return call
 
     def end(self) -> None:
-        """End every thread that waits for an answer, or asks again."""
+        """End every thread that waits for an answer or makes another call."""
         self._gone = True
         for answer in list(self._waiting):
             if not answer.done():
@@ -64,13 +64,13 @@ class GxsmModule:
 
 
 class ScriptConsole:
-    """A console in which a script runs.
+    """A console that runs a script.
 
     Args:
-        script: that listens at a port, and says so.
-        folder: in which GXSM was started.
-        post: takes its calls, from its own thread.
-        ended: called from that thread when the script has ended.
+        script: listens at a port, and prints the address.
+        folder: folder in which GXSM was started.
+        post: receives its calls, from the script's thread.
+        ended: called from the script's thread at its end.
     """
 
     def __init__(
@@ -84,20 +84,14 @@ class ScriptConsole:
         self._thread.start()
 
     def poll(self) -> str | None:
-        """Return the address of the script once it listens.
-
-        Raises:
-            whatever ended it before.
-        """
+        """Return the script's address once it listens. Raises the exception that ended the script before."""
         return self._said.result() if self._said.done() else None
 
     @property
     def runs(self) -> bool:
-        """True until the script has ended."""
         return self._runs
 
     def end(self) -> None:
-        """GXSM is closed."""
         self._module.end()
         self._thread.join()
 
