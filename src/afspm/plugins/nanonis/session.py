@@ -1,4 +1,4 @@
-"""Both connections to Nanonis: one for questions that are answered at once, one for calls that take their time."""
+"""Both connections to Nanonis: one for quick requests, one for blocking calls."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ _HINTS: Final = (
 
 
 class Link:
-    """A connection to Nanonis; the arguments are those of `TcpConnection`.
+    """A TCP connection to Nanonis; the arguments are those of `TcpConnection`.
 
     Attributes:
-        release: of the controller's software; it can be changed once it is known.
+        release: release of the controller's software, set once known.
     """
 
     def __init__(
@@ -51,11 +51,11 @@ class Link:
         """Call a function of Nanonis.
 
         Args:
-            longer_s: so much longer than usual may the answer take.
+            longer_s: additional wait for the answer, real time.
 
         Raises:
-            NanonisError: it could not do it. InvalidValue: what was asked can't be sent.
-            ControllerLost, BadReply: no answer, or none to be trusted; the connection is closed.
+            NanonisError: Nanonis reports an error. InvalidValue: the arguments can't be sent.
+            ControllerLost, BadReply: no answer, or an untrustworthy one; the connection is closed.
         """
 
         def read(receiver: Receiver) -> tuple[object, ...]:
@@ -66,18 +66,18 @@ class Link:
 
 
 class Session:
-    """Two connections to Nanonis, proved and with all modules open.
+    """Two connections to Nanonis, proved, with all available modules open.
 
     Args:
-        driver: that they are for.
-        addresses: of both; the same one only where a port serves several clients.
-        timeout_s: for an answer, in real time.
-        release: None: Nanonis is asked for it.
+        driver: the driver that uses them.
+        addresses: addresses of both; equal only if a port serves several clients.
+        timeout_s: longest wait for an answer, real time.
+        release: release of the software; None: ask Nanonis.
 
     Attributes:
-        controller: its name and version, for a person.
-        opened: the modules that can be used: Nanonis has those that were bought, and they answer once they are open.
-        listener: on the second connection.
+        controller: name and version, for people.
+        opened: available modules: Nanonis has those that were bought, and they answer only once open.
+        listener: user of the second connection.
 
     Raises:
         ControllerLost.
@@ -101,7 +101,6 @@ class Session:
             raise
 
     def close(self) -> None:
-        """End both connections."""
         if self._listener is not None:
             self._listener.close()
         self._link.close()
@@ -128,10 +127,10 @@ class Session:
 
 @dataclass(frozen=True)
 class ScanEnded:
-    """A scan came to its end, or was broken off.
+    """A scan was completed or stopped.
 
     Attributes:
-        path: where Nanonis saved it, as its own computer calls it; empty if it did not.
+        path: file path on Nanonis' computer; empty: not saved.
     """
 
     path: str
@@ -139,10 +138,10 @@ class ScanEnded:
 
 @dataclass(frozen=True)
 class CurveEnded:
-    """A spectrum came to its end.
+    """A spectrum was completed.
 
     Attributes:
-        names: of the channels, with units.
+        names: channel names with units.
         values: [channels, points].
     """
 
@@ -150,45 +149,45 @@ class CurveEnded:
     values: np.ndarray
 
 
-Heard = ScanEnded | CurveEnded | AfspmError
+ListenerEvent = ScanEnded | CurveEnded | AfspmError
 """An error: what was waited for can't be waited for."""
 
 
 class Listener:
-    """Waits in a thread of its own for one thing at a time, on the second connection.
+    """Thread for blocking calls on the second connection, one at a time.
 
     Args:
-        wake: called from that thread when there is something in `heard`.
+        wake: called from that thread when `events` has something new.
     """
 
     def __init__(self, link: Link, wake: Callable[[], None]) -> None:
         self._link = link
         self._wake = wake
-        self._jobs: SimpleQueue[Callable[[], Heard | None] | None] = SimpleQueue()
-        self._heard: SimpleQueue[Heard] = SimpleQueue()
+        self._jobs: SimpleQueue[Callable[[], ListenerEvent | None] | None] = SimpleQueue()
+        self._events: SimpleQueue[ListenerEvent] = SimpleQueue()
         self._for_scan = self._closed = False
         Thread(target=self._work, name="Nanonis' second connection", daemon=True).start()
 
     def scan(self) -> None:
-        """Wait for the end of a scan, if that is not being done already."""
+        """Wait for the end of a scan, unless already waiting for it."""
         if not self._for_scan:
             self._for_scan = True
             self._jobs.put(self._next_end_of_scan)
 
     def curve(self, module: str, base_name: str) -> None:
-        """Take a spectrum with a module and wait for its data."""
+        """Take a spectrum with a module, and wait for its data."""
         self._for_scan = False
         self._jobs.put(lambda: self._curve(module, base_name))
 
-    def heard(self) -> list[Heard]:
-        """Return what has come since the last time."""
+    def events(self) -> list[ListenerEvent]:
+        """Return the events since the last call."""
         found = []
-        while not self._heard.empty():
-            found.append(self._heard.get())
+        while not self._events.empty():
+            found.append(self._events.get())
         return found
 
     def close(self) -> None:
-        """End the thread, whatever it waits for."""
+        """End the thread at once."""
         self._closed = True
         self._link.close()
         self._jobs.put(None)
@@ -199,12 +198,12 @@ class Listener:
             if self._closed:
                 return
             if result is not None:
-                self._heard.put(result)
+                self._events.put(result)
                 self._wake()
             if isinstance(result, ControllerLost):
                 return
 
-    def _done(self, job: Callable[[], Heard | None]) -> Heard | None:
+    def _done(self, job: Callable[[], ListenerEvent | None]) -> ListenerEvent | None:
         try:
             return job()
         except AfspmError as error:
@@ -214,8 +213,8 @@ class Listener:
             self._for_scan = False
             return BadReply(f"Nanonis sent an unreadable message on a measurement: {error!r}")
 
-    def _next_end_of_scan(self) -> Heard | None:
-        """Ask again and again: so a connection that has died is noticed, and a spectrum gets its turn."""
+    def _next_end_of_scan(self) -> ListenerEvent | None:
+        # Short waits in a loop: a dead connection is noticed, and a spectrum gets its turn.
         while self._for_scan and not self._closed:
             timed_out, path = self._link.ask("Scan.WaitEndOfScan", _WAIT_MS, longer_s=_WAIT_MS / 1000)
             if not timed_out:
@@ -223,7 +222,7 @@ class Listener:
                 return ScanEnded(path)
         return None
 
-    def _curve(self, module: str, base_name: str) -> Heard:
+    def _curve(self, module: str, base_name: str) -> ListenerEvent:
         with_data = 1
         names, values, _ = self._link.ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
         return CurveEnded(tuple(names), values)

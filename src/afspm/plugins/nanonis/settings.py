@@ -1,7 +1,7 @@
-"""Generic parameters that Nanonis has in other groupings, units or directions than a table could say.
+"""Parameters that Nanonis groups, scales or signs in ways that a table can't express.
 
-A group is read by one question and written by one command, by generic names, in SI. What a `…Get` replies is never put
-into a `…Set` as it is where the two count differently (the table of `protocol`, "Traps" in the README).
+A group is read by one request and written by one command, by generic names, in SI. Values of a `…Get` are never passed
+to a `…Set` as they are where both count differently (the table of `protocol`, "Traps" in the README).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _ON, _OFF = 1, 2
 
 
 class Group(SettingsGroup):
-    """Parameters that Nanonis is asked for by one question, and told by one command."""
+    """Parameters read by one request and written by one command."""
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
@@ -40,10 +40,10 @@ class Group(SettingsGroup):
 
 
 def numbers(ask: Ask, name: str, *arguments: Any) -> tuple[Any, ...]:
-    """The numbers that a function replies.
+    """Return the numbers that a function replies.
 
     Raises:
-        BadReply: one is not finite: nothing can be set by it.
+        BadReply: a number is not finite, so that nothing can be set by it.
     """
     found = ask(name, *arguments)
     for value in found:
@@ -53,7 +53,7 @@ def numbers(ask: Ask, name: str, *arguments: Any) -> tuple[Any, ...]:
 
 
 class ScanFrame(Group):
-    """Nanonis has the centre, a clockwise angle in degrees, and the range of whole pixels: N pixels of range / N."""
+    """The scan frame: Nanonis has the centre, a clockwise angle in degrees, and the range of N pixels of range / N."""
 
     names = FRAME
 
@@ -87,12 +87,11 @@ class ScanFrame(Group):
 
 
 def _share(pixels: int) -> float:
-    """Of the range, what lies between the first and the last pixel."""
     return (pixels - 1) / pixels if pixels > 1 else 1.0
 
 
 class ScanSpeed(Group):
-    """The speed forward; that backward keeps its ratio, and the speeds are what is kept when the frame changes."""
+    """The scan speed forward. The backward speed keeps its ratio; the speeds are kept when the frame changes."""
 
     names = (names.SCAN_SPEED,)
 
@@ -114,7 +113,7 @@ class ScanSpeed(Group):
 
 
 class Gains(Group):
-    """Nanonis has P, the time constant T and I = P / T."""
+    """The gains of the z controller: Nanonis has P, the time constant T, and I = P / T."""
 
     names = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
 
@@ -132,10 +131,10 @@ class Gains(Group):
 
 
 class FeedbackOn(Group):
-    """The z controller, on or off, as its real-time part says; it follows with a delay.
+    """The switch of the z controller, as its real-time part reports it, with a delay.
 
     Args:
-        wait_for: waits until a condition holds, but not for ever.
+        wait_for: waits for a condition, up to a time limit.
     """
 
     names = (FEEDBACK_ON,)
@@ -154,7 +153,7 @@ class FeedbackOn(Group):
 
 
 class MoveSpeed(Group):
-    """Of the tip outside of scans: a speed of its own, not that of scans."""
+    """The speed of the tip between scans, independent of the scan speed."""
 
     names = (names.MOVE_SPEED,)
 
@@ -168,7 +167,7 @@ class MoveSpeed(Group):
 
 
 class Slope(Group):
-    """The compensation of the sample's tilt, which Nanonis has as angles."""
+    """The compensation of the sample's tilt, as slopes; Nanonis has angles."""
 
     names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
 
@@ -182,7 +181,7 @@ class Slope(Group):
 
 
 class DriftRate(Group):
-    """The speed at which the controller follows the sample by itself; off when both are 0. That in z stays."""
+    """The controller's own drift compensation, off if x and y are 0. The z velocity is kept."""
 
     names = (DRIFT_RATE_X, DRIFT_RATE_Y)
     _usual_limit_percent: ClassVar[float] = 10.0
@@ -200,13 +199,13 @@ class DriftRate(Group):
 
 
 class Probe(Group):
-    """The place of the tip: the goal while it is on its way, the place before while a scan leads it.
+    """The position of the tip: the goal during a move, the position before during a scan.
 
     Args:
-        now_s: experiment time.
+        now_s: returns experiment time.
 
     Attributes:
-        arrives_s: when it should be where it was sent, experiment time.
+        arrives_s: expected arrival, experiment time.
     """
 
     names = POSITION
@@ -222,7 +221,7 @@ class Probe(Group):
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
 
     def xy_m(self) -> tuple[float, float]:
-        """Return where the tip is, (x, y) in m."""
+        """Return the position of the tip, (x, y) in m."""
         if self._goal_m is not None:
             return self._goal_m
         if self._seen_m is not None and self._ask("Scan.StatusGet")[0]:
@@ -252,7 +251,7 @@ class Probe(Group):
         self.arrives_s = self._now_s() + (math.dist(before_m, (x, y)) / speed_m_s if speed_m_s > 0.0 else 0.0)
 
     def arrived(self) -> bool:
-        """Return True if the tip is where it was sent; it then counts as being there exactly."""
+        """Return True if the tip has reached its goal, which then counts as its exact position."""
         if self._goal_m is None:
             return True
         if not self._near(self._numbers("FolMe.XYPosGet", 0), self._goal_m):
@@ -261,7 +260,7 @@ class Probe(Group):
         return True
 
     def give_up(self) -> None:
-        """It does not get there: the place where it is counts."""
+        """Give up the goal: the measured position counts."""
         self._goal_m = self._seen_m = None
 
     def _near(self, a: tuple[Any, ...], b: tuple[float, float]) -> bool:
@@ -279,10 +278,10 @@ TRANSLATED: Final = (
 
 
 def same_float32(name: str, got: Value, other: Value, among: Mapping[str, Value]) -> bool:
-    """Return True if a value that was got is another one, for a controller that keeps most as float32.
+    """Return True if two values are equal for a controller that stores most values as float32.
 
     Args:
-        among: what was got with it: of a frame, all.
+        among: values read together with it: for a frame, all of its values.
     """
     if not (isinstance(got, float) and isinstance(other, float)):
         return got == other

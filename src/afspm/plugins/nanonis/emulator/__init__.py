@@ -1,4 +1,4 @@
-"""An emulated Nanonis controller: the vendor's TCP protocol and files, with simulated physics behind them."""
+"""Emulated Nanonis controller: the vendor's TCP protocol and files, with simulated physics."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ class NanonisRequest:
     """A request.
 
     Attributes:
-        name: of the function as the protocol has it; sent: as the client has written it, which is echoed.
+        name: the function's name in the protocol.
+        sent: the name as sent by the client, which the reply repeats.
     """
 
     name: str
@@ -44,7 +45,7 @@ class NanonisRequest:
 
 @dataclass(frozen=True)
 class PendingReply:
-    """A reply that comes when something has happened."""
+    """A reply that waits for an event."""
 
     asked: NanonisRequest
     later: DeferredResult
@@ -56,26 +57,26 @@ class PendingReply:
 
 @dataclass(frozen=True)
 class DelayedReply:
-    """A reply that is ready, and sent at a time."""
+    """A complete reply with the time at which it is sent."""
 
     content: bytes
     at_s: float
 
 
 class NanonisEmulator(Emulator):
-    """The emulated controller: of an STM with a qPlus sensor, unless `feedback` has another mode.
+    r"""The emulated controller of an STM with a qPlus sensor, unless `feedback` has another mode.
 
     Args:
-        release: of its software: a year of `RELEASES`, or the number itself.
-        port: the first that it listens on; 0: any free.
-        ports: how many, one after the other; where any is free, each is any.
-        logger_port: of the TCP Logger's stream; 0: any free one.
-        one_each: whether a port serves one client at a time, as the real one's do.
-        session_path: what it calls its session folder, e.g. "D:\\\\Data"; left out: what the folder is called here.
-        range_m: of its scanner in x and y.
-        bare_errors: replies with an error have no results; they have, all zero, if not.
-        grabbed_rows: how scans in its memory are handed out: "top-first" or as "recorded".
-        seed, faults, and all of the simulated world: as of every emulator.
+        release: release of its software: a year of `RELEASES`, or the number itself.
+        port: first port to listen on; 0: any free port.
+        ports: number of ports, consecutive unless `port` is 0.
+        logger_port: port of the TCP Logger's stream; 0: any free port.
+        one_each: True if a port serves one client at a time, as real ones do.
+        session_path: its own path of the session folder, e.g. "D:\\Data". Default: the local path.
+        range_m: range of its scanner in x and y.
+        bare_errors: True if replies with an error have no results; False: results of zeros.
+        grabbed_rows: order of rows of scans from its memory: "top-first" or as "recorded".
+        seed, faults, and the simulated world: settings of every emulator.
     """
 
     vendor = "Nanonis"
@@ -136,7 +137,6 @@ class NanonisEmulator(Emulator):
         self._grabbed_rows = grabbed_rows
 
     def open(self) -> str:
-        """Listen on all ports."""
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
         self._server = TcpServer(
             LOOPBACK,
@@ -161,11 +161,11 @@ class NanonisEmulator(Emulator):
         return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"
 
     def serve(self, timeout_s: float) -> None:
-        """Answer what has come."""
+        """Answer the received requests."""
         self._server.poll(timeout_s)
 
     def tick(self, now_s: float) -> float | None:
-        """Scans end, files are written, and who has waited for that is answered."""
+        """Advance scans and files, and send the replies that waited for them."""
         times = [self.software.advance(now_s), self._log_signals(now_s)]
         for connection in self._server.connections:
             times.append(self._go_on(connection, now_s))
@@ -173,7 +173,6 @@ class NanonisEmulator(Emulator):
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def _log_signals(self, now_s: float) -> float | None:
-        """Send what the TCP Logger has to; returns when there is more."""
         readers, signals = self._server.readers, self.software.signals
         stream = signals.logger
         stream.unread = [len(reader.sending) for reader in readers]
@@ -187,7 +186,6 @@ class NanonisEmulator(Emulator):
         return max(stream.next_s(), now_s + self.software.core.experiment_s(_LOGS_EVERY_S))
 
     def _go_on(self, connection: ClientConnection, now_s: float) -> float | None:
-        """Send what was waited for, if it is there; returns when to look again."""
         waits = connection.waits_for
         if isinstance(waits, DelayedReply):
             if now_s < waits.at_s:
@@ -200,7 +198,6 @@ class NanonisEmulator(Emulator):
         return None
 
     def _settled(self, connection: ClientConnection, waits: PendingReply, now_s: float) -> float | None:
-        """Reply if what was waited for has happened, or not in time; returns when to look again."""
         later = waits.later
         results = later.ready(now_s)
         if results is None and now_s >= later.until_s:
@@ -221,7 +218,6 @@ class NanonisEmulator(Emulator):
     # --- requests ---
 
     def _answer_all(self, connection: ClientConnection) -> None:
-        """Answer the requests received on a connection until one has to wait."""
         while connection.waits_for is None and not connection.closing:
             now_s = self.clock.now_s()
             if self.faults.lasts("dialog", now_s):
@@ -241,7 +237,6 @@ class NanonisEmulator(Emulator):
 
     @contextmanager
     def _refusing(self, connection: ClientConnection, asked: NanonisRequest) -> Iterator[None]:
-        """Answer with an error where something can't be: all that a client asks passes through here."""
         try:
             yield
         except (FunctionRefused, InstrumentBusy, InvalidValue, wire.MalformedRequest) as error:
@@ -278,7 +273,7 @@ class NanonisEmulator(Emulator):
             self._reply(connection, asked, found)
 
     def _wire_release(self, now_s: float) -> int:
-        """The release by which the fields go."""
+        # A fault makes the replies use the fields of another release.
         if self.faults.lasts("wrong-release", now_s):
             return min(RELEASES.values()) if self.release > min(RELEASES.values()) else max(RELEASES.values())
         return self.release
@@ -300,7 +295,6 @@ class NanonisEmulator(Emulator):
         self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
 
     def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:
-        """A reply, or what goes wrong with it."""
         now_s = self.clock.now_s()
         content = wire.reply(name, body)
         if self.faults.strikes("no-reply", now_s):
@@ -324,7 +318,7 @@ class NanonisEmulator(Emulator):
 
 
 def _of_stm(feedback: object) -> object:
-    """Complete the settings of the feedback; those of another mode, or no table at all, stay as they are."""
+    # A feedback of another mode, or a malformed table, stays as it is.
     if not isinstance(feedback, Mapping) or feedback.get("mode", "current") != "current":
         return feedback
     sensor = feedback.get("sensor", {})

@@ -1,6 +1,6 @@
-"""The controller's side of the TCP protocol: requests from bytes, replies to bytes.
+"""Controller's side of the TCP protocol: requests from bytes, replies to bytes.
 
-Written apart from the translator's, which it is to be tested against.
+Independent of the translator's code, so that each checks the other.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _SENSELESS_TEXTS: Final = (
 
 
 class MalformedRequest(Exception):
-    """The bytes of a client are not what belongs to the function."""
+    """The bytes of a request do not fit its function."""
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class WireField:
     """One field of a request or a reply.
 
     Attributes:
-        code: as in `functions.txt`.
-        since, until: the first release that has it, and the first that has it no more.
-        mark: how what is set is got: see `functions.txt`.
+        code: type code, see `functions.txt`.
+        since, until: first release with the field, first one without it.
+        mark: relation between values in `…Set` and `…Get`, see `functions.txt`.
     """
 
     code: str
@@ -79,7 +79,7 @@ class WireField:
 
 @dataclass(frozen=True)
 class NanonisFunction:
-    """One function: its fields, and the first release that has it."""
+    """A function: its fields, and the first release that has it."""
 
     arguments: tuple[WireField, ...]
     results: tuple[WireField, ...]
@@ -109,7 +109,7 @@ def _by_lower_case() -> Mapping[str, str]:
 
 
 def known_as(name: str) -> str | None:
-    """Return the table's spelling of a name, ignoring case; None if it is not there."""
+    """Return the table's spelling of a name, ignoring case; None: unknown."""
     return _by_lower_case().get(name.lower())
 
 
@@ -118,10 +118,12 @@ def _fields(column: str) -> tuple[WireField, ...]:
 
 
 def split(received: bytearray) -> tuple[str, bool, bytes] | None:
-    """Takes one request off: its function, whether an answer is wanted, its body; None if it is not there yet.
+    """Remove one request from the received bytes; return name, whether an answer is wanted, and body.
+
+    None: the request is incomplete.
 
     Raises:
-        MalformedRequest: these are no requests.
+        MalformedRequest: not a request.
     """
     if len(received) < HEADER_BYTES:
         return None
@@ -138,7 +140,7 @@ def split(received: bytearray) -> tuple[str, bool, bytes] | None:
 
 
 def arguments(name: str, body: bytes, release: int) -> list[object]:
-    """The arguments in the body of a request.
+    """Decode the arguments in a request's body.
 
     Raises:
         MalformedRequest: too few or too many bytes.
@@ -157,7 +159,7 @@ def arguments(name: str, body: bytes, release: int) -> list[object]:
 
 
 def _unpacked(code: str, body: bytes, at: int, count: int) -> tuple[Any, int]:
-    """A value, and where the next begins; `count` is that of the lists which share one."""
+    # `count` is the length of lists that share one length field.
     if code in _SIZES:
         return struct.unpack_from(f">{code}", body, at)[0], at + _SIZES[code]
     if code.startswith("*"):
@@ -192,7 +194,7 @@ def _items(code: str, count: int, body: bytes, at: int) -> tuple[list[Any], int]
 
 
 def reply(name: str, body: bytes) -> bytes:
-    """With its header."""
+    """Encode a reply from its header's name and its body."""
     return name.encode("ascii", "replace")[:32].ljust(32, b"\0") + struct.pack(">i", len(body)) + bytes(4) + body
 
 
@@ -204,7 +206,7 @@ def body(name: str, results: Sequence[object], release: int, encoding: str = "ut
 
 
 def error_body(name: str, text: str, release: int, *, bare: bool) -> bytes:
-    """Encode the body of a reply with an error, after results that are all zero, or without results."""
+    """Encode the body of a reply with an error, after results of zeros, or without results."""
     codes = [] if bare or name not in functions() else functions()[name].result_codes(release)
     return b"".join(_packed(code, ZEROS[code], "utf-8") for code in codes) + error_block(text, 1)
 
@@ -241,7 +243,7 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
 
 
 def senseless_value(code: str, chance: random.Random) -> object:
-    """A value of the field, by its code."""
+    """Return a random absurd value of a field's type."""
     if code in "fd":
         return chance.choice(_SENSELESS_NUMBERS)
     if code in "BHIin":
