@@ -239,7 +239,7 @@ def test_a_gain_is_set_and_leaves_the_others(bench: Make) -> None:
 
 
 def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> None:
-    made = bench(tells_gains=False)
+    made = bench(reports_gains=False)
     peer = small(made)
     assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
     assert scanned(peer)

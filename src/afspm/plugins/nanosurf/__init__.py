@@ -1,4 +1,4 @@
-"""Nanosurf, over the scripting interface of Nanosurf Studio. See the README beside this."""
+"""Driver of Nanosurf microscopes, over the scripting interface of Nanosurf Studio. See the README in this folder."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ class Nanosurf(Driver):
 
     Args:
         address: "host:port" of its scripting interface.
-        release: of Studio (Help > About): 17 or later. A command that it does not have is not called.
-        session: name of the measurement session, such as "91-21-004"; left out: the only one that is open.
-        gallery_dir: where Studio's gallery folder is seen from here; left out: Studio runs on this computer.
-        image_buffer: number of the low-level buffer that has the running scan, for its lines; left out: none is read.
-        reply_timeout_s: how long a reply may take, in real time.
-        poll_period_s, common: as for every microscope.
+        release: release of Studio (Help > About), 17 or later, which decides the commands to use.
+        session: name of the measurement session, such as "91-21-004". Default: the only open one.
+        gallery_dir: local path of Studio's gallery folder. Default: Studio runs on this computer.
+        image_buffer: number of the low-level buffer with the running scan, for its lines. Default: no lines are read.
+        reply_timeout_s: longest wait for a reply, real time.
+        poll_period_s, common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -104,7 +104,7 @@ class Nanosurf(Driver):
         self._studio().put(values)
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the table, all by one question."""
+        """Return values of the parameter table, all with one request."""
         rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
         values = self._studio().values([row.vendor for row in rows]) if rows else {}
         found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
@@ -117,7 +117,7 @@ class Nanosurf(Driver):
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """From the buffer `image_buffer`."""
+        """Return new lines of the running scan, from the buffer `image_buffer`."""
         if self._image_buffer is None:
             return ()
         region, shape = frame(self.in_force(FRAME))
@@ -128,7 +128,7 @@ class Nanosurf(Driver):
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Scan the frame once, in the direction of `x-scan-direction`."""
+        """Scan the frame once, in the direction `x-scan-direction`."""
         wanted = direction(str(self._kept[names.SCAN_DIRECTION]))
         self._studio().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
         self._doing.start_scan()
@@ -140,7 +140,7 @@ class Nanosurf(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve where the tip was sent, by the cycle that is selected in Studio."""
+        """Take a force curve where the tip was sent, with the cycle selected in Studio."""
         self._doing.start_curve()
 
     @action(names.STOP_SPEC)
@@ -150,12 +150,12 @@ class Nanosurf(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Withdraw the tip, whatever is going on."""
+        """Stop everything and withdraw the tip."""
         self._doing.withdraw()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample, by the approach that is selected in Studio."""
+        """Bring the tip to the sample, with the approach selected in Studio."""
         self._doing.approach()
 
     def command(self, text: str) -> None:
@@ -181,12 +181,10 @@ class Nanosurf(Driver):
         return frame(self.in_force(FRAME))[0]
 
     def _folder(self) -> Path:
-        """The folder of Studio's files, as seen from here."""
         path = f"{_STORAGE}.gallery_directory"
         return Path(self._gallery_dir or str(self._studio().values([path])[path]))
 
     def _save_files(self, session: Session) -> None:
-        """Have every measurement saved to a file of its own. Raises ConfigError: its folder can't be seen."""
         wanted: dict[str, Value] = {
             f"{_STORAGE}.nhf_backend_enabled": True,
             f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
@@ -200,7 +198,6 @@ class Nanosurf(Driver):
             raise ConfigError(told, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
 
     def _check_table(self, session: Session) -> None:
-        """Check that Studio has what the table names, and counts as it says. Raises ConfigError."""
         rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
         for path in session.missing(rows):
             raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")

@@ -1,6 +1,6 @@
-"""The commands of Nanosurf Studio that the driver uses, and in which releases they are.
+"""Commands of Nanosurf Studio that the driver uses, and the releases that have them.
 
-From the tree that nanosurf-core 2.0.7 (MIT) has of Studio. What is marked with (!) in the README is not known.
+From the command tree in nanosurf-core 2.0.7 (MIT). Items marked (!) in the README are unconfirmed.
 """
 
 from __future__ import annotations
@@ -102,11 +102,7 @@ pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
 
 
 def has_old_commands(release: int) -> bool:
-    """Return whether a release has the commands of before 17, too.
-
-    Raises:
-        ConfigError: it is older than 17.
-    """
+    """Return True if a release still has the commands from before 17. Raises ConfigError: it is older than 17."""
     if release < FIRST_RELEASE:
         hint = f"{FIRST_RELEASE} or later"
         raise ConfigError(f"afspm does not speak to Nanosurf Studio {release}", where="release", hint=hint)
@@ -114,10 +110,10 @@ def has_old_commands(release: int) -> bool:
 
 
 def used(release: int) -> tuple[str, ...]:
-    """Return the paths of all commands that are used with a release."""
+    """Return the paths of all commands used with a release."""
     return (*_ALWAYS, *((IS_SCANNING,) if has_old_commands(release) else _SIGNALS))
 
 
 def level(release: int) -> int:
-    """Return the level of the session that is needed: the old commands are in the highest alone (!)."""
+    """Return the lowest session level with the used commands: the old ones need the highest level (!)."""
     return 5 if has_old_commands(release) else 1

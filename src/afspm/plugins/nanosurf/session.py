@@ -1,4 +1,4 @@
-"""A connected Nanosurf Studio: its values, its commands, and whether it scans."""
+"""A connected Nanosurf Studio: its values, its commands, and the state of its scan."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ _LARGEST_BUFFERED: Final = 2**31 - 1
 
 @dataclass(frozen=True)
 class Scanning:
-    """What is known of scans.
+    """The state of scans.
 
     Attributes:
-        running: a scan runs.
-        started: how many have begun since Studio takes note; 0: this release does not count them.
+        running: True while a scan runs.
+        started: number of started scans since the handlers were connected; 0 if this release does not count them.
     """
 
     running: bool
@@ -38,16 +38,16 @@ class Scanning:
 
 
 class Session:
-    """A measurement session of Studio. For one thread.
+    """A measurement session of Studio, for one thread.
 
     Args:
-        open_link: gives a new connection.
-        release: of Studio.
-        name: of the session; empty: the only one that is open.
-        level: of its commands; None: the lowest that is needed.
+        open_link: opens a new connection.
+        release: release of Studio.
+        name: name of the session; empty: the only open one.
+        level: level of its commands; None: the lowest sufficient one.
 
     Raises:
-        ControllerLost. ConfigError: it is another release, or lacks commands.
+        ControllerLost. ConfigError: another release, or missing commands.
     """
 
     def __init__(self, open_link: Callable[[], Link], release: int, name: str, level: int | None = None) -> None:
@@ -64,21 +64,21 @@ class Session:
             raise
 
     def run(self, script: str) -> list[Any]:
-        """Run a script. Raises StudioError, ControllerLost."""
+        """Run a script; return the values that it returns. Raises StudioError, ControllerLost."""
         return self._link.run(script)
 
     def do(self, command: str) -> None:
-        """Call a command. Raises Refused: Studio would not."""
+        """Call a command. Raises Refused: Studio reports an error."""
         try:
             self.run(f"{WORKFLOW}.{command}() return 0")
         except StudioError as error:
             raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused {command}: {error}") from error
 
     def values(self, paths: Sequence[str]) -> dict[str, Value]:
-        """Return values of panels by their paths.
+        """Return values of panels by path.
 
         Raises:
-            ControllerLost: there is none, or a number is not finite: such a reply is not to be trusted.
+            ControllerLost: a value is missing or not finite, so that the reply can't be trusted.
         """
         script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
         found = dict(zip(paths, self._told(script), strict=False))
@@ -89,7 +89,7 @@ class Session:
         return found
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values of panels, all or none. Raises Refused: Studio does not take one."""
+        """Set values of panels, all or none. Raises Refused: Studio rejects one of them."""
         puts = " ".join(
             f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()
         )
@@ -99,17 +99,17 @@ class Session:
             raise Refused(ControlResponse.PARAM_ERROR, f"Studio refused {', '.join(values)}: {error}") from error
 
     def units(self, paths: Iterable[str]) -> dict[str, str]:
-        """Return the units that Studio says its values are in; empty: it says none."""
+        """Return Studio's units of values by path; empty: none."""
         paths = list(paths)
         told = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
         return {path: str(told.get(number, "")) for number, path in enumerate(paths, 1)}
 
     def missing(self, paths: Iterable[str]) -> list[str]:
-        """Return those paths that Studio does not have."""
+        """Return the paths that Studio lacks."""
         return [str(one) for one in self.run(commands.MISSING % ", ".join(map(written, paths)))[0].values()]
 
     def scanning(self) -> Scanning:
-        """Return whether a scan runs."""
+        """Return whether a scan runs, and how many were started. Raises ControllerLost."""
         script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
         told = self._told(script)
         if len(told) != 2 or not isinstance(told[0], bool) or not isinstance(told[1], int):
@@ -117,7 +117,7 @@ class Session:
         return Scanning(*told)
 
     def begin(self, what: str, command: str, first: str = "") -> LongCall:
-        """Begin what takes long, after the script `first`, on a connection of its own. Raises ControllerLost."""
+        """Start a long command on a connection of its own, after the script `first`. Raises ControllerLost."""
         link = self._open_link()
         try:
             self._select(link)
@@ -128,20 +128,18 @@ class Session:
         return LongCall(what, link)
 
     def close(self) -> None:
-        """Let go of it."""
         self._link.close()
 
     # --- inside ---
 
     def _told(self, script: str) -> list[Any]:
-        """Return the values of a script that any session runs. Raises ControllerLost: this one does not any more."""
+        # Any session can run these scripts: an error means that this one was closed or replaced.
         try:
             return self.run(f"return {script}")
         except StudioError as error:
             raise ControllerLost(f"Studio's session is not what it was: {error}") from error
 
     def _checked_name(self, name: str) -> str:
-        """Return the name of the session to select. Raises ConfigError: Studio is of another release."""
         self._link.run("return root.session.select_main(0)")
         major, full, listed = self._link.run("return root.version.major(), root.version.full(), root.session.list()")
         self.controller = f"Nanosurf Studio {full}"
@@ -161,7 +159,6 @@ class Session:
             raise ControllerLost(f"Studio's session {self._name!r} can't be selected: {error}") from error
 
     def _check(self) -> None:
-        """Check that the release has what is used of it, and takes note of scans."""
         missing = self.missing(commands.used(self._release))
         if missing:
             names = ", ".join(missing)
@@ -179,7 +176,7 @@ def _field(path: str) -> str:
 def new_lines(
     session: Session, buffer: int, region: Region, shape: tuple[int, int], start: int, *, upwards: bool
 ) -> list[ScanLines]:
-    """Return the complete lines beyond the first `start` that all channels have, in the order of the scan."""
+    """Return the complete lines beyond the first `start` that all channels have, in scanning order."""
     # (!) which buffer holds the image, and that its values are the lines as they were scanned, is not known
     found = session.run(commands.BUFFER_LINES % buffer)[0]
     channels = [_buffered_channel(one, shape[1]) for one in found.values()]
@@ -195,7 +192,6 @@ def new_lines(
 
 
 def _buffered_channel(told: dict[int, Any], columns: int) -> tuple[str, str, np.ndarray]:
-    """Name, unit and complete lines of a channel."""
     name, unit, span, raw = (told[number] for number in (1, 2, 3, 4))
     values = np.array(list(raw.values()), dtype=np.float64) / _LARGEST_BUFFERED * float(span)
     rows = len(values) // columns

@@ -1,6 +1,6 @@
-"""The layout of Park's TIFF files: private tags, and in them a header of an image, and one of curves.
+"""Layout of Park's TIFF files: private tags that contain a header of an image, or of curves.
 
-From pspylib 0.1.2, the maker's own reader; that of images against Gwyddion, too, and that of curves against AtomicJ.
+From pspylib 0.1.2, the maker's own reader; images were compared with Gwyddion, curves with AtomicJ.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ POINT: Final = np.dtype([("x_um", "<f4"), ("y_um", "<f4"), ("time_s", "<f4")])
 
 
 def text(raw: np.void) -> str:
-    """Return a text of a header: two bytes a character, and zeros behind it."""
+    """Return a text of a header: two bytes a character, padded with zeros."""
     return raw.tobytes().decode("utf-16-le", "replace").partition("\0")[0].strip()
 
 
 def in_si(unit: str) -> tuple[str, float]:
-    """Return the unit without its prefix, and what to multiply with."""
+    """Return the unit without its prefix, and the prefix as a factor."""
     found = _UNIT.fullmatch(unit)
     return (found[2], _PREFIX[found[1]]) if found else (unit, 1.0)

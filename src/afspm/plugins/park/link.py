@@ -1,4 +1,4 @@
-"""The connection to SmartScan: JSON-RPC over ZeroMQ, and scripts whose outcome is told in a form of our own."""
+"""Connection to SmartScan: JSON-RPC over ZeroMQ, with scripts that return their outcome in a form of afspm's own."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ OK, ERROR = "ok", "error"
 
 
 class SmartScanError(AfspmError):
-    """SmartScan could not run a script: its own words."""
+    """SmartScan reports an error of a script, with its own text."""
 
     code = "park-error"
 
 
 class Link:
-    """One connection. For one thread. Raises ControllerLost: nobody listens there. ConfigError: it is no address."""
+    """One connection for one thread. Raises ControllerLost: no connection. ConfigError: malformed address."""
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._address = address
         self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
 
     def ask(self, method: str) -> Any:
-        """Return the result of a method without parameters. Raises SmartScanError, ControllerLost."""
+        """Call a method without parameters; return its result. Raises SmartScanError, ControllerLost."""
         return self._connection.ask(method, _request(method, _NO_PARAMETERS), _fields)["result"]
 
     def run(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript.
+        """Evaluate a JavaScript expression; return its value.
 
         Raises:
-            SmartScanError: it failed. ControllerLost: no reply, or none to be trusted; the connection is closed.
+            SmartScanError: it failed. ControllerLost: no reply, or an untrustworthy one; the connection is closed.
         """
         reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
         if not reply.get("value"):
@@ -59,18 +59,18 @@ class Link:
         return self._outcome(reply)
 
     def begin(self, expression: str) -> None:
-        """Have a script run that takes its time. Raises ControllerLost."""
+        """Start a long script. Raises ControllerLost."""
         self._connection.begin(shown(expression), _request(RUN_SCRIPT, wrapped(expression)))
 
     def wait(self, within_s: float) -> None:
-        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
+        """Wait for the reply to `begin`, at most `within_s` of real time. Raises ControllerLost."""
         self._connection.wait(within_s)
 
     def reply(self, what: str) -> tuple[bool, Any]:
-        """Return whether a reply has come to what was begun, and the value in it, None if it has none.
+        """Return whether the reply has arrived, and its value, None without one.
 
         Raises:
-            SmartScanError: it failed. ControllerLost.
+            SmartScanError: the script failed. ControllerLost.
         """
         raw = self._connection.reply(what)
         if raw is None:
@@ -79,7 +79,6 @@ class Link:
         return True, self._outcome(reply) if reply.get("value") else None
 
     def close(self) -> None:
-        """Let go of it."""
         self._connection.close()
 
     def _outcome(self, reply: Plain) -> Any:
@@ -100,7 +99,7 @@ class Link:
 
 
 def wrapped(expression: str) -> str:
-    """Return a line whose value says whether the expression failed: SmartScan's own way to say so is not known."""
+    """Return a script whose value reports if the expression failed: SmartScan's own form of errors is unconfirmed."""
     ok, error = f'JSON.stringify({{"{OK}": ({expression})}})', f'JSON.stringify({{"{ERROR}": String(e)}})'
     return f"(function() {{ try {{ return {ok}; }} catch (e) {{ return {error}; }} }})()"
 
@@ -111,7 +110,7 @@ def shown(script: str) -> str:
 
 
 def numbers(told: object, count: int) -> list[float]:
-    """Return so many finite numbers, of a list or of a text with commas. Raises ControllerLost."""
+    """Return `count` finite numbers of a list, or of a text with commas. Raises ControllerLost."""
     parts = told.split(",") if isinstance(told, str) else told
     try:
         found = [float(one) for one in parts] if isinstance(parts, list) else []
@@ -127,7 +126,6 @@ def _request(method: str, parameters: str) -> bytes:
 
 
 def _fields(raw: bytes) -> Plain:
-    """Return a reply. Raises SmartScanError: it is an error. ControllerLost: it is none."""
     try:
         reply = json.loads(raw)
     except ValueError as error:

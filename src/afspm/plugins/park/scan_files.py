@@ -1,9 +1,10 @@
-"""Park's TIFF files: one channel of a scan in one direction each, or curves.
+"""Park's TIFF files: each has one channel of a scan in one direction, or curves.
 
-Of images, rows ascend, lengths are in micrometres, and a value is gain · (number · scale + offset) in a unit of its
-own. Offsets are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored
-(!). Of curves, the numbers lie channel by channel, in each both ways one after the other; a value is gain · number, as
-pspylib and AtomicJ have it. Places are taken as those of the scanner, in micrometres (!).
+Images: rows ascend, lengths are in µm, and a value is gain · (number · scale + offset) in a unit of its own. Offsets
+are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored (!).
+
+Curves: the numbers of a channel follow each other, forward and then backward; a value is gain · number, as in pspylib
+and AtomicJ. Positions are taken as those of the scanner, in µm (!).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ Tags = dict[int, Any]
 
 
 def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
-    """The image or the curves of a file. Raises FileError: not whole, or another kind of TIFF."""
+    """Read the image or the curves of a file. Raises FileError: damaged, or another kind of TIFF."""
     tags = _tags(path)
     version, raw = int(tags.get(VERSION_TAG, 0)), bytes(tags.get(HEADER_TAG, b""))
     if tags.get(MAGIC_TAG) != MAGIC:
@@ -128,7 +129,7 @@ def _curves(tags: Tags, path: Path, *, newer: bool) -> tuple[Spectrum, ...]:
 
 
 def _places(raw: bytes, count: int) -> list[XY | None]:
-    """Return where each curve was taken; None: that is not told."""
+    # Files may lack the positions of their curves.
     if len(raw) < count * POINT.itemsize:
         return [None] * count
     points = np.frombuffer(raw, POINT, count)

@@ -1,7 +1,7 @@
-"""The frame, the speed, the gains and the place of the tip as SmartScan has them, and as everybody else.
+"""Frame, speed, gains and tip position: conversion between SmartScan's values and generic parameters.
 
-SmartScan has the centre of a frame in micrometres, its angle in degrees, and lines per second; a line is there and
-back (!).
+SmartScan has the centre of a frame in µm, its angle in degrees, and lines per second; a line is forward and backward
+(!).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _SPEED_PATH: Final = 2.0
 
 
 class FrameSettings(SettingsGroup):
-    """The frame and the speed, which are set together as the speed is told by lines per second."""
+    """Frame and speed, set together since the speed depends on the width and the line rate."""
 
     names = frozenset({*FRAME, names.SCAN_SPEED})
 
@@ -66,7 +66,7 @@ class FrameSettings(SettingsGroup):
 
 
 class Gains(SettingsGroup):
-    """The gains of the feedback: two of the four members of one value, which may not be one to be read (!)."""
+    """The gains of the feedback: two of the four members of an object, which may be write-only (!)."""
 
     names = tuple(_GAINS)
 
@@ -77,8 +77,8 @@ class Gains(SettingsGroup):
         told = self._session().values(list(_GAINS.values()))
         return {name: float(told[path]) for name, path in _GAINS.items()}
 
-    def are_told(self) -> bool:
-        """Return True if SmartScan tells them. Raises ControllerLost."""
+    def are_reported(self) -> bool:
+        """Return True if SmartScan reports the gains. Raises ControllerLost."""
         return all(map(self._session().is_number, _GAINS.values()))
 
     def write(self, values: Mapping[str, Value]) -> None:
@@ -88,7 +88,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The place to which the tip was sent: SmartScan tells that of its stage alone (!)."""
+    """The position where the tip was sent: SmartScan reports that of its stage only (!)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))
@@ -100,12 +100,12 @@ class TipPlace(KeptSettings):
         super().write(values)
 
     def xy_m(self) -> XY:
-        """Return where the tip was sent."""
+        """Return the position where the tip was sent, (x, y) in m."""
         x, y = map(self.number, POSITION)
         return x, y
 
 
 def way_to(place_m: XY) -> str:
-    """Return the script that leads the tip to a place."""
+    """Return the script that moves the tip to a position."""
     x, y = (length / MICROMETRE for length in place_m)
     return f"(spm.xyscanner.moveTo({x!r}, {y!r}), 0)"

@@ -1,4 +1,4 @@
-"""An emulated Nanosurf Studio: its socket, its scripts in a real Lua, and its files, with simulated physics behind."""
+"""Emulated Nanosurf Studio: its socket, its scripts in a real Lua, and its files, with simulated physics."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class NanosurfEmulator(ScriptedEmulator):
     """The emulated program. Needs lupa.
 
     Args:
-        release: of Studio: 19 lacks commands that 17 and 18 have.
-        image_buffer: number of the low-level buffer that the lines of a running scan are read from.
-        start_s: how long the ramp to the first line takes, experiment time.
-        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
-        one_client: whether a further connection waits until the first has gone.
-        seed, faults, and all of the simulated world: as of every emulator.
+        release: release of Studio; 19 lacks commands of 17 and 18.
+        image_buffer: number of the low-level buffer with the lines of the running scan.
+        start_s: duration of the ramp to the first line, experiment time.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        one_client: True if a further connection waits for the end of the first.
+        seed, faults, and the simulated world: settings of every emulator.
     """
 
     vendor = "Nanosurf"
@@ -54,7 +54,6 @@ class NanosurfEmulator(ScriptedEmulator):
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
-        """Make Studio with its tree of commands."""
         self._levels: dict[Client, int | None] = {}
         self._client: Client = None
         program = StudioProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
@@ -62,22 +61,21 @@ class NanosurfEmulator(ScriptedEmulator):
         return program
 
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
-        """Listen for the connections of clients."""
         return StudioWire(port, on_request, self.woken, one_client=self._one_client)
 
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
-        """Run a script in the tree that the client has selected."""
+        """Run a script in the tree selected by the client."""
         self._client = client
         thread, problem = self._tree.start(request.decode("utf-8", "replace"), self._levels.get(client))
         return problem.encode() if problem is not None else self._run_on(client, thread)
 
     def failure(self, request: bytes, reason: str) -> bytes:
-        """Status 1, and the reason."""
+        """Return a reply with status 1 and the reason."""
         quoted = reason.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
         return f'{{1,{{"{quoted}"}}}}'.encode()
 
     def not_a_number(self, request: bytes) -> bytes:
-        """The value that Lua writes for 0/0."""
+        """Return Lua's text of 0/0."""
         return b"{0,{(0/0)}}"
 
     def _run_on(self, client: Client, thread: object) -> bytes | Unfinished:
@@ -90,7 +88,10 @@ class NanosurfEmulator(ScriptedEmulator):
 
 
 class StudioWire:
-    """The socket. See `ScriptWire`."""
+    """Studio's socket: a script and its reply, each after its length in four bytes, least significant first.
+
+    See `ScriptWire`.
+    """
 
     def __init__(self, port: int, on_request: OnRequest, wakes: object, *, one_client: bool) -> None:
         self._on_request = on_request
@@ -115,7 +116,7 @@ class StudioWire:
                 self._server.cut(connection)
 
     def send_half(self, client: Client, reply: bytes) -> None:
-        """Half a reply, after which the connection ends."""
+        """Send half a reply, then end the connection."""
         connection = cast(ClientConnection, client)
         if connection in self._server.connections:
             connection.closing = True
@@ -125,7 +126,7 @@ class StudioWire:
         self._server.close()
 
     def _split(self, connection: ClientConnection) -> None:
-        """Hand on each whole script; a connection that announces too much ends."""
+        # A connection that announces a script of more than 1 MiB ends.
         received = connection.received
         while len(received) >= _LENGTH.size:
             (size,) = _LENGTH.unpack_from(received)

@@ -1,4 +1,4 @@
-"""The files that SmartScan saves: a TIFF for each channel and direction, with the maker's private tags."""
+"""The files that SmartScan saves: a TIFF for each channel and direction, with private tags."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ Picture = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 def images(
     scan: ScanActivity, now_s: float, mode: str, recorded: Collection[str] | None = None
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield the name of each channel with its direction, and its file.
+    """Yield channel and direction, with the file's bytes.
 
     Args:
-        recorded: the channels that are saved; None: all.
+        recorded: the saved channels; None: all.
     """
     for name, (unit, values) in scan.channels(scan.end_s if scan.stopped_s is not None else None).items():
         forward = not name.endswith(RETRACE)
@@ -93,7 +93,7 @@ def _image(
 
 
 def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
-    """The file of a curve: its channels, each there and back."""
+    """Encode the file of a curve: its channels, each forward and backward."""
     there, back = spectrum.both_ways()
     told = np.zeros((), CURVES)
     columns = []
@@ -113,9 +113,8 @@ def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
 
 
 def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) -> bytes:
-    """A file that the maker's own reader (pspylib) takes: it needs a picture in colours, in strips, of which one
-    would be told in a way that it does not know.
-    """
+    # The maker's own reader (pspylib) needs a picture with a palette, in several strips: it does not parse the tags of
+    # a single strip.
     from PIL import Image, TiffImagePlugin
 
     tags = TiffImagePlugin.ImageFileDirectory_v2()
@@ -138,7 +137,7 @@ def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) 
 
 
 def _shown(values: Array) -> Picture:
-    """The picture that other programs see: 255 is highest, and the top row has the largest y; of a line, twice."""
+    # For other programs: 255 is highest, and the top row has the largest y. A single line is doubled.
     low, high = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
     scaled = (values - low) / (high - low) * 255.0 if high > low else np.zeros_like(values)
     picture = np.nan_to_num(scaled[::-1]).astype(np.uint8)
