@@ -1,4 +1,4 @@
-"""Driver of Asylum Research microscopes, over ZeroMQ-XOP in Igor Pro. The README in this folder lists what is known."""
+"""Driver of Asylum Research microscopes, over ZeroMQ-XOP in Igor Pro. See the README in this folder."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _AT_FIRST: Final[dict[str, Value]] = {
 }
 _SPOTS: Final = ("image", "scanner", "none")
 _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
-"""Of a wave of Igor's, with room for the number; it is a file's name, too."""
+"""Base name of waves and files: Igor's limit for wave names, less four digits."""
 
 
 class Asylum(Driver):
@@ -173,11 +173,13 @@ class Asylum(Driver):
         probe_m = self._place.xy_m() if self._spots == "image" else None
         self._activity.begin(SCAN)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
+        # with LastScan 0 Asylum scans the frame again and again
         self._igor().put("LastScan", 1)
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
-        self._igor().put("LastScan", 1)  # also where beginning to scan puts it back
+        self._igor().put("LastScan", 1)  # again, in case the start has reset it
         self._activity.await_begin(SCAN)
-        if probe_m is not None:  # it stays where it is, on another image
+        # spots count from the corner of the new image now: the same position is another spot
+        if probe_m is not None:
             try:
                 self._place.put(probe_m)
             except (XopError, Refused) as error:
@@ -197,11 +199,13 @@ class Asylum(Driver):
         """Stop the scan. Asylum also withdraws the tip."""
         self._igor().do("DoScanFunc", "StopScan")
         self._activity.stopped()
+        # StopScan also stops the feedback and withdraws the tip: a person should know
         self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
         """Take a force curve where the tip was sent; where the tip is if it was never sent."""
+        # ScanStatus and FMapStatus do not show single force curves
         if self._igor().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
@@ -231,6 +235,7 @@ class Asylum(Driver):
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
         """Bring the tip to the sample, like the button Engage."""
+        # the function takes the name of the pressed button
         if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
             raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")
 

@@ -20,7 +20,7 @@ from afspm.translator.state import Kept
 FORCE: Final = "force"
 
 _SAVED_TO: Final = {SCAN: "SaveImage", FORCE: "SaveForce"}
-"""Both a number, of which 2 means that it is saved, and a text, the folder."""
+"""Each name is a number (2: measurements are saved) and, in GS, a text (the folder)."""
 _SAVE: Final = 2.0
 
 
@@ -92,7 +92,7 @@ class AsylumActivity(Activity):
         return as_region(self._kept["image"])
 
     def find_image(self) -> None:
-        """Take the frame in force as that of the open image, unless an earlier run has stored one."""
+        """Take the frame in force for the open image's, unless an earlier run has stored one."""
         self._kept.setdefault("image", as_list(self._frame_in_force()))
 
     def _image_begins(self) -> None:
@@ -105,7 +105,8 @@ class AsylumActivity(Activity):
         """Register the start of a measurement. Of a force curve from the panel, only the file has the position."""
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
-            if "led_away" in self._kept:  # it was sent somewhere
+            # only if the tip was ever sent to a spot: else a force curve stays where it is
+            if "led_away" in self._kept:
                 self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
         self._files.begin_at(what, self._target(what), taken)
@@ -125,6 +126,7 @@ class AsylumActivity(Activity):
             Refused: ACTION_ERROR: the folder does not exist on this computer.
         """
         name = _SAVED_TO[what]
+        # the file is the only result: no function used here returns images or curves
         if self._session.values([name])[name] != _SAVE:
             self._log.warning("Asylum did not save its measurements (%s); saving is on from now on", name)
             self._session.put(name, _SAVE)
@@ -142,7 +144,8 @@ class AsylumActivity(Activity):
         self._session.do("SetBaseName", base)
         self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
         try:
-            self._session.do("ARCheckSuffix")  # as the panel does; it sees folders that can't be seen from here, too
+            # the panel's own check also sees folders that are not reachable from this computer
+            self._session.do("ARCheckSuffix")
         except XopError as error:
             if error.number != MISSING:
                 raise

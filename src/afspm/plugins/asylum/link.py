@@ -30,6 +30,7 @@ class Link:
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._address = address
         self._numbers = itertools.count(1)
+        # a DEALER, since a REQ is unusable after one lost reply; without an identity, as the XOP refuses duplicates
         self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
 
     def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
@@ -51,7 +52,7 @@ class Link:
 
         def parse(payload: bytes) -> xop.Reply | None:
             found = xop.reply(payload)
-            # an error found before Igor is asked comes without the id, and can only be that of what is in flight
+            # errors 3 to 7, found before Igor is asked, have no id: they belong to the only request in flight
             is_ours = found.message_id == message_id or (found.message_id is None and found.error is not None)
             return found if is_ours else None
 

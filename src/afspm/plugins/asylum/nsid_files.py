@@ -64,7 +64,7 @@ def _axis_m(axis: h5py.Dataset, unit: str) -> NDArray[np.float64]:
 def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
     channel = hdf5.text(image.attrs["quantity"])
     values = hdf5.array(image).T
-    # what wrote Asylum's gave the axes the unit of their channel; they are in m
+    # the writer of Asylum's files gave axes the unit of their channel, but they are in m
     x, y = (_axis_m(image.parent[axis], "m" if note else "") for axis in "xy")
     if values.shape != (len(y), len(x)) or not ((np.diff(x) > 0).all() and (np.diff(y) > 0).all()):
         raise FileError(f"the axes of {channel} do not fit an image of {values.shape[1]} x {values.shape[0]} pixels")
@@ -72,6 +72,6 @@ def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path
     if note:
         center_m, angle_rad = asylum.center_and_angle(note)
     region = Region(center_m, (x[-1] - x[0], y[-1] - y[0]), angle_rad)
-    # what wrote these files gave "m" to channels that it did not know
+    # the writer gave "m" to channels that it did not know
     unit = (asylum.unit_of(channel) if note else "") or hdf5.text(image.attrs.get("units", ""))
     return Scan(region, channel, unit, np.ascontiguousarray(values), end_ns, str(path))

@@ -41,7 +41,7 @@ class AsylumFiles(FolderFiles):
     """The measurement that is running or has just ended, and the results."""
 
     precision = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
-    """A note prints five digits of a number."""
+    """A note has five digits of a number."""
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
         super().__init__(kept, log)
@@ -60,8 +60,12 @@ class AsylumFiles(FolderFiles):
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
         """Log a warning if the scanned frame differs from the one set; the file is right then."""
         if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
-            told = f"{path.name} holds a frame of {one.region} instead of {wanted}, which was set"
-            self._log.warning("%s; the scan is published as the file has it", told)
+            self._log.warning(
+                "%s has the frame %s instead of %s, which was set; it is published with the file's frame",
+                path.name,
+                one.region,
+                wanted,
+            )
 
     def _goes_on(self, running: Entry) -> None:
         running["suffix"] += 1
@@ -100,7 +104,7 @@ def local(igor_path: str, folders: Mapping[str, str]) -> Path:
     if fitting:
         start, here = max(fitting, key=lambda one: len(_parts(one[0])))
         return Path(here, *parts[len(_parts(start)) :])
-    if igor_path.startswith(":"):  # a computer without drives
+    if igor_path.startswith(":"):  # an emulator on a system without drive letters
         return Path("/", *parts)
     if sys.platform != "win32" or len(parts[0]) != 1:
         hint = f'folders = {{ "{igor_path}" = "/where/it/is/mounted" }}'

@@ -2,7 +2,7 @@
 
 From real files: XOffset and YOffset are the centre of the scan; images are [x, y, channel] with both axes ascending for
 either scan direction, FastScanSize from first to last pixel; `Seconds` is the local time of saving, since 1904; the
-unit of a wave is that of its first channel only.
+unit of a wave applies to its first channel only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Note = PlainMapping
 
 CONTROLLER = "Asylum"
 _IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controller)
-# Of channels by what their names begin with, without the "Nap" of a second pass.
+# By the beginning of a channel's name, without the "Nap" of a second pass: a wave has one unit for all its channels.
 _UNITS = {
     "Height": "m", "ZSensor": "m", "RawZSensor": "m", "Amplitude": "m", "Deflection": "m", "Phase": "deg",
     "Frequency": "Hz", "Current": "A", "UserIn": "V", "BackPackIn": "V", "Lateral": "V", "Potential": "V",

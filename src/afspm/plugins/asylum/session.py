@@ -15,9 +15,10 @@ from afspm.translator.parameters import Value
 
 SCAN_STATUS, MAP_STATUS = "ScanStatus", "FMapStatus"
 
+# Bits of ARGetStatus: only the published afspm documents them, so a second source decides, too (see `Doing.state`).
 _SCANNING, _ENGAGED, _FORCE, _MOTOR = 0x1, 0x2, 0xF0, 0x100000
 _LONGEST_LIST: Final = 800
-"""Characters: a longer one would not fit into a request."""
+"""Characters of names in one request, which has at most 1024 bytes."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ class Session:
                 raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         return found
 
+    # PV checks no range, and updates none of the values that the panel derives.
     def put(self, name: str, value: Value) -> None:
         if isinstance(value, str):
             self.ask("PS", name, value)
@@ -132,11 +134,11 @@ class Session:
         return self._bits(), [self.number("GV", name) for name in names]
 
     def _several(self, names: Sequence[str]) -> list[float]:
-        told = self.text("AfspmLook", "".join(f"{name};" for name in names))
+        reply = self.text("AfspmLook", "".join(f"{name};" for name in names))
         try:
-            found = [float(word) for word in told.removesuffix(";").split(";")]
+            found = [float(word) for word in reply.removesuffix(";").split(";")]
         except ValueError as error:
-            raise xop.BadReply(f"AfspmLook returned {told!r}") from error
+            raise xop.BadReply(f"AfspmLook returned {reply!r}") from error
         if len(found) != 1 + len(names):
             raise xop.BadReply(f"AfspmLook returned {len(found) - 1} values instead of {len(names)}")
         return found

@@ -24,7 +24,7 @@ NAMES: Final = frozenset({*FRAME, names.SCAN_SPEED})
 
 _OUR_SPOT: Final = 1.0
 PATH_OF_A_LINE: Final = 2.5
-"""In widths of the frame: there and back, and round the ends (ScanSpeed / (FastScanSize · ScanRate) in all notes)."""
+"""Path of the tip in a line, in widths of the frame: ScanSpeed / (FastScanSize · ScanRate) in all real notes."""
 
 
 def generic(found: Mapping[str, float]) -> dict[str, Value]:
@@ -145,7 +145,7 @@ class TipPlace(SettingsGroup):
 
     def go(self) -> None:
         """Move the tip to the spot. Raises Refused."""
-        self._igor().put("ForceSpotNumber", _OUR_SPOT)  # whatever is chosen at the panel
+        self._igor().put("ForceSpotNumber", _OUR_SPOT)  # a person may have chosen another spot at the panel
         if not self._igor().do("DoForceFunc", "Go"):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused to move the tip")
         self._on_move()

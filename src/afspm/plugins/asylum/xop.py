@@ -16,10 +16,10 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.translator.driver_base import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
-"""Bytes: what is longer makes the XOP drop the connection without a word."""
+"""Bytes. At a longer request the XOP drops the connection without a reply."""
 
 MISSING: Final = 101
-"""The error of a function that Igor does not have."""
+"""Error number for a function that Igor does not have."""
 
 _MEANINGS: Final = {
     1: "an error without a name",
@@ -68,7 +68,7 @@ class BadReply(ControllerLost):
 
 
 Result = float | str | None
-"""None: a wave, which no function that is asked for here returns."""
+"""None: a wave, which no function used here returns."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +96,7 @@ def request(name: str, parameters: Sequence[Parameter], message_id: str) -> byte
         if isinstance(value, float) and not math.isfinite(value):
             raise InvalidValue(f"{name} can't be called with {value}")
     call = {"name": name, "params": list(parameters)} if parameters else {"name": name}
+    # the XOP accepts the integer 1 only; its own readme has "v1" by mistake
     content = {"version": 1, "messageID": message_id, "CallFunction": call}
     try:
         message = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()
@@ -126,8 +127,8 @@ def _reply(content: PlainMapping) -> Reply:
         raise ValueError("errorCode or messageID has the wrong type")
     if number:
         history = str(content.get("history") or "").strip()
-        told = str(content["errorCode"].get("msg", ""))
-        return Reply(message_id, (number, f"{told} {history}".strip()))
+        message = str(content["errorCode"].get("msg", ""))
+        return Reply(message_id, (number, f"{message} {history}".strip()))
     found = content.get("result", [])
     results = [_value(one) for one in (found if isinstance(found, list) else [found])]
     return Reply(message_id, None, tuple(results))

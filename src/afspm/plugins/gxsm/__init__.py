@@ -120,6 +120,7 @@ class Gxsm(Driver):
         address = Address.parse(self.controller_at)
         ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
         self.prove()
+        # the only way to know: neither `set`, `get` nor `action` reports an unknown name
         refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
         missing = [ref for ref in REFNAMES if ref not in refnames]
         if missing:
@@ -242,7 +243,7 @@ class Gxsm(Driver):
             return ()
         done = self._activity.lines_done()
         found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)
-        # of a scan that is stopped meanwhile GXSM says that it is at its last line
+        # a stopped scan reports its last line, as if all were complete
         return found if self._activity.gxsm.doing().measuring else ()
 
     # --- actions ---
@@ -250,7 +251,8 @@ class Gxsm(Driver):
     @action(names.START_SCAN)
     def start_scan(self) -> None:
         """Scan the frame once, with the channels and direction set on GXSM's panel."""
-        if REPEAT_OFF in self._offered.actions:  # it would never end
+        # a repeated scan never ends
+        if REPEAT_OFF in self._offered.actions:
             self._ask.call("action", REPEAT_OFF)
         self._activity.start_scan()
 

@@ -21,9 +21,9 @@ from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
-"""So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
+"""GXSM's own work after the end of a scan; a file saved earlier has no end time."""
 SHOWS_S: Final = 1.0
-"""So long what was begun may take to be seen running; 0.3 s were measured."""
+"""Longest delay until a started measurement shows in the status bits; measured: up to 0.3 s."""
 _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
 
@@ -57,7 +57,8 @@ class LineWatch:
 
     def turned(self, line: int, rows: int) -> bool:
         """Register a line; return True if it reverses the direction."""
-        if line == self.line or not 0 <= line < rows:  # at the start of a scan Gxsm4 once reported line -296
+        # Gxsm4's simulator reports line -296 at the start of its first scan
+        if line == self.line or not 0 <= line < rows:
             return False
         step = 1 if line > self.line else -1
         self.line, turned = line, self.step not in (0, step)
@@ -160,21 +161,23 @@ class GxsmActivity(Activity):
         self._saving = saving
         self._autosave = AutosaveSwitch(gxsm.ask, is_used=saving.switches_autosave)
         self._way = TipWay(kept, clock)
-        self._looked_ns = 0  # at the last look
+        self._looked_ns = 0  # time of the last poll
         self._shows_until_s = 0.0
         self._scan = ScanProgress()
         self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
 
-    # --- what is begun ---
+    # --- start and stop ---
 
     def start_scan(self) -> None:
-        self._autosave.on = None  # a person may have switched it at the panel
+        self._autosave.on = None  # unknown: a person may have switched it at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
         self._scan.y_before = int(self.gxsm.ask.number("y_current"))
         rows, columns = self._set_frame()[1]
+        # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
         self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
+        # returns 0 at once, even if no scan starts (no channel set, or one running)
         self.gxsm.ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
@@ -235,7 +238,7 @@ class GxsmActivity(Activity):
     def status(self) -> ScopeStatus:
         """Return the present state; register measurements that have ended, whose files are then awaited."""
         doing, now_s = self.gxsm.doing(), self._clock.now_s()
-        # a RedPitaya does not tell measuring from a program of its own that may lead the tip
+        # RPSPMC has one bit for scans, spectra and its own vector programs, which also move the tip
         led = self.gxsm.hardware is Hardware.RPSPMC and self._way.is_on
         if self.curve_awaited and doing.measuring and not led:
             return self._forestalled()
@@ -247,7 +250,7 @@ class GxsmActivity(Activity):
             return self._measuring(doing)
         self._looked_ns = self._clock.now_ns()
         moving = doing.moving or self._way.is_on
-        # a stopped spectrum may still be at the tip's way to it
+        # the stopped spectrum may not have started yet: the tip is still moving to its place
         if self._stopping and (moving or (self._autosave.on is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
@@ -267,7 +270,7 @@ class GxsmActivity(Activity):
         if self._files.what == SCAN and doing.scanning and self._is_another():
             self._follow()
         self._shows_until_s = self._scan.settles_until_s = 0.0
-        if not self._files.what and not self._stopping:  # somebody began it at the panel
+        if not self._files.what and not self._stopping:  # started at the panel
             self.begin(SCAN if doing.scanning else "VP")
         if self._files.what == SCAN and self._files.before is None:
             self._look_at_memory()
@@ -280,9 +283,9 @@ class GxsmActivity(Activity):
         # it: a new number in the file names, and lines that start from the beginning.
         before, name = self._scan.name, self.gxsm.ask.text("chfname", 0)
         self._scan.name = name
-        # once GXSM has saved, it reports another number in place of one that was taken
+        # after saving, GXSM reports the next free number if the first one was taken: no sign of another scan
         is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
-        if self._files.is_own:  # Repeat was switched off for it
+        if self._files.is_own:  # Repeat is off: no scan follows by itself
             return is_another
         line, watch = int(self.gxsm.ask.number("y_current")), self._scan.watch
         if watch is None:
@@ -305,8 +308,7 @@ class GxsmActivity(Activity):
         self._seen_last = (0, 0), None
 
     def _look_at_memory(self) -> None:
-        # Not near the last row: GXSM may have scanned it already, and its content would then not be that of the
-        # previous scan.
+        # Not near the last row: GXSM may have scanned it already, and overwritten the previous scan there.
         rows, columns = self._files.scanning[1]
         found = looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns)
         line = int(self.gxsm.ask.number("y_current"))
@@ -351,7 +353,7 @@ class GxsmActivity(Activity):
             return
         self._begin_scan(self._looked_ns, own=False)
         self._autosave.switch(on=True)
-        self._is_another()  # the first look, which later ones are compared with
+        self._is_another()  # the first observation, for comparison with later ones
 
     def _begin_scan(self, begun_ns: int, *, own: bool) -> None:
         self._stopping, self._scan = False, ScanProgress()
@@ -377,17 +379,18 @@ class GxsmActivity(Activity):
         is_whole = self._is_whole()
         if is_whole and not self._files.is_saved_by_gxsm:
             try:
+                # its return value is the line, not a path; calling it twice would save the scan twice
                 self.gxsm.ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
-        # only now: before, GXSM may still tell of the folder of the scan before
+        # not earlier: up to 40 ms after a start GXSM still reports the paths of the previous scan
         channels, folder = self._channels(), self._folder()
         self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool | None:
         # None: the scan followed another one at once, and was seen too late to know the rows of the previous scan.
         before, (_, shape) = self._before(), self._files.scanning
-        if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
+        if before is None and self._seen_last[0] == shape:  # a short scan from the panel
             before = self._seen_last[1]
         columns = shape[1] if before is None else before["columns"]
         after = looked_at(self.gxsm.ask, len(self._channels()), (0, shape[0] - 1), columns)
@@ -406,6 +409,7 @@ class GxsmActivity(Activity):
     def _channels(self, most: int = _CHANNELS) -> list[str]:
         found: list[str] = []
         for channel in range(most):
+            # GXSM has no list of channels: the first number without one is answered with "EE: invalid channel"
             path = self.gxsm.ask.text("chfname", channel)
             if path.startswith(_NO_CHANNEL):
                 break

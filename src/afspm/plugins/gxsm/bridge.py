@@ -19,22 +19,23 @@ import socket
 import time
 from pathlib import Path
 
-HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if it is in use: another number here and in `address`
+HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if in use: choose another number here and in `address`
 SECRET = "~/.afspm/gxsm-bridge-secret"
 FOLDER = globals().get("FOLDER", str(Path.cwd()))
 WELCOME = "afspm bridge 2"
+# waitscan is missing on purpose: it blocks, and wedges Gxsm4 until it is restarted.
 METHODS = {
     *("set", "get", "gets", "list_refnames", "list_actions", "action", "rtquery", "y_current"),
     *("startscan", "stopscan", "autosave", "chfname", "moveto_scan_xy"),
     *("get_geometry", "get_dimensions", "get_differentials", "get_slice", "get_probe_event"),
 }
 LONGEST, LONGEST_PROOF = 10_000, 200  # bytes of a line
-LOOK_S, WAIT_S = 0.5, 0.1  # between two looks at script-control, and at what clients owe
-PROVES_S = 2.0  # since it connected, however much a client sends meanwhile
-TAKES_S = 10.0  # for a client to take an answer; and a client that is silent so long makes room for another
+LOOK_S, WAIT_S = 0.5, 0.1  # period of checks of script-control, of clients' deadlines
+PROVES_S = 2.0  # deadline for the proof, also for a client that keeps sending
+TAKES_S = 10.0  # to receive an answer; a client silent for longer may be replaced
 MOST_STRANGERS, MOST_CLIENTS = 64, 8
 NONCE = 64  # hexadecimal digits
-gxsm = globals().get("gxsm")  # the console has it
+gxsm = globals().get("gxsm")  # defined in the console
 
 
 def packed(value):  # type: ignore[no-untyped-def]
@@ -118,9 +119,9 @@ def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
         if method not in METHODS:
             raise NameError(f"{method} is not a method that the bridge passes on")
         value = getattr(gxsm, method)(*arguments)
-        # what `action` returns in Gxsm3 is not initialised: it must not be looked at
+        # Gxsm3 returns uninitialised memory from `action`, which must not be touched
         return json.dumps({"value": None if method == "action" else value}, default=packed)
-    except Exception as error:  # what a call raises is the client's to handle: the bridge goes on
+    except Exception as error:  # any error of GXSM goes to the client, and the bridge serves the others
         return json.dumps({"error": f"{type(error).__name__}: {error}"})
 
 
@@ -232,7 +233,7 @@ class Bridge:
     def _accept(self) -> None:
         try:
             client = Client(self._listener.accept()[0], self._known, time.monotonic())
-        except OSError:  # it has gone before it was served
+        except OSError:  # the client has disconnected before it was accepted
             return
         self._clients.append(client)
         self._selector.register(client.connection, client.events, client)

@@ -113,7 +113,7 @@ def _read(receiver: Receiver) -> dict[str, object]:
     return _reply(b"".join(parts))
 
 
-@lru_cache(256, typed=True)  # the same few are asked again and again, a frame by seven questions
+@lru_cache(256, typed=True)  # few different calls, often repeated: reading the frame takes seven
 def message(method: str, *arguments: str | int | float) -> bytes:
     """Encode the call of a function as a line."""
     return json.dumps([method, *arguments]).encode() + b"\n"

@@ -14,9 +14,9 @@ STATUS: Final = "s"
 ABORT: Final = "DSP_VP_ABORT_EXECUTE"
 APPROACH: Final = "DSP_CMD_AUTOAPP"
 AUTOSAVE: Final = {True: "CHECK-MainAutoSave", False: "UNCHECK-MainAutoSave"}
-"""The actions that switch it on and off."""
+"""Actions that switch Auto Save on and off."""
 REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
-_MODES: Final = {"force": "FZ"}  # other kinds of spectra are called as GXSM calls them
+_MODES: Final = {"force": "FZ"}  # other kinds have GXSM's own names
 _MOST_BITS: Final = 1 << 24
 
 
@@ -81,7 +81,7 @@ def decoded(hardware: Hardware, slots: list[float]) -> Doing:
         raise BadReply(f"GXSM reports its state as {slots}, which is not a set of bits")
     bits = int(value)
     if hardware is Hardware.RPSPMC:
-        running = bool(bits & 2)  # a scan or a spectrum: it does not tell
+        running = bool(bits & 2)  # one bit for scan and spectrum
         return Doing(bool(bits & 1), running, running, bool(bits & 4), moving=False, approaching=False)
     return Doing(
         bool(bits & 1),

@@ -57,7 +57,7 @@ def _scalar(kind: object, content: object) -> object:
 
 
 _ALLOWED: Final[dict[tuple[str, str], object]] = {("numpy", "dtype"): _DType, ("numpy", "ndarray"): _Array}
-for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
+for _core in ("numpy.core", "numpy._core"):  # names before and since numpy 2
     _ALLOWED[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
     _ALLOWED[f"{_core}.multiarray", "scalar"] = _scalar
     _ALLOWED[f"{_core}.numeric", "_frombuffer"] = _from_buffer
@@ -82,7 +82,7 @@ def loads(content: bytes) -> object:
         raise
     except RecursionError:
         raise BadReply("GXSM's reply is nested too deeply") from None
-    except Exception as error:  # whatever the bytes make of the unpickler
+    except Exception as error:  # damaged bytes make the unpickler raise almost any error
         raise BadReply(f"GXSM's reply is not a pickle of a value: {type(error).__name__}: {error}") from error
 
 

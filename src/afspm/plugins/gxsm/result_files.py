@@ -28,11 +28,11 @@ from afspm.translator.result_files import (
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
-"""Files tell the second in which a scan began."""
+"""Resolution of start times in files, with a margin: they have whole seconds."""
 LATE_S: Final = 20.0
-"""One scan may begin so much later after it was asked for than another."""
+"""Longest difference of start delays between two scans."""
 SOON_S: Final = 1.0
-"""After so long a channel that did not come before will not come; 0.3 s were measured."""
+"""Longest wait for a channel that the previous scan did not save; measured: up to 0.3 s."""
 
 
 class GxsmFiles(ResultFiles):
@@ -60,13 +60,13 @@ class GxsmFiles(ResultFiles):
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
-        self._outcome: bool | None = None  # of a measurement that another one followed at once
+        self._outcome: bool | None = None  # of a measurement directly followed by another one
         self.upwards = False
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
         kept.setdefault("program", "")
-        kept.setdefault("starts", [])  # of the last scan's files
-        kept.setdefault("behind_ns", 0)  # how much their clock was
+        kept.setdefault("starts", [])  # start times in the last scan's files
+        kept.setdefault("behind_ns", 0)  # lag of the clock in the files
 
     @property
     def scanning(self) -> tuple[Region, tuple[int, int]]:
@@ -130,7 +130,7 @@ class GxsmFiles(ResultFiles):
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
         self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
         if followed is not None:
-            # GXSM saves a scan before it begins the next: all that is there now is of the one that has ended
+            # GXSM saves a scan before it starts the next: all present files belong to the ended one
             there = _files(_folder(followed), followed["what"])
             names = [str(file) for file in there if modified_ns(file) > followed["newest_ns"]]
             self._kept["ended"] = {**followed, "names": sorted(names)}
@@ -159,7 +159,7 @@ class GxsmFiles(ResultFiles):
         awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
         self._ends({"end_ns": end_ns, **awaited, "channels": order, "before": before, "is_whole": is_whole})
         ended = self._kept["ended"]
-        if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
+        if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
             ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before = {}, {}, set()
@@ -168,7 +168,7 @@ class GxsmFiles(ResultFiles):
 
     def _hurry(self, now_s: float) -> None:
         # The next measurement overwrites GXSM's memory and may overwrite files: read them now, or never.
-        for _ in range(2):  # they are read when they have not grown since the last look
+        for _ in range(2):  # a file is read once it has not grown between two looks
             if self._is_followed:
                 self.results(now_s)
         if self._is_followed:
@@ -248,11 +248,11 @@ class GxsmFiles(ResultFiles):
                 try:
                     self._whole[file] = read_result(file)
                 except (AfspmError, OSError):
-                    continue  # not yet
+                    continue  # incomplete: GXSM is still writing it
             content = self._whole.get(file)
             if content is not None and not self._is_of_before(content, ended["begun_ns"]):
                 found[file] = content
-        if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
+        if ended["what"] == SCAN:  # one for each channel: a person may save it again
             return {file: found[file] for file in endings(found).values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
@@ -327,7 +327,7 @@ class GxsmFiles(ResultFiles):
                 self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
         names = [str(file) for file in files]
-        # numbered by its end: files of spectra may be overwritten
+        # the end time makes the name unique: SRanger overwrites files of spectra
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
         self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
         self._kept["ended"] = None

@@ -26,7 +26,7 @@ class Rows(TypedDict):
 
     Attributes:
         columns: number of compared columns.
-        digests: digest by channel and row; that of a constant row, which proves nothing, starts with `_CONSTANT`.
+        digests: digest by channel and row. The digest of a constant row, which proves nothing, starts with `_CONSTANT`.
     """
 
     columns: int
@@ -112,7 +112,7 @@ def _is_shape(found: Any) -> bool:
     is_shape = (
         isinstance(found, tuple | list) and len(found) == 4 and all(isinstance(one, int | float) for one in found)
     )
-    return is_shape and 0 < found[0] < _MOST  # where there is no scan, GXSM says 4294967295
+    return is_shape and 0 < found[0] < _MOST  # without a scan GXSM reports 4294967295
 
 
 def _factor(ask: Asking, channel: int) -> float:
@@ -145,7 +145,7 @@ def new_lines(
     for channel, ending in enumerate(endings):
         if ending in known:
             found = ask.call("get_slice", channel, 0, 0, start, count)
-            # of another shape: somebody has changed the next frame, and this one was found running
+            # another shape: a person has changed the next frame, after this scan was found running
             if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
                 images[ending] = found.astype(np.float64)
     lines = []

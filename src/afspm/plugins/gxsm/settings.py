@@ -1,7 +1,7 @@
 """Scan frame and tip position: GXSM has the centre, a clockwise angle, and lengths in the unit of its panel.
 
 `get` and `set` use the unit that the user prefers; `moveto_scan_xy` and files are always in ångström. A range goes from
-the centre of the first pixel to that of the last, as in afspm.
+the centre of the first pixel to the centre of the last, as in afspm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from afspm.translator.state import Kept
 
 ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
-_ROUNDED: Final = 0.06  # what a panel's digits may leave out
+_ROUNDED: Final = 0.06  # rounding of the panel's digits
 REFNAMES: Final = ("PointsX", "PointsY", "RangeX", "RangeY", "OffsetX", "OffsetY", "Rotation")
 _SIZE: Final = {names.SCAN_SIZE_X, names.SCAN_SIZE_Y}
 PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}

@@ -62,7 +62,7 @@ class SharedMemoryLink:
         self._timeout_s = timeout_s
         self._monotonic_s = monotonic_s
         self._where = f"shm:{block}"
-        # what waits for the memory to change has nothing to be woken by but the end
+        # waits in polls of the memory: nothing but `close` could wake them
         self._closed = Event()
         path = _FOLDER / block
         try:
@@ -75,7 +75,7 @@ class SharedMemoryLink:
                 self.close()
             raise
         self._memory = self._mapped(path)
-        # traced as if the bridge had passed the calls on: it is one form for both, and can be played back anywhere
+        # traced in the form of the bridge's calls: one form for both, which can be replayed on any system
         self._trace = TRACE.connection(TCP)
 
     def _mapped(self, path: Path) -> mmap.mmap:
@@ -116,7 +116,9 @@ class SharedMemoryLink:
     def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> object:
         until_s = self._monotonic_s() + self._timeout_s
         self._see_alive()
-        if self._status() == _REQUEST:  # of somebody who has given up waiting: its answer would be taken for ours
+        if (
+            self._status() == _REQUEST
+        ):  # of a caller that has given up waiting: its answer would be taken for the next one's
             before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
             self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
         content = pickle.dumps(arguments, 4)
@@ -139,7 +141,7 @@ class SharedMemoryLink:
         status = self._status()
         if status in _FAILURES:
             raise GxsmError(_FAILURES[status], where=method)
-        length = struct.unpack_from("<I", self._memory, _LENGTH)[0]  # GXSM itself takes 32 bits of it
+        length = struct.unpack_from("<I", self._memory, _LENGTH)[0]  # a uint64, but GXSM itself reads 32 bits
         if status != 0 or length > _BYTES - _CONTENT:
             raise BadReply(f"GXSM replied {length} bytes, with the status {status}, to {method}", where=self._where)
         return pickles.loads(self._memory[_CONTENT : _CONTENT + length])

@@ -12,7 +12,7 @@ from afspm.simulation.simulator import Simulator
 
 __all__ = ["ImageMicroscope"]
 
-# An instrument that shows the picture as it is; whoever wants noise, drift or a blunt tip says so.
+# An ideal instrument shows the picture as it is; settings add noise, drift or a blunt tip.
 _IDEAL: Mapping[str, PlainMapping] = {
     "tip": {"radius_m": 1e-12, "half_angle_deg": 1.0, "spread": 0.0},
     "noise": dict.fromkeys(

@@ -30,7 +30,7 @@ _AT_FIRST: Final[dict[str, Value]] = {
     names.CRASH_DEPTH: 1e-9,
 }
 _AT_ONCE: Final = 0
-"""To what could also wait until it is done."""
+"""Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
 
 
@@ -38,8 +38,8 @@ class Nanonis(Driver):
     """The microscope behind a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings > TCP, each of which serves one client. One is
-            enough for an emulator.
+        address: "host:port,port": two of the ports at File > Settings > TCP; each serves one client. One is enough for
+            an emulator.
         session_dir: local path of Nanonis' session folder. Default: Nanonis runs on this computer. Data in unreachable
             files is fetched over TCP.
         release: release of Nanonis' software (Help > Info), if it reports none or a wrong one.
@@ -170,7 +170,7 @@ class Nanonis(Driver):
         except protocol.NanonisError:
             self._activity.forget()
             raise
-        if self._ask("Scan.StatusGet")[0]:  # it may be over before it is looked at again
+        if self._ask("Scan.StatusGet")[0]:  # it may be over before the next poll
             self._files.seen()
 
     @action(names.STOP_SCAN)
@@ -205,6 +205,7 @@ class Nanonis(Driver):
         depth_m = self._kept.number(names.CRASH_DEPTH)
         ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
         bias_v = own.numbers(self._ask, "Bias.Get")[0]
+        # one dip at the present bias: the tip shaper's second lift undoes the first
         same_bias, settle_s, restore = 2, 0.1, 1
         before = (settle_s, same_bias, bias_v)
         self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
@@ -214,6 +215,7 @@ class Nanonis(Driver):
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
         """Withdraw the tip by its piezo, even if the running measurement can't be stopped."""
+        # the approach first: going on, it would bring the withdrawn tip back
         for stop in (self._activity.stop_approach, self._activity.stop_measuring):
             try:
                 stop()

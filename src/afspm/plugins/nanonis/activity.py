@@ -21,9 +21,9 @@ from afspm.translator.setting_groups import frame
 from afspm.translator.state import Kept
 
 _SHOWS_S: Final = 10.0
-"""Real time that a scan may take to be seen running, which may have to go to its first line."""
+"""Real time until a started scan shows as running: the tip may first have to move to its first line."""
 _LATEST_S: Final = 10.0
-"""Experiment time that the tip may arrive later than it should."""
+"""Experiment time after the expected arrival of the tip at which it counts as failed."""
 _SAFE_TIP, _WITHDRAWING = 5, 6
 
 
@@ -62,7 +62,7 @@ class NanonisActivity(Activity):
         self._was_safe = False
         self._shows_until_s = 0.0
 
-    # --- what is begun ---
+    # --- start and stop ---
 
     def begin_scan(self, region: Region) -> None:
         """Register the start of a scan, or a scan found running."""
@@ -141,6 +141,7 @@ class NanonisActivity(Activity):
         Nanonis does not report the end of such an action. The occupation persists if the answer, the connection or this
         process is lost.
         """
+        # kept before the action starts: it may go on although the answer, or this process, is lost
         self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
         try:
             yield
@@ -159,7 +160,7 @@ class NanonisActivity(Activity):
         times = (self._occupied[1], self._probe.arrives_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
-    # --- what goes on ---
+    # --- state ---
 
     def status(self) -> ScopeStatus:
         """Return the present state; register measurements that have ended, whose files are then awaited.
@@ -189,14 +190,14 @@ class NanonisActivity(Activity):
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def _scanning(self, path: str | None) -> ScopeStatus:
-        if path:  # it scans again and again
+        if path:  # a continuous scan: one frame has ended, the next one runs
             self.end(path)
         self.follow(SCAN)
         if not self._stopping:
             self._files.seen()
             self._listener.scan()
             if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
-                self.stop_scan()  # it may go on in the air, and look well
+                self.stop_scan()  # the scan may go on in the air, and its picture look plausible
                 self._failed = True
         return ScopeStatus(ScopeState.SCANNING)
 
@@ -224,6 +225,7 @@ class NanonisActivity(Activity):
         return APPROACH in self._opened and bool(self._ask("AutoApproach.OnOffGet")[0])
 
     def _kind_running(self) -> str:
+        # the blocking call on the second connection reports the end of the translator's own spectra
         if self._kind_asked:
             return self._kind_asked
         for kind, module in MODULES.items():

@@ -113,8 +113,8 @@ def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
     else:
         scans = [scan for scan in content if isinstance(scan, Scan)]
         names = [scan.channel for scan in scans]
-        told_apart = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
-        channels = {name: (scan.unit, scan.values) for name, scan in zip(told_apart, scans, strict=True)}
+        unique = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
+        channels = {name: (scan.unit, scan.values) for name, scan in zip(unique, scans, strict=True)}
         encoded = encode_scan(one.region, channels, facts)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, [encoded])

@@ -21,9 +21,9 @@ from afspm.translator.driver_base import ControllerLost
 
 HEADER_BYTES: Final = 40
 NEWEST: Final = 1 << 31
-"""A release that has every field."""
+"""A release with all fields."""
 LARGEST_BODY: Final = 1 << 28
-"""Eight channels of the largest scan are less: what claims to be longer is no reply."""
+"""Bytes; eight channels of the largest scan are less, so a longer body is no reply."""
 
 _HEADER: Final = struct.Struct(">32sihh")
 _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
@@ -190,7 +190,7 @@ class _Reader:
         return text_of(self.take(self.number("i")))
 
     def texts(self) -> list[str]:
-        self.number("i")  # their size in bytes, which peers reckon in different ways
+        self.number("i")  # the size in bytes, which peers calculate differently
         return [self.text() for _ in range(self.count(4))]
 
     def count(self, at_least_bytes: int) -> int:

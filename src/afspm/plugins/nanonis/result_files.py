@@ -22,7 +22,7 @@ from afspm.translator.result_files import (
 )
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
-"""A file prints seven digits of a position, and degrees with three."""
+"""Files have seven digits of a position, and angles to 0.001 degrees."""
 
 Fetch = Callable[[Entry], Content]
 
@@ -126,7 +126,7 @@ class NanonisFiles(ResultFiles):
             if missing := lines_missing(content):
                 raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
         except LOST:
-            self._kept["ended"] = dict(ended)  # once it is found again
+            self._kept["ended"] = dict(ended)  # to fetch after the next connection
             raise
         except AfspmError as error:
             self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", ended["what"], missed, error)
@@ -147,12 +147,12 @@ class NanonisFiles(ResultFiles):
         try:
             content = _content(file, ended)
         except (AfspmError, OSError):
-            return None  # not yet
+            return None  # incomplete: Nanonis is still writing it
         return None if lines_missing(content) else content
 
     def _file(self, ended: Entry) -> Path | None:
         if ended["reported"]:
-            # whatever the other computer calls its folder, the name is the same
+            # the folder has another path on Nanonis' computer, but the file has the same name
             folder = self._session_dir
             path = Path(ended["reported"]) if folder is None else folder / PureWindowsPath(ended["reported"]).name
             return newest([path] if path.is_file() else [], ended["newest_ns"])[1]

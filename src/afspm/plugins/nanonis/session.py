@@ -20,7 +20,7 @@ from afspm.translator.tcp import Receiver, TcpConnection
 MODULES: Final = {"IV": "BiasSpectr", "force": "ZSpectr"}
 APPROACH: Final = "AutoApproach"
 _WITHOUT_VERSION: Final = 10862
-"""The release to take where the software can't tell its own."""
+"""The release to assume if the software can't report its own: it lacks Util.VersionGet."""
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
 _HINTS: Final = (
@@ -76,7 +76,7 @@ class Session:
 
     Attributes:
         controller: name and version, for people.
-        opened: available modules: Nanonis has those that were bought, and they answer only once open.
+        opened: available modules: Nanonis has the bought ones, which answer only once open.
         listener: user of the second connection.
 
     Raises:
@@ -88,6 +88,7 @@ class Session:
         self._link = Link(addresses[0], timeout_s, driver.clock.monotonic_s)
         self.ask = self._link.ask
         self._listener: Listener | None = None
+        # each port of Nanonis serves one client, one call at a time: a blocking call needs a port of its own
         try:
             driver.prove()
             self.controller = f"Nanonis, release {release}"
@@ -150,7 +151,7 @@ class CurveEnded:
 
 
 ListenerEvent = ScanEnded | CurveEnded | AfspmError
-"""An error: what was waited for can't be waited for."""
+"""An error means that the wait failed."""
 
 
 class Listener:
@@ -209,7 +210,7 @@ class Listener:
         except AfspmError as error:
             self._for_scan = False
             return error
-        except Exception as error:  # whatever it says, this connection goes on being listened to, or is made anew
+        except Exception as error:  # a malformed reply can raise any error: the thread must report it, not die
             self._for_scan = False
             return BadReply(f"Nanonis sent an unreadable message on a measurement: {error!r}")
 

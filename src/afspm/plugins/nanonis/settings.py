@@ -22,11 +22,11 @@ DRIFT_RATE_X: Final = "x-drift-rate-x"
 DRIFT_RATE_Y: Final = "x-drift-rate-y"
 
 _PIXELS_AT_ONCE: Final = 16
-_DIGITS: Final = 1e-6  # of float32
+_DIGITS: Final = 1e-6  # relative precision of float32, with a margin
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
-"""Made of a centre and a size: the error of each is that of the largest."""
+"""Parameters calculated from centre and size: their absolute error is the largest one's."""
 _ON, _OFF = 1, 2
-"""In what is set; in what is got they are 1 and 0."""
+"""In `…Set`; `…Get` returns 1 and 0 instead."""
 
 
 class Group(SettingsGroup):
@@ -67,6 +67,7 @@ class ScanFrame(Group):
 
     def write(self, values: Mapping[str, Value]) -> None:
         region, (rows, columns) = frame(self.merged(values))
+        # Nanonis would round the number of pixels without a word
         if columns % _PIXELS_AT_ONCE:
             below = max(columns // _PIXELS_AT_ONCE, 1) * _PIXELS_AT_ONCE
             raise refuse_value(
@@ -107,7 +108,7 @@ class ScanSpeed(Group):
             raise refuse_value(
                 names.SCAN_SPEED, f"{forward_m_s} m/s forward and {ratio} times that backward are not above 0"
             )
-        keep_speed = 1  # 0 in what SpeedGet replies
+        keep_speed = 1  # SpeedGet returns 0 for it
         times_s = width_m / forward_m_s, width_m / backward_m_s
         self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, keep_speed, ratio)
 
@@ -118,7 +119,7 @@ class Gains(Group):
     names = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
 
     def read(self) -> dict[str, Value]:
-        proportional, _, integral = self._ask("ZCtrl.GainGet")  # T is infinite where there is no I
+        proportional, _, integral = self._ask("ZCtrl.GainGet")  # not `_numbers`: T is infinite without I
         return {names.ZCTRL_PGAIN: proportional, names.ZCTRL_IGAIN: integral}
 
     def write(self, values: Mapping[str, Value]) -> None:
@@ -210,7 +211,7 @@ class Probe(Group):
 
     names = POSITION
     _finest_part: ClassVar[float] = 2e-6
-    """Of the scanner's range: the least difference that its converters tell."""
+    """Resolution of the converters, as a share of the scanner's range."""
 
     def __init__(self, ask: Ask, now_s: Callable[[], float]) -> None:
         super().__init__(ask)
@@ -274,7 +275,7 @@ TRANSLATED: Final = (
     *(*ScanFrame.names, *ScanSpeed.names, *Gains.names, *MoveSpeed.names, *Slope.names, *DriftRate.names),
     *(*Probe.names, *FeedbackOn.names),
 )
-"""Of all parameters that a group here translates."""
+"""Names of all parameters that a group here translates."""
 
 
 def same_float32(name: str, got: Value, other: Value, among: Mapping[str, Value]) -> bool:
@@ -285,7 +286,7 @@ def same_float32(name: str, got: Value, other: Value, among: Mapping[str, Value]
     """
     if not (isinstance(got, float) and isinstance(other, float)):
         return got == other
-    if name == names.SCAN_ANGLE:  # 350 degrees may come back as -10
+    if name == names.SCAN_ANGLE:  # a controller may return 350 degrees as -10
         return abs(math.remainder(got - other, math.tau)) <= _DIGITS * math.tau
     largest = max(abs(float(among[part])) for part in _ADDED_UP & among.keys()) if name in _ADDED_UP else 0.0
     return math.isclose(got, other, rel_tol=_DIGITS, abs_tol=_DIGITS * largest)

@@ -194,8 +194,8 @@ class Nanosurf(Driver):
             session.put(wanted)
         folder = self._folder()
         if not folder.is_dir():
-            told = f"Studio's gallery {folder} does not exist on this computer"
-            raise ConfigError(told, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
+            problem = f"Studio's gallery {folder} does not exist on this computer"
+            raise ConfigError(problem, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
 
     def _check_table(self, session: Session) -> None:
         rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
@@ -204,7 +204,7 @@ class Nanosurf(Driver):
         expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
         for path, unit in session.units(expected).items():
             if unit not in expected[path]:
-                told = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
+                problem = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
                 name = rows[path].name if path in rows else ""
                 hint = f'[microscope.parameters.{name}] unit = "{unit}", with a range' if name else "report it"
-                raise ConfigError(told, where=name or path, hint=hint)
+                raise ConfigError(problem, where=name or path, hint=hint)

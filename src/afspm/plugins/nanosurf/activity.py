@@ -64,7 +64,9 @@ class StudioActivity(Activity):
         curve = call is not None and call.what == FORCE
         if self._stopping and curve:
             with suppress(Refused):
-                self._session.do(commands.STOP_CURVE)  # the first may have overtaken the start: see `Session.begin`
+                self._session.do(
+                    commands.STOP_CURVE
+                )  # again: the first stop may have overtaken the start, on another connection
         self.follow(SCAN if scanning else FORCE if curve else "")
         if scanning:
             return ScopeStatus(ScopeState.SCANNING)

@@ -11,7 +11,7 @@ from afspm.basics.errors import ConfigError
 
 FIRST_RELEASE: Final = 17
 _WITHOUT_OLD: Final = 19
-"""Release from which the commands of before 17 are gone."""
+"""First release without the commands from before 17."""
 
 WORKFLOW: Final = "root.workflow"
 START, STOP = "imaging.start", "imaging.stop"
@@ -21,7 +21,7 @@ APPROACH, WITHDRAW = "approach.approach", "approach.withdraw"
 TAKE_CURVE, STOP_CURVE = "spectroscopy.acquire", "spectroscopy.stop"
 MOVE: Final = "scanner.move_to_target_offsets"
 GRID: Final = tuple(f"spectroscopy.grid_{name}" for name in ("center_offset_x", "center_offset_y", "columns", "rows"))
-"""Of the curves that are taken: where its centre is, and how many there are."""
+"""Values of the grid of curves: centre, columns and rows."""
 
 _ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE, *GRID)
 _SIGNALS: Final = (f"{STARTED}.connect", f"{STARTED}.empty", f"{FINISHED}.connect")
@@ -37,7 +37,7 @@ if not afspm_seen then
 end
 return {WORKFLOW}.{STARTED}.empty()
 """
-"""Has Studio note when scans begin and end; it returns whether it has not taken notice."""
+"""Connects handlers that count scans; returns true if Studio has not connected them."""
 
 MISSING: Final = """
 local missing = {}
@@ -48,7 +48,7 @@ for _, path in ipairs({%s}) do
 end
 return missing
 """
-"""Returns those of a list of paths that the tree does not have."""
+"""Returns the paths of a list that the tree lacks."""
 
 
 UNITS: Final = """
@@ -76,7 +76,7 @@ if not fine then
 end
 return 0
 """
-"""Sets values; if Studio refuses one, puts back those that were set."""
+"""Sets values; if Studio refuses one, restores the ones set before."""
 
 BUFFER_LEVEL: Final = 2
 """The level of a session from which on the low-level buffers are there."""
@@ -98,7 +98,7 @@ STOP_ALL: Final = f"""
 local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
 pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
 """
-"""Stops what is going on, as far as that can be stopped."""
+"""Stops everything that can be stopped."""
 
 
 def has_old_commands(release: int) -> bool:

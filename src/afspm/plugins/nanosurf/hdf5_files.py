@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
 CONTROLLER: Final = "Nanosurf Studio"
 _TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 5: "int16", 6: "int64", 7: "double"}
-"""Of format 1, which numbers the types that format 2 names."""
+"""Types by number, in format 1; format 2 names them."""
 _SPECTROSCOPY: Final = ("spectroscopy", "spectroscopy_grid")
 _MEASUREMENTS: Final = (*_SPECTROSCOPY, "image_line_based", "wavemode_nma")
-"""Kinds of groups; a file of format 2 has others, such as one of calibrations."""
+"""Kinds of groups with measurements; format 2 has others, such as calibrations."""
 
 Array = NDArray[np.float64]
 
@@ -113,8 +113,8 @@ def _block_sizes(segment: h5py.Group, dataset: h5py.Dataset) -> NDArray[np.int64
     source = dataset.attrs.get("dataset_block_size_source")
     for other in segment.values():
         named = hdf5.text(other.attrs.get("name", "")) == "number_of_datapoints_acquired"
-        told = source is not None and other.attrs.get("dataset_block_size_id") == source
-        if named or told:
+        referenced = source is not None and other.attrs.get("dataset_block_size_id") == source
+        if named or referenced:
             return hdf5.array(other).astype(np.int64).ravel()
     return np.array([dataset.size])
 
@@ -149,7 +149,7 @@ def _values(dataset: h5py.Dataset) -> Array:
     low, high = (float(attributes[f"{prefix}_calibration_{end}"]) for end in ("min", "max"))
     limits = np.iinfo(kind)
     smallest, largest = float(limits.min), float(limits.max)
-    if prefix == "signal":  # format 2 keeps one number back
+    if prefix == "signal":  # format 2 reserves one number for missing values
         missing = raw == float(dataset.fillvalue)
         smallest, largest = (smallest + 1.0, largest) if limits.min else (smallest, largest - 1.0)
         raw = np.where(missing, np.nan, raw)

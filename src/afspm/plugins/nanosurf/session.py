@@ -20,7 +20,7 @@ from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
-"""Paths whose value is a number that stands for a choice."""
+"""Paths of choices, whose value is a number."""
 _LARGEST_BUFFERED: Final = 2**31 - 1
 
 
@@ -59,7 +59,7 @@ class Session:
             self._name = self._checked_name(name)
             self._select(self._link)
             self._check()
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             self._link.close()
             raise
 
@@ -81,7 +81,7 @@ class Session:
             ControllerLost: a value is missing or not finite, so that the reply can't be trusted.
         """
         script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
-        found = dict(zip(paths, self._told(script), strict=False))
+        found = dict(zip(paths, self._returned(script), strict=False))
         for path in paths:
             value = found.get(path)
             if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and not isfinite(value)):
@@ -101,8 +101,8 @@ class Session:
     def units(self, paths: Iterable[str]) -> dict[str, str]:
         """Return Studio's units of values by path; empty: none."""
         paths = list(paths)
-        told = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
-        return {path: str(told.get(number, "")) for number, path in enumerate(paths, 1)}
+        found = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
+        return {path: str(found.get(number, "")) for number, path in enumerate(paths, 1)}
 
     def missing(self, paths: Iterable[str]) -> list[str]:
         """Return the paths that Studio lacks."""
@@ -111,10 +111,10 @@ class Session:
     def scanning(self) -> Scanning:
         """Return whether a scan runs, and how many were started. Raises ControllerLost."""
         script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
-        told = self._told(script)
-        if len(told) != 2 or not isinstance(told[0], bool) or not isinstance(told[1], int):
-            raise ControllerLost(f"Studio replied {told} to whether it scans")
-        return Scanning(*told)
+        found = self._returned(script)
+        if len(found) != 2 or not isinstance(found[0], bool) or not isinstance(found[1], int):
+            raise ControllerLost(f"Studio replied {found} when asked if it scans")
+        return Scanning(*found)
 
     def begin(self, what: str, command: str, first: str = "") -> LongCall:
         """Start a long command on a connection of its own, after the script `first`. Raises ControllerLost."""
@@ -122,7 +122,7 @@ class Session:
         try:
             self._select(link)
             link.begin(f"{first} return {WORKFLOW}.{command}()")
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
         return LongCall(what, link)
@@ -132,7 +132,7 @@ class Session:
 
     # --- inside ---
 
-    def _told(self, script: str) -> list[Any]:
+    def _returned(self, script: str) -> list[Any]:
         # Any session can run these scripts: an error means that this one was closed or replaced.
         try:
             return self.run(f"return {script}")
@@ -144,12 +144,12 @@ class Session:
         major, full, listed = self._link.run("return root.version.major(), root.version.full(), root.session.list()")
         self.controller = f"Nanosurf Studio {full}"
         if major != self._release:
-            told = f"Studio is of release {major}, not {self._release}"
-            raise ConfigError(told, where="release", hint=f"release = {major}")
+            problem = f"Studio is release {major}, not {self._release}"
+            raise ConfigError(problem, where="release", hint=f"release = {major}")
         found = [str(one) for one in listed.values()] if isinstance(listed, dict) else []
         if name in found or (not name and len(found) == 1):
             return name or found[0]
-        hint = f"open one, or set session to one of {', '.join(found) or 'those that are open'}"
+        hint = f"open one, or set session to one of {', '.join(found) or 'the open ones'}"
         raise ControllerLost(f"Studio has no single measurement session {name}", hint=hint)
 
     def _select(self, link: Link) -> None:
@@ -165,8 +165,8 @@ class Session:
             hint = "name its release (Help > About) in the setting release, and look at the level of its licence"
             raise ConfigError(f"{self.controller} has no {names}", where="release", hint=hint)
         if not self._old and self.run(commands.WATCH)[0]:
-            told = f"{self.controller} does not tell scripts when scans begin and end"
-            raise ConfigError(told, where="release", hint="report it, with the release, to the project of afspm")
+            problem = f"{self.controller} does not report the start and end of scans to scripts"
+            raise ConfigError(problem, where="release", hint="report it, with the release, to the afspm project")
 
 
 def _field(path: str) -> str:
@@ -191,8 +191,8 @@ def new_lines(
     return lines
 
 
-def _buffered_channel(told: dict[int, Any], columns: int) -> tuple[str, str, np.ndarray]:
-    name, unit, span, raw = (told[number] for number in (1, 2, 3, 4))
+def _buffered_channel(found: dict[int, Any], columns: int) -> tuple[str, str, np.ndarray]:
+    name, unit, span, raw = (found[number] for number in (1, 2, 3, 4))
     values = np.array(list(raw.values()), dtype=np.float64) / _LARGEST_BUFFERED * float(span)
     rows = len(values) // columns
     return str(name), str(unit), values[: rows * columns].reshape(rows, columns)

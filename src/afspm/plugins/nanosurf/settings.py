@@ -31,9 +31,9 @@ UNITS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),
     _RATE: ("Hz", "1/s"),
 }
-"""The units that the translation of these values is right for."""
+"""Accepted units of Studio's values: the conversions here are right for these only."""
 SPEED_PATH: Final = 2.0
-"""Widths of the frame that the tip travels in a line."""
+"""Path of the tip in a line, in widths of the frame: forward and backward (!)."""
 
 
 class FrameSettings(SettingsGroup):

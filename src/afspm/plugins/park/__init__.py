@@ -86,14 +86,14 @@ class Park(Driver):
         self.prove()
         self.table = self._whole_table
         if not self._gains.are_reported():
-            self.log.warning("SmartScan does not tell the gains of its feedback: they are not supported")
+            self.log.warning("SmartScan does not report the gains of its feedback: they are not supported")
             self.table = self.table.without(Gains.names)
         for group in (self._kept, self._place):
             group.kept_in(self.memory)
         folder = self._folder()
         if not folder.is_dir():
-            told = f"SmartScan's folder of data {folder} does not exist on this computer"
-            raise ConfigError(told, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
+            problem = f"SmartScan's folder of data {folder} does not exist on this computer"
+            raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
         self._activity = SmartScanActivity(
             session, self._files, self._folder, self._frame_in_force, self.clock, self.log

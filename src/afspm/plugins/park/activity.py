@@ -21,12 +21,12 @@ from afspm.translator.result_files import SCAN, XY, as_list
 
 START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
 CURVES: Final = {"force": "fd", "IV": "iv"}
-"""Kinds of curves, and what SmartScan calls them."""
+"""Kinds of curves, with SmartScan's names."""
 APPROACH: Final = '(spm.approach.start("q+s"), 0)'
 _ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
 _STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
 _ANSWERS_S: Final = 0.5
-"""So long, in real time, an expression may take before it counts as one that takes long: an error has come by then."""
+"""Real time after which an expression counts as a long one; an error arrives earlier."""
 
 
 class SmartScanActivity(Activity):
@@ -58,11 +58,13 @@ class SmartScanActivity(Activity):
     def status(self) -> ScopeStatus:
         """Return the present state; register measurements that have ended, whose files are then awaited."""
         call = self._running_call()
-        curve = call is not None and call.what in CURVES  # it may count as a scan, too (!)
+        curve = call is not None and call.what in CURVES  # scan_query may report a curve as a scan (!)
         scanning = not curve and self._session.scanning()
         if self._stopping and curve:
             with suppress(Refused):
-                self._session.do(STOP_CURVE)  # the first may have overtaken the script, which has another connection
+                self._session.do(
+                    STOP_CURVE
+                )  # again: the first stop may have overtaken the start, on another connection
         if scanning:
             self.follow(self._files.what or SCAN)
             return ScopeStatus(ScopeState.SCANNING)
@@ -97,7 +99,7 @@ class SmartScanActivity(Activity):
         call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
         try:
             goes_on = call.running()
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             call.close()
             raise
         if goes_on:

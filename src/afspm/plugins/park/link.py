@@ -84,18 +84,20 @@ class Link:
     def _outcome(self, reply: Plain) -> Any:
         value = reply.get("value")
         try:
-            told = json.loads(value) if isinstance(value, str) else value
+            outcome = json.loads(value) if isinstance(value, str) else value
         except ValueError:
-            told = None
-        if not isinstance(told, dict) or len(told) != 1 or not told.keys() & {OK, ERROR}:
+            outcome = None
+        if not isinstance(outcome, dict) or len(outcome) != 1 or not outcome.keys() & {OK, ERROR}:
             raise self._bad(f"SmartScan replied {reply} to a script")
-        if ERROR in told:
-            raise SmartScanError(str(told[ERROR]))
-        return told[OK]
+        if ERROR in outcome:
+            raise SmartScanError(str(outcome[ERROR]))
+        return outcome[OK]
 
-    def _bad(self, told: str) -> ControllerLost:
+    def _bad(self, problem: str) -> ControllerLost:
         self.close()
-        return ControllerLost(told, where=self._address, hint="afspm does not understand it: report it, with a trace")
+        return ControllerLost(
+            problem, where=self._address, hint="afspm does not understand it: report it, with a trace"
+        )
 
 
 def wrapped(expression: str) -> str:
@@ -109,15 +111,15 @@ def shown(script: str) -> str:
     return script if len(script) <= _SHOWN else f"{script[:_SHOWN]}…"
 
 
-def numbers(told: object, count: int) -> list[float]:
+def numbers(reply: object, count: int) -> list[float]:
     """Return `count` finite numbers of a list, or of a text with commas. Raises ControllerLost."""
-    parts = told.split(",") if isinstance(told, str) else told
+    parts = reply.split(",") if isinstance(reply, str) else reply
     try:
         found = [float(one) for one in parts] if isinstance(parts, list) else []
     except (TypeError, ValueError):
         found = []
     if len(found) != count or not all(map(math.isfinite, found)):
-        raise ControllerLost(f"SmartScan replied {told!r} instead of {count} numbers")
+        raise ControllerLost(f"SmartScan replied {reply!r} instead of {count} numbers")
     return found
 
 
@@ -133,8 +135,8 @@ def _fields(raw: bytes) -> Plain:
     if not isinstance(reply, dict):
         raise ControllerLost(f"a reply that is not JSON-RPC: {raw[:_SHOWN]!r}")
     if reply.get("error"):
-        told = reply["error"]
-        raise SmartScanError(str(told.get("message", told) if isinstance(told, dict) else told))
+        error = reply["error"]
+        raise SmartScanError(str(error.get("message", error) if isinstance(error, dict) else error))
     if "result" not in reply:
         raise ControllerLost(f"a reply without a result: {raw[:_SHOWN]!r}")
     return reply

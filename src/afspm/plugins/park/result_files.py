@@ -12,7 +12,7 @@ from afspm.translator.folder_files import FolderFiles
 from afspm.translator.result_files import Entry, FilePrecision, modified_ns
 
 SETTLE_S: Final = 1.0
-"""So long, in real time, no other file may have come before a scan's are taken: how many there will be is not known."""
+"""Real time without a new file before a scan counts as complete: the number of its files is unknown."""
 
 
 class ParkFiles(FolderFiles):

@@ -62,13 +62,13 @@ def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
     if kind not in (IMAGE, SPECTROSCOPY):
         raise FileError("holds a line; afspm reads Park's images and curves")
     newer = version == max(VERSIONS)
-    told = {name: _plain(header[name]) for name in HEADER.names or ()}
+    fields = {name: _plain(header[name]) for name in HEADER.names or ()}
     date = str(tags.get(DATE_TAG, "")).strip("\0 ")
     return FileContent(
         f"Park {text(header['mode'])}".strip(),
         scans=(_scan(header, tags, path, newer=newer),) if kind == IMAGE else (),
         spectra=_curves(tags, path, newer=newer) if kind == SPECTROSCOPY else (),
-        header=told,
+        header=fields,
         start_ns=local_ns(date, _DATE, zone) if date else None,
         upwards=bool(header["upwards"]) if kind == IMAGE else None,
     )

@@ -43,19 +43,19 @@ class Session:
         except SmartScanError as error:
             self._link.close()
             raise ControllerLost(f"SmartScan is not ready: {error}") from error
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             self._link.close()
             raise
 
     def values(self, paths: Sequence[str]) -> dict[str, Value]:
         """Return values by path below `spm`. Raises Refused: unknown path. ControllerLost: not a plain value."""
         try:
-            told = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
+            found = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
         except SmartScanError as error:
             raise Refused(ControlResponse.PARAM_ERROR, f"SmartScan refused {', '.join(paths)}: {error}") from error
-        if not isinstance(told, list) or len(told) != len(paths) or not all(map(_is_value, told)):
-            raise ControllerLost(f"SmartScan replied {told} for {', '.join(paths)}")
-        return dict(zip(paths, told, strict=True))
+        if not isinstance(found, list) or len(found) != len(paths) or not all(map(_is_value, found)):
+            raise ControllerLost(f"SmartScan replied {found} for {', '.join(paths)}")
+        return dict(zip(paths, found, strict=True))
 
     def is_number(self, path: str) -> bool:
         """Return True if there is a number at a path below `spm`. Raises ControllerLost."""
@@ -110,7 +110,7 @@ class Session:
         try:
             link.begin(expression)
             link.wait(wait_s)
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
         return LongCall(what, link, lambda value: value is None and self.script_runs())
@@ -133,12 +133,12 @@ class Session:
             raise ControllerLost(f"SmartScan does not answer {method}: {error}") from error
 
     def _word(self, method: str, yes: Collection[str], no: Collection[str], hint: str) -> bool:
-        told = str(self._asked(method)).strip().casefold()
-        if told not in yes and told not in no:
+        found = str(self._asked(method)).strip().casefold()
+        if found not in yes and found not in no:
             known = ", ".join(sorted({*yes, *no}))
-            raise ControllerLost(f"SmartScan replied {told!r} to {method}, and not one of {known}", hint=hint)
-        return told in yes
+            raise ControllerLost(f"SmartScan replied {found!r} to {method}, and not one of {known}", hint=hint)
+        return found in yes
 
 
-def _is_value(told: object) -> bool:
-    return isinstance(told, bool | int | str) or (isinstance(told, float) and math.isfinite(told))
+def _is_value(found: object) -> bool:
+    return isinstance(found, bool | int | str) or (isinstance(found, float) and math.isfinite(found))

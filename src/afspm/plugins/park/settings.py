@@ -24,7 +24,7 @@ _RATE: Final = "scan.rate"
 _GAIN: Final = "zservo.gain"
 _GAINS: Final = {names.ZCTRL_PGAIN: f"{_GAIN}.p", names.ZCTRL_IGAIN: f"{_GAIN}.i"}
 _SPEED_PATH: Final = 2.0
-"""Widths of the frame that the tip travels in a line."""
+"""Path of the tip in a line, in widths of the frame: forward and backward (!)."""
 
 
 class FrameSettings(SettingsGroup):
@@ -74,8 +74,8 @@ class Gains(SettingsGroup):
         self._session = session
 
     def read(self) -> dict[str, Value]:
-        told = self._session().values(list(_GAINS.values()))
-        return {name: float(told[path]) for name, path in _GAINS.items()}
+        found = self._session().values(list(_GAINS.values()))
+        return {name: float(found[path]) for name, path in _GAINS.items()}
 
     def are_reported(self) -> bool:
         """Return True if SmartScan reports the gains. Raises ControllerLost."""
@@ -88,7 +88,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The position where the tip was sent: SmartScan reports that of its stage only (!)."""
+    """The position where the tip was sent: SmartScan reports its stage's position only (!)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))

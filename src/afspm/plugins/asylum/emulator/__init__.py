@@ -35,7 +35,7 @@ class AsylumEmulator(Emulator):
     """The emulated microscope.
 
     Args:
-        idle_s: real seconds between two idle moments of Igor, each of which executes one call. 0: at once.
+        idle_s: real seconds between two idle moments of Igor; one call is executed at each. 0: at once.
         start_s: duration of the ramp to the first line, experiment time.
         file_s: delay between the end of a measurement and the first half of its file, and between both halves.
         save_path: Igor's name of the data folder, "C:Users:Me:Data:". Default: the folder's own path.
@@ -92,7 +92,7 @@ class AsylumEmulator(Emulator):
 
     def open(self) -> str:
         self._server = XopServer(self.port, self.woken, self.log)
-        # "C:Users:Me:"; where there are no drives it begins with a colon
+        # Igor's form "C:Users:Me:"; on a system without drive letters the path starts with a colon
         path = self._settings.save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
         texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._settings.base_name}
         values = IgorValues(texts)
@@ -124,7 +124,7 @@ class AsylumEmulator(Emulator):
 
     def tick(self, now_s: float) -> float | None:
         if not self._locked():
-            self.take_button_away()  # of a dialog that lasted for a while
+            self.take_button_away()  # the dialog's time is over
         while self._delayed and self._delayed[0].at_s <= now_s:
             delayed = self._delayed.popleft()
             self._server.send(delayed.client, delayed.payload)
@@ -193,7 +193,7 @@ class AsylumEmulator(Emulator):
         except DialogOpen as dialog:
             self._open_dialog(str(dialog), math.inf)
             given = dialog.result
-        except Exception as error:  # whatever a client asks for, Igor stays
+        except Exception as error:  # any error of a function aborts the call only: Igor goes on
             if not isinstance(error, AfspmError):
                 self.log.exception("%s was aborted", call.name)
             raise wire.CallFailed(_ABORTED, f"While executing {call.name} an error occurred: {error}") from error

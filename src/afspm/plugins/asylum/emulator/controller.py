@@ -34,12 +34,12 @@ _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
 _PULSE_S: Final = 60.0
 _INDENTS_M: Final = 1e-6
-"""A force curve that goes further than this does not only touch the sample."""
+"""A longer force curve drives the tip into the sample."""
 _REACH_M: Final = 1e-3
-"""No scanner goes further."""
+"""Limit of all distances: far beyond any scanner."""
 _LONGEST_NAME: Final = 17
 _INTEGRAL_GAIN: Final = 150.0
-"""What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
+"""Simulated integral gain, in 1/s, for a gain of 1 in Asylum's units."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class AsylumController:
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
-        # somebody has scanned once, and left the image open; the first spot is in its middle
+        # as after a scan whose image is still open: the first spot is in its middle
         self._image = self._frame()
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
@@ -140,12 +140,14 @@ class AsylumController:
             self.values.put("ScanDown", float(down))
         if self.faults.strikes("keeps-scanning", now_s):
             self.values.put("LastScan", 0)
+        # the real software sets ScanStatus at once, and starts the scan after a ramp
         self.values.put("ScanStatus", 1)
         self.values.settle()
         self.rig.stop_spectrum(now_s)
         self.rig.engaged = True
         self._starts_at_s = now_s + self._settings.start_s
 
+    # StopScan of the real software also stops the feedback and withdraws the tip.
     def stop(self, now_s: float) -> None:
         """Stop everything, including the feedback, and withdraw the tip."""
         if self.scanning:
@@ -217,6 +219,7 @@ class AsylumController:
         scan = self.rig.scan
         if scan is not None:
             self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
+        # LastScan 0: the next frame follows in the other direction, until a person stops it
         if not self.values.get("LastScan"):
             self.scan(now_s, not self.values.get("ScanDown"))
             return
@@ -252,7 +255,7 @@ class AsylumController:
         depth_m, speed_m_s = self.values.get("ForceDist"), self.values.get("Velocity")
         if depth_m > _INDENTS_M:
             self.rig.crash(min(depth_m, _REACH_M), speed_m_s, now_s)
-            self.rig.abandon(now_s)  # the curve itself takes the time
+            self.rig.abandon(now_s)  # the curve itself takes the time, not the crash
 
     def stop_curve(self, now_s: float) -> None:
         self._curve_running = False
@@ -291,7 +294,7 @@ class AsylumController:
     def _save(self, where: str, now_s: float, made: files.Made) -> None:
         faults = self.faults
         if faults.strikes("other-name", now_s):
-            self.values.put_text("BaseName", "Somebody")
+            self.values.put_text("BaseName", "Panel")
         if not self._whole(where) & 2 or faults.strikes("no-file", now_s):
             return
         suffix = self._suffix()

@@ -20,7 +20,7 @@ _FLOAT32: Final = 2
 
 Entries = Mapping[str, float | str]
 Made = Callable[[str], bytes]
-"""The content of a file, given the name of its wave."""
+"""Encodes a file, given the name of its wave."""
 
 
 def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> bytes:
@@ -30,7 +30,7 @@ def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> by
     for channel, (unit, found) in channels.items():
         quantity, _, back = channel.partition(" ")
         labels.append(f"{quantity.replace(' ', '')}{back or 'Trace'}")
-        # an amplitude is noted as a length
+        # real files have amplitudes as lengths
         layers.append((found * AMPLITUDE_M_PER_V if (quantity, unit) == ("Amplitude", "V") else found).T)
     rows, columns = scan.shape
     width, height = scan.region.size_m
@@ -75,11 +75,12 @@ def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values
 def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
     local, seconds = igor_moment(now_s)
     texts = {
+        # not UTF-8 once encoded: readers that assume it fail at real notes, too
         "StartHeadTemp": "32.125 °C",
         "Date": f"{local:%Y-%m-%d}",
         "Time": f"{local:%H:%M:%S}",
         "Seconds": f"{seconds:.3f}",
-        "SaveImage": values.text("SaveImage"),  # the second of this name, as in real notes
+        "SaveImage": values.text("SaveImage"),  # twice in a note, as in real ones: number and text
         "MicroscopeModel": "afspm SIMULATED",
         "Version": "15.09.112",
         "BaseName": values.text("BaseName"),

@@ -11,7 +11,7 @@ from afspm.plugins.asylum.emulator.wire import CallFailed, IgorFunction
 
 ABORTED: Final = 107
 _NOTHING: Final = math.nan
-"""What a function without a return gives."""
+"""Result of an Igor function without a return statement."""
 
 
 class DialogOpen(Exception):
@@ -98,7 +98,7 @@ class AsylumFunctions:
     def _status(self) -> float:
         return float(self._controller.status(self._now_s()))
 
-    # --- what is done ---
+    # --- actions ---
 
     def _do_scan(self, button: str) -> float:
         # Asylum's own code cuts the command out of the name of the pressed button, at the last "_" and at "Button".
@@ -115,6 +115,7 @@ class AsylumFunctions:
 
     def _do_force(self, button: str) -> float:
         name = button.partition("Force")[0]
+        # the real function has no return after a start, and returns 0 for a refusal: the reverse of the others
         if name == "Single":
             return _NOTHING if self._controller.curve(self._now_s()) else 0.0
         if name == "Go":

@@ -45,6 +45,7 @@ class XopServer:
     def bind(self) -> None:
         """Start listening (zeromq_server_bind)."""
         socket = self._context.socket(zmq.ROUTER)
+        # the options of the real XOP; a longer request makes libzmq drop the connection without a reply
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDTIMEO, 0)
         socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
@@ -78,7 +79,7 @@ class XopServer:
         if self._held is not None and not locked:
             self.queue.append(self._held)
             self._held = None
-            timeout_s = 0.0  # Igor can do it at once
+            timeout_s = 0.0  # the held call can be executed at once
         if self._socket is not None and self._held is None:
             poller.register(self._socket, zmq.POLLIN)
         ready = dict(poller.poll(max(0, round(timeout_s * 1000))))
@@ -104,6 +105,7 @@ class XopServer:
         self._context.destroy(linger=0)
 
     def _take(self, frames: list[bytes], *, locked: bool) -> None:
+        # the real XOP throws and never replies: to REQ_CORRELATE, or a DEALER without an empty frame
         if len(frames) != 3 or frames[1]:
             self._log.warning("received %d frames, which are not a request; it gets no reply", len(frames))
             return

@@ -39,7 +39,7 @@ _HEXADECIMAL: Final = r"0x([0-9a-f]+\.?[0-9a-f]*|\.[0-9a-f]+)(p[+-]?\d+)?"
 _NUMBER: Final = re.compile(
     rf"[ \t\n\v\f\r]*[+-]?({_HEXADECIMAL}|{_DECIMAL}|inf(inity)?|nan(\(\w*\))?)", re.IGNORECASE | re.ASCII
 )
-"""A number as C's strtod reads it to the end of the text."""
+"""Numbers that C's strtod parses completely."""
 
 Value = float | str | Mapping[str, object] | None
 
@@ -110,7 +110,7 @@ def _parsed(payload: bytes) -> object:
     text = payload.removeprefix(b"\xef\xbb\xbf").partition(b"\0")[0]
     try:
         content = json.loads(text.decode("utf-8"), parse_constant=_no_constant, parse_int=_integer, parse_float=_finite)
-        json.dumps(content, ensure_ascii=False).encode("utf-8")  # half a surrogate pair is no text
+        json.dumps(content, ensure_ascii=False).encode("utf-8")  # raises for lone surrogates
     except (ValueError, RecursionError):
         raise CallFailed(3) from None
     return content

@@ -140,7 +140,7 @@ class GxsmEmulator(Emulator):
             if self._block is not None:
                 self._block.end(remains=True)
                 self._block = None
-            raise Crashed("as it was told to")
+            raise Crashed("an emulated crash")
         if self._console is not None and self._listens and not self._console.runs:
             self._listens = False
             self.listening("")
@@ -166,7 +166,7 @@ class GxsmEmulator(Emulator):
     def _answer_all(self) -> None:
         while self.unanswered and not self.silent and not self.faults.lasts("wedge", self.clock.now_s()):
             call = self.unanswered.popleft()
-            self.program.advance(self.clock.now_s())  # GXSM does one thing after the other
+            self.program.advance(self.clock.now_s())  # GXSM's calls and its own work alternate in one thread
             try:
                 found = self._calls.answer(call.method, call.arguments)
             except NoAnswer:
@@ -174,9 +174,9 @@ class GxsmEmulator(Emulator):
                 return
             except WrongArguments as error:
                 found = SystemError(str(error)) if self._block is None else error.value
-            except (NameError, SystemError) as error:  # what a script of the user's is to see
+            except (NameError, SystemError) as error:  # errors of the real module, for the script
                 found = error
-            except Exception as error:
+            except Exception as error:  # an error of the emulator must not end it: the script sees one, too
                 self.log.exception("%s failed", call.method)
                 found = SystemError(str(error))
             call.answered(found)

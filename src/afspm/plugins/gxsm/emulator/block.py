@@ -54,7 +54,7 @@ class SharedMemoryBlock:
         self._name, self._faults, self._now_s, self._post = name, faults, now_s, post
         command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("signalled.py")), name, process]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder)
-        self._frame()  # it is ready
+        self._frame()  # the first frame: the process is ready for signals
 
     @property
     def pid(self) -> int:
@@ -110,7 +110,7 @@ class SharedMemoryBlock:
         else:
             try:
                 content = pickle.dumps(found, 4)
-            except Exception:
+            except Exception:  # pickle raises any error of an object's own code
                 status = _NOT_PASSED_ON
         if len(content) > SIZE - CONTENT:
             status, content = _NOT_PASSED_ON, b""
@@ -128,7 +128,7 @@ class SharedMemoryBlock:
 
     def _write(self, answer: bytes) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # it was killed
+        with contextlib.suppress(OSError):  # the process was killed
             self._process.stdin.write(struct.pack(">I", len(answer)) + answer)
             self._process.stdin.flush()
 

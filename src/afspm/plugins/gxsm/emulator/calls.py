@@ -28,7 +28,7 @@ _MODES: Final = {
 _KINDS: Final = {"FZ": "force"}
 _NOBODY: Final = 4294967295
 _VOLT: Final = 532.0
-"""Of the scanner, in ångström."""
+"""Ångström per volt of the scanner."""
 
 
 _Method = TypeVar("_Method", bound=Callable[..., object])
@@ -39,7 +39,7 @@ _FUNCTIONS: dict[str, tuple[Callable[..., object], inspect.Signature]] = {}
 def _function(method: _Method) -> _Method:
     # Functions are found by their name without the underscore. Their signatures are read once: reading one takes longer
     # than most calls.
-    _FUNCTIONS[method.__name__[1:]] = method, inspect.signature(method)  # which takes longer than most calls
+    _FUNCTIONS[method.__name__[1:]] = method, inspect.signature(method)
     return method
 
 

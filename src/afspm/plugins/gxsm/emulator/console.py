@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 SCRIPT: Final = Path(__file__).parents[1] / "bridge.py"
-"""What is run if nothing else is said: the file that a user runs, not a module of ours."""
+"""The default script: the file that a user runs, which is not imported as a module."""
 _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
 
@@ -112,7 +112,7 @@ class ScriptConsole:
             exec(compile(self._script.read_text(encoding="utf-8"), str(self._script), "exec"), scope)
         except ConsoleClosed:
             pass
-        except BaseException as error:
+        except BaseException as error:  # SystemExit, too: `poll` raises it in the emulator's thread
             if not self._said.done():
                 self._said.set_exception(error)
         finally:

@@ -17,7 +17,7 @@ _ANGSTROM: Final = "Å"
 _PADDING: Final = " " * 4
 _NO_UNIT: Final = " " * 5
 _DAC_STEP: Final = 0.422
-"""In ångström: a range is never less."""
+"""Smallest range, in ångström: one step of the converter."""
 
 
 @dataclass
@@ -84,13 +84,14 @@ class GxsmEntries:
             return 0
         value = self._atof(text) * self._factor(entry)
         value = (float(np.trunc(value)) if entry.whole else value) or entry.zero
+        # the real one keeps its value, returns 0, and shows a dialog on the screen
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0
         if ref in ("StepsX", "StepsY"):
             ref, value = f"Range{ref[-1]}", value * max(self[f"Points{ref[-1]}"] - 1.0, 1.0)
         self._take(ref, value)
-        if ref in ("RangeX", "PointsX"):  # the ratio is kept: here 1:1
+        if ref in ("RangeX", "PointsX"):  # GXSM keeps the aspect ratio, here always 1:1
             self._take(f"{ref[:-1]}Y", value)
         for axis in "XY":
             self.put(f"Steps{axis}", self[f"Range{axis}"] / max(self[f"Points{axis}"] - 1.0, 1.0))

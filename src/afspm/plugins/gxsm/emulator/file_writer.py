@@ -14,6 +14,7 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
     "half-file": "a file is half written, and whole only after the duration",
     "file-missing": "a file is never written",
 }
+# Measured: files appear 0.1 s after the scanning bit drops, one by one, and are seen half written.
 _FIRST_S, _APART_S, _HALF_S = 0.1, 0.05, 0.02
 
 
@@ -37,7 +38,7 @@ class GxsmFileWriter:
         self._faults = faults
         self._writes: list[_Write] = []
         self.counter = 1
-        """Of the next scan: it begins anew with each start of GXSM, whatever files there are."""
+        """Number of the next scan: 1 at each start of GXSM, even if files have it."""
         self.done_s = 0.0
 
     def next_number(self) -> int:

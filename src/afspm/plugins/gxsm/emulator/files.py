@@ -14,7 +14,7 @@ import numpy as np
 if TYPE_CHECKING:
     import h5py
 
-_USER: Final = "Nobody"
+_USER: Final = "user"
 _VERSIONS: Final = {3: ("gxsm3", "3.54.0"), 4: ("gxsm4", "4.4.1")}
 _ANGSTROM: Final = {"label": "L", "var_unit": "Ang", "unit": "AA"}
 
@@ -53,7 +53,7 @@ SIMULATED_3: Final = (
     GxsmChannel("Height", "Topo", "Xp", *_IN_ANGSTROM, 0.117506942891),
     GxsmChannel("Amplitude", "MIX1", "Xp", ("V", "V"), 1.0, 0.000305185),
 )
-"""Of the simulator that Gxsm3 has."""
+"""Channels of Gxsm3's simulator."""
 CHANNELS: Final = {
     3: (
         GxsmChannel("Height", "Topo", "Xp", *_IN_ANGSTROM, 0.117506942891),
@@ -68,7 +68,7 @@ CHANNELS: Final = {
         GxsmChannel("Phase", "Phase", "Xp", ("deg", "°"), 1.0, 1.0),
     ),
 }
-"""By the version of GXSM."""
+"""Channels by the version of GXSM."""
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ def vpdata(curve: GxsmSpectrumFile) -> bytes:
         f"# Probe Data Number      :: N={count}",
         "#C ",
         "#C Data Table             :: data=",
-        # what is swept comes a second time
+        # real files repeat the swept column
         "\t".join(["#C Index", *(f'"{label}"' for label in [labels[0], *labels]), "Block-Start-Index"]),
     ]
     for i in range(count):

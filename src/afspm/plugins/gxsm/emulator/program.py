@@ -30,15 +30,15 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
 }
 ANGSTROM_M: Final = 1e-10
 SHOWS_S: Final = 0.15
-"""A scan is seen running so long after it was begun."""
+"""Delay of the scanning bit after the start of a scan."""
 NAMED_S: Final = 0.04
-"""Until so long after its begin the names of the scan before are on_change."""
+"""Time after the start of a scan during which the previous scan's file names are reported."""
 IGAIN: Final = 10.0
-"""The simulated integral gain for one of GXSM's, which go to 200."""
+"""Simulated integral gain for a gain of 1 in GXSM, whose range is 0 to 200."""
 UNFINISHED_S: Final = 0.25
-"""So long after the end of a scan GXSM is not done with it: a file that is saved then has no end in it."""
+"""GXSM's own work after the end of a scan; a file saved during it has no end time."""
 _PIXELS_S: Final = 0.045
-"""What its own simulator takes for a line besides its pixels."""
+"""Duration of a line in GXSM's own simulator, in addition to its pixels."""
 _NEVER_WRITTEN: Final = -296
 """The line that Gxsm4's simulator reports at the start of its first scan."""
 _PULSE_S: Final = 1.0
@@ -47,7 +47,7 @@ _MIXERS: Final = {
     "current": ("dsp-fbs-mx0-current-set", "nA", 1e-9),
     "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
 }
-"""By the mode of the feedback: the entry of its setpoint, the unit, and a simulated one for one of GXSM's."""
+"""By the mode of the feedback: entry of the setpoint, unit, and SI value of this unit."""
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
@@ -250,7 +250,7 @@ class GxsmProgram:
         region = self.frame()
         self.rig.setup.region, self.rig.setup.shape, self.rig.setup.upwards = region, (rows, columns), False
         if self.card == "simulator":
-            # it turns its picture the other way than the frame
+            # the real simulator turns its picture against the direction of the frame
             self.rig.setup.region = replace(region, angle_rad=-region.angle_rad)
             self.rig.setup.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
         else:
@@ -271,7 +271,7 @@ class GxsmProgram:
         self.scan.runs, self.scan.saved = True, False
 
     def y_current(self, now_s: float) -> int:
-        """Return the last complete line; before the first one that of the previous scan; after a stop the last line."""
+        """Return the last complete line; before the first one the previous scan's; after a stop the last line."""
         scan = self.scan.activity
         if scan is None:
             return 0
@@ -391,7 +391,7 @@ class GxsmProgram:
     def _save_curve(self, curve: SpectrumActivity, now_s: float) -> None:
         self._curves += 1
         path = self._curve_path()
-        while self.card == "RPSPMC" and path.exists():  # others overwrite
+        while self.card == "RPSPMC" and path.exists():  # RPSPMC skips existing names, other hardware overwrites them
             self._curves += 1
             path = self._curve_path()
         offset = self.entries["OffsetX"], self.entries["OffsetY"]

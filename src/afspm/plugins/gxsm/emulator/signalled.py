@@ -64,7 +64,7 @@ def run(block: str, name: str) -> None:
     sys.stdout.buffer.flush()
     asked = False
     while True:
-        # while a call is out nothing else is passed on: whoever writes the answer does not read meanwhile
+        # one call at a time: the emulator does not read while it writes an answer, and both would block
         ready = select.select([0] if asked else [0, woken], [], [])[0]
         if 0 in ready:
             answered(memory)

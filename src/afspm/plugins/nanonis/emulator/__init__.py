@@ -20,10 +20,10 @@ from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 from afspm.simulation.instrument import InstrumentBusy
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
-"""By the year of the software: the first that has what the protocol has from then on."""
+"""By the year of the software: the first release with this version of the protocol."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
 _LOGS_EVERY_S: Final = 0.005
-"""Real time between two looks at what the TCP Logger has to send."""
+"""Real time between two polls of the TCP Logger."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
 _QPLUS: Final[PlainMapping] = {"resonance_hz": 30e3, "spring_n_per_m": 1800.0, "oscillation_m": 100e-12}
 _STM: Final[PlainMapping] = {"mode": "current", "setpoint": 100e-12, "qplus": True}
@@ -101,7 +101,7 @@ class NanonisEmulator(Emulator):
         "half-file": "a file is half written, and whole only after the duration",
         "file-missing": "a file is announced but never written",
         "stale-name": "the file of the previous scan is announced for a scan",
-        "autosave-off": "scans and spectra are not saved for the duration, whatever is set",
+        "autosave-off": "scans and spectra are not saved for the duration, despite the settings",
         "late-start": "a scan begins, and is reported as running, only after the duration",
         "no-start": "a scan does not begin, without an error",
         "ends-at-once": "for the duration, waiting for the end of a scan returns at once if none runs",
@@ -243,7 +243,7 @@ class NanonisEmulator(Emulator):
             self._refuse(connection, asked, str(error))
         except Crashed:
             raise
-        except Exception as error:
+        except Exception as error:  # an error of the emulator must not end it: the client sees one, too
             self.log.exception("%s failed", asked.name)
             self._refuse(connection, asked, str(error))
 

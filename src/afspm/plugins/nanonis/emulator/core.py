@@ -19,7 +19,7 @@ _Z_CONTROLLERS: Final = {
     "frequency-shift": ("OC M1 Freq. Shift", "Hz"),
     "amplitude": ("Amplitude", "V"),
 }
-"""By the mode of the simulated feedback."""
+"""Name and unit of the z controller, by the mode of the simulated feedback."""
 
 
 @dataclass

@@ -18,10 +18,10 @@ _STORED: Final = (
     "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
     "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util", "File",
 )  # fmt: skip
-"""Modules of the real software: of functions without a handler, what is set in them is at least got again."""
+"""Modules of the real software, whose functions without a handler store values in registers."""
 _KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
 _MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
-"""A slew rate that is not limited is infinite."""
+"""Infinite slew rates mean no limit."""
 
 
 class FunctionRefused(Exception):

@@ -10,7 +10,7 @@ from typing import Final
 USUAL_PORT: Final = 6590
 LARGEST_OVERSAMPLING: Final = 1000
 MOST_WAITING: Final = 1 << 20
-"""Bytes that a reader may leave unread: after that it gets nothing more until it has read."""
+"""Highest number of unread bytes of a reader, which receives nothing more until it has read."""
 _RATE_HZ: Final = 2000.0
 _MOST_AT_ONCE: Final = 20
 _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7

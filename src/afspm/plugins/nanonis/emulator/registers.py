@@ -45,11 +45,12 @@ _KEYED_OTHERWISE: Final[dict[str, tuple[tuple[int, ...], tuple[int, ...]]]] = {
     "APRFGen.Freq": ((), (1,)),
     "APRFGen.Power": ((), (1,)),
 }
-"""Which of the arguments that are set say what they belong to, and which of them are got, where it is not that the
-first ones are those that it is got by, and the others are got in their order."""
+"""Positions of arguments of `…Set`: the ones that name the item, and the ones that `…Get` returns.
+
+Usually the first arguments are those of `…Get` and name the item, and all others are returned in their order."""
 
 _OTHER_NAMES: Final = {"AtomTrack.StatusGet": "AtomTrack.Ctrl"}
-"""The registers that are got by a name of another form."""
+"""Getters and setters with different names."""
 
 
 class Registers:

@@ -22,10 +22,10 @@ Image = tuple[str, str, np.ndarray, np.ndarray]
 """Name, unit, values forward and backward [y, x]."""
 _PIXELS_AT_ONCE: Final = 16
 _WAITED: Final = "waited"
-"""Memory of a client: how many scans had ended, and when, before it waits for the next end."""
+"""Key in a client's memory: number of ended scans, and time, when it started to wait for the next end."""
 _PASTES: Final = (0, 1, 2)
 _SMALLEST_M: Final = 2e-12
-"""Of a frame: half of it, in two lines, is what the simulated scanner can just scan."""
+"""Smallest side of a frame: half of it is the shortest line distance of the simulated scanner."""
 _AUTOSAVE: Final = ("all", "next", "off")
 
 
@@ -171,7 +171,7 @@ class ScanModule:
     def _action(self, action: int, direction: int) -> Answer:
         now_s, rig = self._core.now_s, self._core.rig
         if action == 0:
-            if self.running is not None:  # it begins anew
+            if self.running is not None:  # the running scan is restarted
                 rig.stop_scan(now_s)
                 self.advance(now_s)
             self._start_on_request(bool(direction), now_s)

@@ -11,12 +11,12 @@ from afspm.plugins.nanonis.emulator.logger import LARGEST_OVERSAMPLING, TcpLogge
 from afspm.simulation.activities import RETRACE, SpectrumActivity
 
 CHANNELS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17, "Frequency Shift": 18}
-"""Simulated channel -> index of its signal."""
+"""Index of the signal by simulated channel."""
 NAMES: Final = {"Height": "Z", "Frequency Shift": "OC M1 Freq. Shift"}
 _CURRENT, _BIAS = CHANNELS["Current"], 24
 _UNITS: Final = {"Current": "A", "Height": "m", "Phase": "deg", "Amplitude": "V", "Frequency Shift": "Hz"}
 _OF_SPECTRA: Final = {"Deflection": (20, "m"), "Force": (21, "N"), "dI/dV": (22, "S")}
-"""Signals of spectra alone, with their units."""
+"""Signals of spectra only: index and unit."""
 _SWEPT: Final = {"Bias": "Bias calc", "Z": "Z rel"}
 _SLOTS: Final = 24
 _GAINS: Final = [f"LN 10^{decade}" for decade in range(3, 12)]

@@ -30,7 +30,7 @@ class NanonisSoftware:
     """The software.
 
     Args:
-        session_path: session folder's path on the controller's computer; empty: that of `folder`.
+        session_path: session folder's path on the controller's computer; empty: the path of `folder`.
         range_m: range of the scanner in x and y.
         rows_as_recorded: True if images are returned as recorded, False for the top row first.
     """

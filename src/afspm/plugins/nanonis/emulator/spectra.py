@@ -16,7 +16,7 @@ from afspm.simulation.activities import SpectrumActivity
 
 _KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}
-"""Signals that the simulated spectra have."""
+"""Indexes of the signals in simulated spectra."""
 _TITLES: Final = {"BiasSpectr": "bias spectroscopy", "ZSpectr": "Z spectroscopy"}
 _FILE_NAMES: Final = {"BiasSpectr": "Bias-Spectroscopy", "ZSpectr": "Z-Spectroscopy"}
 _MOST_POINTS: Final = 1 << 16
@@ -27,7 +27,7 @@ class SweepSettings:
     """Sweep settings of a spectroscopy module.
 
     Attributes:
-        points: number of points; None: that of the simulated spectrum.
+        points: number of points; None: as in the simulated spectrum.
         limits: first and last value of the sweep; None: those of the simulated spectrum, whose last values continue
             beyond.
         sweeps: number of averaged sweeps.

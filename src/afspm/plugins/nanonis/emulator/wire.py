@@ -165,7 +165,7 @@ def _unpacked(code: str, body: bytes, at: int, count: int) -> tuple[Any, int]:
     if code.startswith("*"):
         return _items(code[1], count, body, at)
     if code == "A":
-        at += 4  # the size in bytes, which clients reckon in different ways
+        at += 4  # the size in bytes, which clients calculate differently: nanonis-spm and nanonisTCP disagree
     (number,) = struct.unpack_from(">i", body, at)
     at += 4
     if code == "n":
@@ -236,7 +236,7 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
         return b"".join(_packed(code[1], one, encoding) for one in value)
     if code == "f" and abs(value) > _LARGEST_SINGLE:
         return struct.pack(">f", math.copysign(math.inf, value))
-    if code in "BHIin":  # what was set with a sign may be got without one
+    if code in "BHIin":  # a value set as a signed field may be returned as an unsigned one
         size = _SIZES[code.replace("n", "i")]
         return (int(value) % (1 << 8 * size)).to_bytes(size, "big")
     return struct.pack(f">{code}", value)

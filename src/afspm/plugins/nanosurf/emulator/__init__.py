@@ -18,7 +18,7 @@ from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 _LENGTH: Final = struct.Struct("<I")
 LONGEST_SCRIPT: Final = 1 << 20
 _MOST_UNREAD: Final = 64 << 20
-"""Bytes of replies that a client may leave unread: after that its connection ends."""
+"""Highest number of unread bytes of a client, whose connection then ends."""
 
 
 class NanosurfEmulator(ScriptedEmulator):

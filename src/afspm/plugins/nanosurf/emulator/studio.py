@@ -19,11 +19,11 @@ from afspm.simulation.activities import RETRACE, Channels, ScanActivity, Spectru
 from afspm.simulation.emulation.program import MakerProgram, NamedFile
 
 _INTEGRAL_GAIN: Final = 0.5
-"""What Studio's integral gain of 1 is to the simulated feedback, in 1/s."""
+"""Simulated integral gain, in 1/s, for a gain of 1 in Studio."""
 _GAIN_SHARE: Final = 0.4
-"""The gain that the Gain Finder finds, as a share of the one at which the simulated feedback oscillates."""
+"""Result of the Gain Finder, as a share of the gain at which the simulated feedback oscillates."""
 _NOMINAL: Final = 1.2
-"""The maker's values of the cantilever, as a multiple of the true ones."""
+"""The maker's nominal cantilever values, as a multiple of the true ones."""
 _REACH_M: Final = 50e-6
 _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
@@ -177,7 +177,7 @@ class StudioProgram(MakerProgram):
         self._item_name = "Image"
         self._grid: CurveGrid | None = None
         self._calibrated = False
-        self._told_scanning = False
+        self._signalled_scanning = False
         feedback = self.rig.setup.feedback
         if feedback.setpoint is not None:
             self.values[SETPOINT] = feedback.setpoint
@@ -188,7 +188,7 @@ class StudioProgram(MakerProgram):
             "probe.current_deflection_sensitivity": world.feedback.sensitivity_m_per_v,
             "probe.current_spring_constant": world.force.spring_n_per_m,
         }
-        # until it is calibrated, those of its maker
+        # nominal values until the calibration
         self.values |= {path: _NOMINAL * value for path, value in self._cantilever.items()}
 
     @property
@@ -247,8 +247,8 @@ class StudioProgram(MakerProgram):
         if self.when_advanced(now_s):
             again_s = super().advance(now_s)
             self._go_on_with_grid(now_s)
-        if self.scanning is not self._told_scanning:
-            self._told_scanning = self.scanning
+        if self.scanning is not self._signalled_scanning:
+            self._signalled_scanning = self.scanning
             self.on_signal("scanning_started" if self.scanning else "scanning_finished")
         return again_s
 

@@ -16,17 +16,17 @@ from afspm.plugins.nanosurf.emulator.workspace import MeasurementQueue, Workspac
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 SESSION: Final = "91-01-000"
-"""The name of a simulated controller in the maker's client."""
+"""The maker's client has this name for a simulated controller."""
 LAST_WITH_OLD_COMMANDS: Final = 18
 ALL_LEVELS: Final = 5
 _INT32: Final = 2**31 - 1
 _FIELDS: Final = ("unit", "units", "min", "max")
-"""Of a property, besides its value."""
+"""Fields of a property besides its value."""
 _SYNCHRONIZED: Final = 3
 _MEMORY: Final = 64 << 20
-"""Of all scripts together, in bytes."""
+"""Highest memory of all scripts together, in bytes."""
 _ROOM: Final = 16 << 20
-"""Scripts may keep so much of it after their end."""
+"""Highest memory that scripts may keep after their end, in bytes."""
 _WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
 
 Nested = Plain

@@ -70,7 +70,7 @@ class ParkEmulator(ScriptedEmulator):
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
-        self._scripts: dict[Script, bool] = {}  # and whether its reply was sent already
+        self._scripts: dict[Script, bool] = {}  # True: its reply was sent already
         self._smartscan = SmartScanProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
         self._smartscan.reports_gains = self._reports_gains
         return self._smartscan
@@ -154,7 +154,7 @@ class ParkEmulator(ScriptedEmulator):
     def _step(self, request: bytes, script: Script) -> bytes | Unfinished:
         try:
             found = script.step()
-        except BaseException:
+        except BaseException:  # any end of a script, also by an error of the emulator
             self._scripts.pop(script, None)
             raise
         if found is None and script.waits and self._replies == "at-once":
@@ -188,7 +188,7 @@ def _no_constant(name: str) -> NoReturn:
 
 
 class SmartRemoteWire:
-    """SmartRemote's socket: a ZeroMQ REP for several clients, each of which waits for its reply.
+    """SmartRemote's socket: a ZeroMQ REP for several clients, which wait for their replies.
 
     See `ScriptWire`.
     """

@@ -20,9 +20,9 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 LONGEST_S: Final = 5.0
-"""Real seconds of computing after which a script is given up. Its thread computes on: the engine can't be left."""
+"""Real seconds of computing before a script is ended. Its thread goes on: the engine can't be interrupted."""
 _AT_ONCE_S: Final = 0.25
-"""Real seconds that the emulator waits for a script before it serves others: as long as most need to the end."""
+"""Real seconds of waiting for a script before others are served; most scripts end within them."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
@@ -38,7 +38,9 @@ class Wait:
 
 
 Ask = Callable[[str, str, list[Any]], object]
-"""Answers a script: "get", "set" or "call", a path below `spm`, arguments; "now" gives ms. Raises AfspmError."""
+"""Executes a script's request: "get", "set" or "call", a path below `spm`, arguments; "now" returns ms.
+
+Raises AfspmError."""
 
 
 class Script:
@@ -130,7 +132,7 @@ class Script:
             context.eval(_PRELUDE.read_text(encoding="utf-8"))
             context.set("__source", source)
             self._hand_over("done", context.eval("__run(__source)"))
-        # an engine that fails in any other way must end its script, too: the emulator waits for it
+        # any other failure of the engine must end its script, too: the emulator waits for it
         except Exception as error:
             self._hand_over("failed", str(error).partition("\n")[0])
 

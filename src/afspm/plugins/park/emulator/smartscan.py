@@ -27,7 +27,7 @@ GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
     "offsetY": (float, -50.0, 50.0),
     "rotation": (float, -360.0, 360.0),
 }
-"""The frame, in the order in which it is told: type and bounds, in micrometres and degrees."""
+"""The frame in the order of `geometry_query`: type and bounds, in µm and degrees."""
 _CURVES: Final = {"fd": "force", "iv": "IV"}
 _OTHER_NAMES: Final = {
     "zheight": "Height",
@@ -36,25 +36,25 @@ _OTHER_NAMES: Final = {
     "ncmphase": "Phase",
     "ncmfrequency": "Frequency Shift",
 }
-"""What users' scripts call channels; "Channel" before a name, capitals and spaces make no difference."""
+"""Names of channels in users' scripts; "Channel" before a name, capitals and spaces are ignored."""
 _SHOWN: Final = {"m": ("um", 1e6), "A": ("pA", 1e12)}
-"""The unit in which a channel is read, and how many of it are one of the simulation's."""
+"""Units of read values, with the factor from SI."""
 _MOST_READ: Final = 10_000
 _LOCATION: Final = {"subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "jpegSave": False}
 _RETRACTED_UM, _EXTENDED_UM = 7.5, -7.5
 _SCANNER_UM_S, _STAGE_UM_S = 10.0, 1000.0
-"""Speeds where a script gives none: of the scanner, and of a stage at its normalized speed of 1."""
+"""Default speed of the scanner; speed of a stage at its normalized speed of 1."""
 _STAGE_TOP_UM: Final = 1e4
 _TOUCHES_UM: Final = 0.02
-"""So far below the height at which it touches, a tip is still not driven into the sample."""
+"""Depth below the height of contact at which a move starts to damage the tip."""
 _SWEEP_S: Final = 3.0
 _LINE_SCAN: Final = "line scan"
 _LINE_SCAN_S: Final = 1e9
-"""A line is scanned again and again until it is stopped."""
+"""A line is scanned repeatedly until stopped."""
 _SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
 _GAIN: Final = "zservo.gain"
 _PROPORTIONAL, _INTEGRAL = 0.2, 3000.0
-"""What SmartScan's gains of 1 are to the simulated feedback; the second in 1/s."""
+"""Simulated gains for gains of 1 in SmartScan; the second in 1/s."""
 _BOUNDS: Final = {_SETPOINT: (-10.0, 10.0), _RATE: (1e-4, 1e5), _BIAS: (-10.0, 10.0), "bias.sample": (-10.0, 10.0)}
 
 
@@ -82,7 +82,7 @@ class SmartScanProgram(MakerProgram):
             "scan.options": {"twoWay": False, "overScan": {"enable": False, "percent": 5}},
             "dataLocation": {"baseDir": str(self.folder), **_LOCATION},
         }
-        self._told: dict[str, Callable[[], object]] = {
+        self._reported: dict[str, Callable[[], object]] = {
             "zscanner.pos": lambda: self._z_um,
             "zscanner.fullyRetractedPos": lambda: _RETRACTED_UM,
             "zscanner.fullyExtendedPos": lambda: _EXTENDED_UM,
@@ -133,7 +133,7 @@ class SmartScanProgram(MakerProgram):
     @property
     def names(self) -> str:
         """The names below `spm`, as JSON."""
-        return json.dumps({"values": [*self._values, *self._told], "methods": list(self._methods)})
+        return json.dumps({"values": [*self._values, *self._reported], "methods": list(self._methods)})
 
     def ask(self, kind: str, path: str, given: list[Any]) -> object:
         """Execute a request of a script. Raises AfspmError, TypeError."""
@@ -146,7 +146,7 @@ class SmartScanProgram(MakerProgram):
             return None
         if path == _GAIN and not self.reports_gains:
             return None
-        return self._told[path]() if path in self._told else self._values[path]
+        return self._reported[path]() if path in self._reported else self._values[path]
 
     def next_waking_s(self, now_s: float) -> float | None:
         """Return the time at which the next sleeping script continues."""
@@ -183,10 +183,10 @@ class SmartScanProgram(MakerProgram):
         return Wait(lambda: self.scanning)
 
     def _start_curve(self, mode: str | Plain = "fd", place: str = "given") -> None:
-        told = mode if isinstance(mode, dict) else {"mode": mode, "type": place}
-        if told.get("mode") not in _CURVES or told.get("type") != "here":
+        wanted = mode if isinstance(mode, dict) else {"mode": mode, "type": place}
+        if wanted.get("mode") not in _CURVES or wanted.get("type") != "here":
             raise InvalidValue(f"no points are given for {mode!r}, or there is no such spectroscopy")
-        self.start_curve(_CURVES[told["mode"]], self.now_s)
+        self.start_curve(_CURVES[wanted["mode"]], self.now_s)
 
     def _measure_curve(self, *given: Any) -> Wait:
         self._start_curve(*given)
@@ -207,7 +207,7 @@ class SmartScanProgram(MakerProgram):
         if mode not in ("q", "quick", "q+s", "quickAndsafe", "inc", "incremental", "incz", "incrementalzscanner"):
             raise InvalidValue(f"there is no approach {mode!r}")
         self.engage()
-        self._z_um = self.stage_um[2] = 0.0  # where the tip touches
+        self._z_um = self.stage_um[2] = 0.0  # the height of contact
         return Wait(lambda: self.engages or self.rig.doing(self.now_s) == "approach")
 
     def _retract(self) -> Wait:
