@@ -192,7 +192,7 @@ def test_a_file_of_another_name_is_found(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("other-name")
-    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Somebody0000.ibw"}
+    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Panel0000.ibw"}
 
 
 @pytest.mark.parametrize("partial", [False, True])

@@ -52,7 +52,7 @@ def scanned(peer: Peer) -> list[str]:
     ("kind", "settings", "told"),
     [
         ("garbage", BRIDGE, "reports its state as"),
-        ("nan", BRIDGE, "GXSM says nan for"),
+        ("nan", BRIDGE, "GXSM returned nan for"),
         ("wrong-type", BRIDGE, "GXSM replied '\\x04' to"),
         ("error", BRIDGE, "SystemError: an emulated error"),
         ("error", SHM, "GXSM can't pass on the result"),

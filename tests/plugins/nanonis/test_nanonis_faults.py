@@ -30,7 +30,7 @@ SEEN = 5.0
         ("wrong-name", "Nanonis replied to 'Util.RTFreqGet' instead of"),
         ("garbage", "Nanonis replied to"),
         ("huge", "Nanonis announced 2147483647 bytes"),
-        ("nan", "says nan"),
+        ("nan", "returned nan"),
     ],
 )
 def test_a_bad_reply_has_a_name_and_the_controller_is_found_again(bench: Make, kind: str, told: str) -> None:

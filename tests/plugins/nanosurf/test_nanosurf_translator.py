@@ -214,7 +214,7 @@ def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
 @pytest.mark.parametrize(
     ("emulator", "settings", "told"),
     [
-        ({"release": 19}, {"release": 18}, "Studio is of release 19, not 18"),
+        ({"release": 19}, {"release": 18}, "Studio is release 19, not 18"),
         ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
         ({}, {"parameters": {"zctrl-setpoint": {"unit": "nm"}}}, "Studio has z_control.setpoint in V, not in nm"),
         ({}, {"parameters": {"x-a": {"vendor": "no.such"}}}, "Studio has no no.such"),

@@ -243,7 +243,7 @@ def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> No
     peer = small(made)
     assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
     assert scanned(peer)
-    made.until_said("does not tell the gains")
+    made.until_said("does not report the gains")
 
 
 @pytest.mark.parametrize("kind", ["spectrum-refused", "no-file"])

@@ -75,7 +75,7 @@ class Asylum(Driver):
         self._base_name = _checked_name(base_name)
         self._spots = spots
         if spots not in _SPOTS:
-            raise ConfigError(f"{spots!r}", where="spots", hint=" or ".join(_SPOTS))
+            raise ConfigError(f"{spots!r} is no origin of spots", where="spots", hint=" or ".join(_SPOTS))
         if spots == "none":
             self.table = self.table.without(POSITION)
         self._reply_timeout_s = reply_timeout_s

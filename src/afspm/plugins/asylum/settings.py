@@ -50,7 +50,7 @@ def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[st
     speed_m_s = float(values[names.SCAN_SPEED])
     fast_m, slow_m = region.size_m
     if speed_m_s <= 0.0:
-        raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+        raise InvalidValue(f"the scan speed must be above 0, not {speed_m_s:g} m/s")
     shorter_m = min(fast_m, slow_m)
     return {
         "XOffset": region.center_m[0],

@@ -86,7 +86,7 @@ class Gxsm(Driver):
         super().__init__(**common)
         kinds = [kind.value for kind in Hardware]
         if hardware is not None and hardware not in kinds:
-            raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
+            raise ConfigError(f"unknown hardware {hardware!r}", where="hardware", hint=f"one of {', '.join(kinds)}")
         if saving not in _SAVERS:
             raise ConfigError(f"{saving!r} is not a way of saving", where="saving", hint=f"{' or '.join(_SAVERS)}")
         self.controller_at = address

@@ -110,14 +110,14 @@ class Asking:
         """Call a function that returns numbers. Raises BadReply: it returned something else. See `Link.call`."""
         value = self.call(method, *arguments)
         if not isinstance(value, tuple | list) or not all(isinstance(one, int | float) for one in value):
-            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which are no numbers")
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which are not numbers")
         return [float(one) for one in value]
 
     def names(self, method: str) -> frozenset[str]:
         """Call a function that returns names. Raises BadReply: it returned something else. See `Link.call`."""
         value = self.call(method)
         if not isinstance(value, tuple | list) or not all(isinstance(one, str) for one in value):
-            raise BadReply(f"GXSM replied {value!r:.100} to {method}, which are no names")
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}, which are not names")
         return frozenset(value)
 
 

@@ -317,7 +317,8 @@ class GxsmFiles(ResultFiles):
             absent = sorted(set(ended["channels"]) - endings(files).keys() - {""})
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning(
-                    "GXSM did not save %s; the translator waits less long for it from now on", ", ".join(absent)
+                    "GXSM did not save %s; from now on the translator waits for it for a short time only",
+                    ", ".join(absent),
                 )
             self._kept["absent"] = absent
             self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})

@@ -46,7 +46,7 @@ def user_unit_m(ask: Asking) -> float:
     except (ValueError, AfspmError) as error:
         raise BadReply(f"GXSM shows {shown!r} for RangeX: {error}") from error
     if not math.isclose(read, number, rel_tol=0.01, abs_tol=_ROUNDED):
-        raise BadReply(f"GXSM shows {shown!r} for RangeX, and says {number}")
+        raise BadReply(f"GXSM shows {shown!r} for RangeX on its panel, but returns {number}")
     return unit_m
 
 
@@ -191,7 +191,7 @@ def number(ask: Asking, ref: str) -> float:
     """Return the value of a parameter. Raises BadReply: GXSM has none."""
     value = ask.number("get", ref)
     if not math.isfinite(value):
-        raise BadReply(f"GXSM says {value} for {ref}")
+        raise BadReply(f"GXSM returned {value} for {ref}")
     return value
 
 

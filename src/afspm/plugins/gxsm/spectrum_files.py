@@ -37,7 +37,7 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     rows = [line.split("\t") for line in lines[starts[0] + 2 : ends[0]] if line.strip("#C \t")]
     announced = re.search(r"N=(\d+)", header.get("Probe Data Number", ""))
     if announced is None or len(rows) != int(announced[1]):
-        raise FileError(f"has {len(rows)} rows in its table and announces {announced and announced[1]}")
+        raise FileError(f"has {len(rows)} rows in its table instead of the announced {announced and announced[1]}")
     for number, row in enumerate(rows):
         if len(row) != len(columns) or row[0] != str(number):
             raise FileError(f"row {number} of its table is damaged")

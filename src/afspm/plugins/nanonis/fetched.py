@@ -38,7 +38,9 @@ class Grabbing:
     def __post_init__(self) -> None:
         for name, value, choices in (("rows", self.rows, ROWS), ("backward", self.backward, BACKWARD)):
             if value not in choices:
-                raise ConfigError(f"{value!r}", where=f"grabbed_{name}", hint=f"one of {', '.join(choices)}")
+                raise ConfigError(
+                    f"unknown value {value!r}", where=f"grabbed_{name}", hint=f"one of {', '.join(choices)}"
+                )
 
     def image(self, raw: np.ndarray, *, upwards: bool, backward: bool) -> np.ndarray:
         """Return the image [y, x] with both axes ascending."""

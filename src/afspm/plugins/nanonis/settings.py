@@ -48,7 +48,7 @@ def numbers(ask: Ask, name: str, *arguments: Any) -> tuple[Any, ...]:
     found = ask(name, *arguments)
     for value in found:
         if isinstance(value, float) and not math.isfinite(value):
-            raise BadReply(f"Nanonis says {value} in reply to {name}")
+            raise BadReply(f"Nanonis returned {value} in reply to {name}")
     return found
 
 
@@ -61,7 +61,9 @@ class ScanFrame(Group):
         _, columns, rows = self._ask("Scan.BufferGet")
         x, y, width, height, clockwise_deg = self._numbers("Scan.FrameGet")
         if min(columns, rows) < 1 or min(width, height) <= 0.0:
-            raise BadReply(f"Nanonis says that the frame is {width} m x {height} m of {columns} x {rows} pixels")
+            raise BadReply(
+                f"Nanonis returned a frame of {lengths_text((width, height), ' x ')} with {columns} x {rows} pixels"
+            )
         size_m = (width * _share(columns), height * _share(rows))
         return frame_values(Region((x, y), size_m, 0.0 - math.radians(clockwise_deg)), (rows, columns))
 
@@ -106,7 +108,8 @@ class ScanSpeed(Group):
         backward_m_s = forward_m_s * ratio
         if min(forward_m_s, backward_m_s) <= 0.0:
             raise refuse_value(
-                names.SCAN_SPEED, f"{forward_m_s} m/s forward and {ratio} times that backward are not above 0"
+                names.SCAN_SPEED,
+                f"the speeds forward and backward must be above 0, not {forward_m_s:g} and {backward_m_s:g} m/s",
             )
         keep_speed = 1  # SpeedGet returns 0 for it
         times_s = width_m / forward_m_s, width_m / backward_m_s

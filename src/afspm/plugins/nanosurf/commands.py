@@ -105,7 +105,7 @@ def has_old_commands(release: int) -> bool:
     """Return True if a release still has the commands from before 17. Raises ConfigError: it is older than 17."""
     if release < FIRST_RELEASE:
         hint = f"{FIRST_RELEASE} or later"
-        raise ConfigError(f"afspm does not speak to Nanosurf Studio {release}", where="release", hint=hint)
+        raise ConfigError(f"Nanosurf Studio {release} is too old for afspm", where="release", hint=hint)
     return release < _WITHOUT_OLD
 
 

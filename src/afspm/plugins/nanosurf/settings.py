@@ -57,7 +57,7 @@ class FrameSettings(SettingsGroup):
         region, (rows, columns) = frame(wanted)
         speed_m_s = float(wanted[names.SCAN_SPEED])
         if speed_m_s <= 0.0:
-            raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+            raise InvalidValue(f"the scan speed must be above 0, not {speed_m_s:g} m/s")
         (x, y), (width, height) = region.center_m, region.size_m
         rate = speed_m_s / (SPEED_PATH * width)
         angle_deg = math.degrees(region.angle_rad)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.formatting import lengths_text
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, Length, PollPeriod
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
@@ -60,14 +61,20 @@ class Park(Driver):
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
         if lift < 0.0:
-            raise ConfigError(f"{lift} m would move the tip to the sample", where="lift", hint="0 or more")
+            raise ConfigError(
+                f"a lift of {lengths_text([lift])} would move the tip to the sample", where="lift", hint="0 or more"
+            )
         self.controller_at = address
         self._data_dir, self._lift_m, self._reply_timeout_s = data_dir, lift, reply_timeout_s
         self._scanning = _SCANNING | {word.casefold() for word in scanning_words}
         self._idle = _IDLE | {word.casefold() for word in idle_words}
         both = self._scanning & self._idle
         if both:
-            raise ConfigError(f"{', '.join(sorted(both))} would mean both", where="idle_words", hint="take one away")
+            raise ConfigError(
+                f"{', '.join(sorted(both))} would mean both scanning and idle",
+                where="idle_words",
+                hint="remove them from one list",
+            )
         self._session: Session | None = None
         self._activity: SmartScanActivity | None = None
         self._place = TipPlace(self._smartscan, self._begun)

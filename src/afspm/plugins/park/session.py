@@ -93,7 +93,7 @@ class Session:
 
     def scanning(self) -> bool:
         """Return True while a scan runs. Raises ControllerLost: unknown word in the answer."""
-        hint = "watch what it says while it scans and while it does not, and set scanning_words and idle_words"
+        hint = "note its answers during a scan and without one, and set scanning_words and idle_words"
         return self._word(SCAN_STATUS, self._scanning, self._idle, hint)
 
     def script_runs(self) -> bool:

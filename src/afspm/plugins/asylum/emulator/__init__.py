@@ -85,7 +85,7 @@ class AsylumEmulator(Emulator):
     ) -> None:
         super().__init__(**settings)
         if procedures not in PROCEDURES:
-            raise ConfigError(f"{procedures!r}", where="procedures", hint=" or ".join(PROCEDURES))
+            raise ConfigError(f"unknown procedures: {procedures!r}", where="procedures", hint=" or ".join(PROCEDURES))
         self._settings = AsylumSettings(
             idle_s, start_s, file_s, save_path, base_name, procedures, has_status, image_open, saves_partial
         )
@@ -201,10 +201,10 @@ class AsylumEmulator(Emulator):
             given += "\udcb0"
         return wire.success(function, given, call.message_id)
 
-    def _open_dialog(self, says: str, lasts_s: float) -> None:
+    def _open_dialog(self, text: str, lasts_s: float) -> None:
         # A modal dialog stops Igor's main thread: queued calls wait until OK is pressed, or for `lasts_s`.
         self._locked_until_s = self.clock.now_s() + lasts_s
-        self.show_button("press-OK", f"a dialog waits for OK: {says}", self._close_dialog)
+        self.show_button("press-OK", f"a dialog waits for OK: {text}", self._close_dialog)
 
     def _close_dialog(self) -> None:
         opened, now_s = self._locked_until_s, self.clock.now_s()

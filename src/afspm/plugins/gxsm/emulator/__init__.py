@@ -82,7 +82,7 @@ class GxsmEmulator(Emulator):
             ("user_unit", user_unit, USER_UNITS),
         ):
             if value not in known:
-                raise ConfigError(f"{value!r}", where=name, hint=f"there are {', '.join(map(str, known))}")
+                raise ConfigError(f"unknown value {value!r}", where=name, hint=f"one of {', '.join(map(str, known))}")
         self._settings = program.GxsmSettings(
             version, card, user_unit, decimal_comma, auto_save, probe_auto_save, reach_m
         )

@@ -23,7 +23,7 @@ from afspm.simulation.faults import Faults
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "bad-pickle": "shared memory: the result is not a pickle",
     "evil-pickle": "shared memory: the result would run a program if it were unpickled",
-    "code": "shared memory: the status says that the result can't be passed on",
+    "code": "shared memory: the status -1, as for a result that can't be passed on",
     "huge": "shared memory: a result that is longer than the memory",
 }
 NAME_BYTES: Final = 64

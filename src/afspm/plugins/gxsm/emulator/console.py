@@ -77,7 +77,7 @@ class ScriptConsole:
         self, script: Path, port: int, folder: Path, post: Callable[[ScriptCall], None], ended: Callable[[], None]
     ) -> None:
         self._module = GxsmModule(post)
-        self._said: Future[str] = Future()
+        self._address: Future[str] = Future()
         self._script, self._port, self._folder, self._ended = script, port, folder, ended
         self._runs = True
         self._thread = threading.Thread(target=self._run, daemon=True, name="GXSM's console")
@@ -85,7 +85,7 @@ class ScriptConsole:
 
     def poll(self) -> str | None:
         """Return the script's address once it listens. Raises the exception that ended the script before."""
-        return self._said.result() if self._said.done() else None
+        return self._address.result() if self._address.done() else None
 
     @property
     def runs(self) -> bool:
@@ -98,8 +98,8 @@ class ScriptConsole:
     def _run(self) -> None:
         def print_(*values: object) -> None:
             found = _LISTENS.search(" ".join(map(str, values)))
-            if found and not self._said.done():
-                self._said.set_result(f"{found[1]}:{found[2]}")
+            if found and not self._address.done():
+                self._address.set_result(f"{found[1]}:{found[2]}")
 
         scope = {
             "__name__": "__main__",
@@ -113,8 +113,8 @@ class ScriptConsole:
         except ConsoleClosed:
             pass
         except BaseException as error:  # SystemExit, too: `poll` raises it in the emulator's thread
-            if not self._said.done():
-                self._said.set_exception(error)
+            if not self._address.done():
+                self._address.set_exception(error)
         finally:
             self._runs = False
             self._ended()

@@ -133,7 +133,7 @@ class NanonisEmulator(Emulator):
         self._range_m = range_m
         self._bare_errors = bare_errors
         if grabbed_rows not in ("top-first", "recorded"):
-            raise ConfigError(f"{grabbed_rows!r}", where="grabbed_rows", hint='"top-first" or "recorded"')
+            raise ConfigError(f"unknown order {grabbed_rows!r}", where="grabbed_rows", hint='"top-first" or "recorded"')
         self._grabbed_rows = grabbed_rows
 
     def open(self) -> str:

@@ -270,7 +270,9 @@ class ScanModule:
         (!) The real controller's answer to a frame smaller than an atom is unknown: here it is refused.
         """
         if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
-            raise FunctionRefused(f"a frame of {width:g} m x {height:g} m can't be scanned: from {_SMALLEST_M:g} m")
+            raise FunctionRefused(
+                f"a frame of {width:g} m x {height:g} m can't be scanned: its sides must be at least {_SMALLEST_M:g} m"
+            )
         range_m = self._core.range_m[:2]
         width, height = min(width, range_m[0]), min(height, range_m[1])
         x, y = (
