@@ -72,7 +72,7 @@ def bench(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
 
 
 @each
-def test_scans_follow_each_other_each_in_a_file_of_its_own(maker: Maker, bench: Make) -> None:
+def test_consecutive_scans_have_files_of_their_own(maker: Maker, bench: Make) -> None:
     peer = bench().start()
     ready(peer)
     found = [scanned(peer)[maker.height] for _ in range(3)]
@@ -99,7 +99,7 @@ def test_stopped_scan_is_not_published(maker: Maker, bench: Make) -> None:
 
 
 @each
-def test_scan_begun_at_the_panel_is_published(maker: Maker, bench: Make) -> None:
+def test_scan_from_the_panel_is_published(maker: Maker, bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer, shape=(40, 32))
@@ -113,7 +113,7 @@ def test_scan_begun_at_the_panel_is_published(maker: Maker, bench: Make) -> None
 
 
 @pytest.mark.parametrize("maker", [MAKERS[name] for name in ("asylum", "nanosurf", "park")], ids=lambda one: one.name)
-def test_scan_that_does_not_begin_is_refused(maker: Maker, bench: Make) -> None:
+def test_scan_that_does_not_start_is_refused(maker: Maker, bench: Make) -> None:
     """GXSM and Nanonis, whose scans may begin late, are not waited for."""
     made = bench()
     peer = small(made)

@@ -41,7 +41,7 @@ def scans_again(peer: Peer) -> list[Scan]:
         ("unknown", "an error without a name (1"),
     ],
 )
-def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_igor_reconnected(bench: Make, kind: str, told: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     # of nan the first two are of the status, where they mean that a release has no such value
@@ -61,7 +61,7 @@ def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, 
         ("restart", "nothing listens at this address"),
     ],
 )
-def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str, told: str) -> None:
+def test_lasting_fault_is_reported_until_it_ends(bench: Make, kind: str, told: str) -> None:
     made = bench(speed=1.0)
     peer = small(made, **SOON)
     made.strike(kind, duration_s=8.0)
@@ -73,7 +73,7 @@ def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str,
     made.until_said(told)
 
 
-def test_a_tip_on_its_way_is_still_on_it_when_the_connection_comes_back(bench: Make) -> None:
+def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = small(made, move_s=20.0)
     arrives_s = made.clock.now_s() + 20.0
@@ -85,7 +85,7 @@ def test_a_tip_on_its_way_is_still_on_it_when_the_connection_comes_back(bench: M
     assert made.clock.now_s() >= arrives_s
 
 
-def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path: Path) -> None:
+def test_restarted_igor_is_reconnected(bench: Make, tmp_path: Path) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike("crash")
@@ -97,7 +97,7 @@ def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path
         assert peer.get("x-engaged") == "true"
 
 
-def test_procedures_that_are_not_included_are_asked_for(bench: Make) -> None:
+def test_missing_procedures_are_named(bench: Make) -> None:
     made = bench(procedures="none")
     peer = made.start()
     peer.until(UNDEFINED)
@@ -105,7 +105,7 @@ def test_procedures_that_are_not_included_are_asked_for(bench: Make) -> None:
     made.until_said("is afspm.ipf included in Igor's procedures")
 
 
-def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> None:
+def test_procedures_of_the_published_afspm_suffice_to_scan(bench: Make) -> None:
     made = bench(procedures="spots")
     peer = small(made)
     scans_again(peer)
@@ -118,7 +118,7 @@ def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> Non
 # --- scans and curves ---
 
 
-def test_a_force_curve_that_is_refused(bench: Make) -> None:
+def test_refused_force_curve_is_an_error(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("force-refused")
@@ -129,7 +129,7 @@ def test_a_force_curve_that_is_refused(bench: Make) -> None:
     assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
 
 
-def test_a_force_curve_whose_end_could_not_be_seen_is_refused(bench: Make) -> None:
+def test_force_curve_without_status_function_is_refused(bench: Make) -> None:
     made = bench(has_status=False)
     peer = small(made)
     response = peer.act(names.START_SPEC)
@@ -138,7 +138,7 @@ def test_a_force_curve_whose_end_could_not_be_seen_is_refused(bench: Make) -> No
     scans_again(peer)
 
 
-def test_a_scan_is_one_scan_even_if_beginning_it_puts_last_scan_back(bench: Make) -> None:
+def test_scan_runs_once_even_if_its_start_resets_last_scan(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("keeps-scanning")
@@ -146,7 +146,7 @@ def test_a_scan_is_one_scan_even_if_beginning_it_puts_last_scan_back(bench: Make
     assert made.emulator.controller.values.get("LastScan") == 1
 
 
-def test_saving_is_switched_on_where_it_is_off(bench: Make) -> None:
+def test_saving_is_switched_on_if_off(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.at_panel(lambda emulator: emulator.controller.values.put("SaveImage", 0))
@@ -155,7 +155,7 @@ def test_saving_is_switched_on_where_it_is_off(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])
-def test_a_file_that_comes_late_or_in_parts_is_waited_for(bench: Make, kind: str) -> None:
+def test_late_or_partial_file_is_awaited(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.strike(kind, duration_s=6.0)
@@ -163,7 +163,7 @@ def test_a_file_that_comes_late_or_in_parts_is_waited_for(bench: Make, kind: str
 
 
 @pytest.mark.parametrize(("kind", "lasts_s"), [("no-file", 1.0), ("half-file", 1e6), ("drive-gone", 20.0)])
-def test_a_scan_without_a_whole_file_is_told_and_the_next_is_not_taken_for_it(
+def test_scan_without_a_complete_file_is_reported_and_not_confused_with_the_next(
     bench: Make, kind: str, lasts_s: float
 ) -> None:
     made = bench(speed=20.0)
@@ -177,7 +177,7 @@ def test_a_scan_without_a_whole_file_is_told_and_the_next_is_not_taken_for_it(
     assert scans_again(peer)[0].values.shape == (8, 16)
 
 
-def test_a_file_of_the_same_name_is_that_of_the_new_scan(bench: Make) -> None:
+def test_file_of_the_same_name_belongs_to_the_new_scan(bench: Make) -> None:
     made = bench()
     peer = small(made)
     first = scans_again(peer)
@@ -188,7 +188,7 @@ def test_a_file_of_the_same_name_is_that_of_the_new_scan(bench: Make) -> None:
     assert (first[0].values != second[0].values).any()
 
 
-def test_a_file_of_another_name_is_found(bench: Make) -> None:
+def test_file_of_another_name_is_found(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("other-name")
@@ -196,7 +196,7 @@ def test_a_file_of_another_name_is_found(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("partial", [False, True])
-def test_a_scan_that_somebody_stops_is_interrupted(bench: Make, partial: bool) -> None:
+def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, partial: bool) -> None:
     made = bench(speed=4.0, saves_partial=partial)
     peer = small(made, result_timeout_s=3.0)
     assert peer.act(names.START_SCAN).ok
@@ -207,7 +207,7 @@ def test_a_scan_that_somebody_stops_is_interrupted(bench: Make, partial: bool) -
     assert not scans(heard)
 
 
-def test_what_one_source_says_to_be_scanning_is(bench: Make) -> None:
+def test_scan_reported_by_one_source_counts(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.emulator.faults.demand(Fault("status-stuck", 0.0, 1, 20.0), made.clock.now_s())

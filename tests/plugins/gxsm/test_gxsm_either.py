@@ -64,7 +64,7 @@ def in_force(peer: Peer, wanted: ScanParameters) -> None:
     peer.until(FREE)
 
 
-def test_a_scan_of_a_turned_frame_that_is_no_square(peer: Peer) -> None:
+def test_scan_of_a_rotated_oblong_frame(peer: Peer) -> None:
     assert peer.act(names.START_SCAN).ok
     heard = peer.until(FREE)
     assert states(heard) == ["SCANNING", "FREE"]
@@ -79,7 +79,7 @@ def test_a_scan_of_a_turned_frame_that_is_no_square(peer: Peer) -> None:
     assert 0.0 < np.ptp(topography.values) < 1e-6
 
 
-def test_a_scan_that_is_stopped(peer: Peer) -> None:
+def test_stopped_scan(peer: Peer) -> None:
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.set(names.SCAN_SIZE_X, 60e-9).code == ControlResponse.NOT_FREE
@@ -106,7 +106,7 @@ def test_parameters_are_as_they_were_set(peer: Peer) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, before).ok
 
 
-def test_what_can_not_be_is_refused(peer: Peer) -> None:
+def test_invalid_values_are_refused(peer: Peer) -> None:
     assert peer.set(names.SCAN_SIZE_X, "nan").code == ControlResponse.PARAM_ERROR
     assert peer.set(names.SCAN_SIZE_X, 1, "V").code == ControlResponse.PARAM_ERROR
     assert peer.set(names.SCAN_SIZE_X, -1e-9).code == ControlResponse.PARAM_ERROR

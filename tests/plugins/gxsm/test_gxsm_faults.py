@@ -63,9 +63,7 @@ def scanned(peer: Peer) -> list[str]:
         ("huge", SHM, "GXSM replied 2147483648 bytes"),
     ],
 )
-def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
-    bench: Make, kind: str, settings: dict[str, Any], told: str
-) -> None:
+def test_bad_answer_is_logged_and_gxsm_reconnected(bench: Make, kind: str, settings: dict[str, Any], told: str) -> None:
     made = bench(**settings)
     peer = small(made)
     made.strike(kind)
@@ -76,7 +74,7 @@ def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
     assert not Path("evil").exists()
 
 
-def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -> None:
+def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
     """A RedPitaya does not tell that the tip moves."""
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
@@ -90,7 +88,7 @@ def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -
     assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((400e-9, 0.0))
 
 
-def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None:
+def test_tip_moved_with_its_frame_counts_as_moving(bench: Make) -> None:
     """A RedPitaya does not tell that either; and where it goes next, it goes from there."""
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
@@ -104,7 +102,7 @@ def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None
 
 
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
-def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, Any]) -> None:
+def test_hanging_gxsm_is_lost_and_reconnected(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(speed=1.0, **settings)
     peer = small(made, **SOON)
     made.strike("wedge", duration_s=8.0)
@@ -118,7 +116,7 @@ def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, An
 
 
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
-def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings: dict[str, Any]) -> None:
+def test_restarted_gxsm_is_reconnected(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(**settings)
     address = made.address.partition("@")[0]
     if settings:
@@ -136,7 +134,7 @@ def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings
     assert scanned(peer)
 
 
-def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_behind: Path) -> None:
+def test_memory_of_an_ended_gxsm_is_not_trusted(bench: Make, left_behind: Path) -> None:
     made = bench(block=left_behind.name, **SHM)
     peer = small(made)
     made.strike("crash")
@@ -154,7 +152,7 @@ def left_behind() -> Iterator[Path]:
     path.unlink(missing_ok=True)
 
 
-def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) -> None:
+def test_stopped_script_is_reported_until_it_runs_again(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("script-stopped")
@@ -166,7 +164,7 @@ def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) ->
     assert scanned(peer)
 
 
-def test_script_that_has_ended_is_run_again_from_outside(bench: Make) -> None:
+def test_ended_script_can_be_run_again(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("script-stopped")
@@ -185,7 +183,7 @@ def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.setup.bias_v == 0.1
 
 
-def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> None:
+def test_silently_rejected_value_is_refused(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("refused")
@@ -198,7 +196,7 @@ def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> Non
 # --- scans ---
 
 
-def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench: Make) -> None:
+def test_scan_that_did_not_start_is_reported_and_an_old_one_not_published(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     assert scanned(peer)
@@ -211,7 +209,7 @@ def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench
     made.until_said("it was stopped or never began")
 
 
-def test_a_scan_without_channels_is_told(bench: Make) -> None:
+def test_scan_without_channels_is_reported(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.at_panel(lambda emulator: emulator.program.channels.clear())
@@ -246,7 +244,7 @@ KINDS: list[dict[str, Any]] = [{"version": 3}, {}, SHM, {"card": "RPSPMC"}, {"ca
 
 @pytest.mark.parametrize("saving", ["afspm", "gxsm"])
 @pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm", "rpspmc", "simulator"])
-def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: dict[str, Any], saving: str) -> None:
+def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, kind: dict[str, Any], saving: str) -> None:
     """GXSM keeps, and saves, the scan before in the rows that it did not come to, and nothing says so."""
     made = bench(speed=1.0, **kind)
     peer = small(made, saving=saving)
@@ -269,7 +267,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: di
     ],
     ids=["frame", "fewer-rows", "fewer-columns", "more-columns", "more-rows"],
 )
-def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Region, shape: tuple[int, int]) -> None:
+def test_rows_of_another_frame_count_as_old(bench: Make, region: Region, shape: tuple[int, int]) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
@@ -278,7 +276,7 @@ def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Reg
     stopped_at_panel(made, peer)
 
 
-def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> None:
+def test_scan_stopped_in_its_first_line_is_interrupted(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     assert peer.set(names.SCAN_SPEED, "10", "um/s").ok
@@ -290,7 +288,7 @@ def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> 
     assert states(peer.until(FREE)) == ["INTERRUPTED", "FREE"]
 
 
-def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None:
+def test_stopped_first_scan_is_interrupted(bench: Make) -> None:
     """There was none before: its file has zeros."""
     made = bench(speed=1.0)
     peer = small(made)
@@ -299,7 +297,7 @@ def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make, seen: bool) -> None:
+def test_scan_started_and_stopped_at_the_panel_is_interrupted(bench: Make, seen: bool) -> None:
     """Also if the translator has not seen the scan before."""
     made = bench(speed=1.0)
     peer = small(made)
@@ -342,7 +340,7 @@ def test_slow_lines_of_gxsms_simulator_are_scanned_to_their_end(bench: Make) -> 
     assert last.line_s > 0.2
 
 
-def test_a_scan_is_saved_when_gxsm_is_done_with_it(bench: Make) -> None:
+def test_scan_is_saved_after_gxsms_own_work(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     for name in scanned(peer):
@@ -365,7 +363,7 @@ def test_a_folder_chosen_at_the_panel_between_two_scans_is_found(bench: Make, tm
     ("kind", "version", "saving"),
     [("file-late", 3, "afspm"), ("half-file", 3, "gxsm"), ("file-late", 4, "gxsm"), ("half-file", 4, "afspm")],
 )
-def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, version: int, saving: str) -> None:
+def test_slow_files_are_awaited(bench: Make, kind: str, version: int, saving: str) -> None:
     made = bench(speed=20.0, version=version)
     peer = small(made, saving=saving)
     expected = scanned(peer)
@@ -374,7 +372,7 @@ def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, versi
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file", "file-missing"])
-def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(bench: Make, kind: str) -> None:
+def test_missing_channel_is_named_and_the_others_published(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=20.0)
     made.strike(kind, duration_s=1e6)
@@ -384,7 +382,7 @@ def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(benc
     assert len(scanned(peer)) == 4, "it is not given up for ever"
 
 
-def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
+def test_scan_without_files_is_interrupted(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=20.0)
     made.strike("file-missing", count=4)
@@ -395,7 +393,7 @@ def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
     assert scanned(peer)
 
 
-def test_a_gxsm_that_names_its_channels_only_once_it_scans(bench: Make) -> None:
+def test_channels_named_only_during_a_scan_are_found(bench: Make) -> None:
     """Files of before are in its folder, too, and not taken for the new ones."""
     made = bench(speed=20.0)
     peer = small(made)
@@ -413,7 +411,7 @@ def _named_late(program: GxsmProgram) -> Callable[[float], list[Path]]:
     return late
 
 
-def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path: Path) -> None:
+def test_unreachable_folder_is_named(bench: Make, tmp_path: Path) -> None:
     made = bench(speed=20.0)
     peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
     assert peer.act(names.START_SCAN).ok
@@ -421,7 +419,7 @@ def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path:
     made.until_said("does not exist on this computer")
 
 
-def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
+def test_scan_that_ended_while_gxsm_hung_is_published(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made, **SOON)
     assert peer.act(names.START_SCAN).ok
@@ -435,7 +433,7 @@ def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
 # --- spectra ---
 
 
-def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
+def test_unsaved_spectrum_is_reported(bench: Make) -> None:
     made = bench(speed=20.0, probe_auto_save=False)
     peer = small(made, result_timeout_s=20.0)
     assert peer.act(names.START_SPEC).ok
@@ -445,7 +443,7 @@ def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file"])
-def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> None:
+def test_slow_spectrum_is_awaited(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.strike(kind, duration_s=3.0)
@@ -453,7 +451,7 @@ def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) ->
     assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
 
 
-def test_a_spectrum_whose_name_was_there_already_is_the_new_one(bench: Make) -> None:
+def test_spectrum_with_an_existing_name_is_the_new_one(bench: Make) -> None:
     """GXSM overwrites it."""
     made = bench(speed=20.0)
     (made.data / "scan001-VP001-VP.vpdata").write_text("of last year")

@@ -47,7 +47,7 @@ def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_p
     assert seen == [{}, {"b": 100}, {"b": 200}, {"b": 200, "a": 50}, {"b": 200, "a": 100}]
 
 
-def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
+def test_next_number_is_the_first_free_one(tmp_path: Path) -> None:
     saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
     (tmp_path / "scan001-Xp-a.nc").touch()
     number = saving.next_number()
@@ -116,7 +116,7 @@ def test_a_scan_written_by_the_emulator_reads_as_the_real_one(tmp_path: Path, ve
 
 @needs_data
 @pytest.mark.parametrize(("version", "label"), BOTH)
-def test_what_is_in_a_file_is_in_the_real_one_too(tmp_path: Path, version: int, label: str) -> None:
+def test_file_has_the_variables_of_a_real_one(tmp_path: Path, version: int, label: str) -> None:
     """Every variable, with the same type, dimensions and order of its values."""
     real = DATA / REAL[version][label]
     ours = written(tmp_path, version, label, real)

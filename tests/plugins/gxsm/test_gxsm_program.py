@@ -113,7 +113,7 @@ def _readable(path: Path) -> bool:
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]) -> None:
+def test_set_never_reports_a_refusal(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(user_unit="nm", **kind)
     with calling(made) as gxsm:
         assert gxsm.call("set", "RangeX", "30.5") == 0
@@ -145,7 +145,7 @@ def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]
         assert not_converted(gxsm, "set")
 
 
-def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
+def test_reported_names_may_be_existing_files_until_saving(bench: Make) -> None:
     """And in the first moments of a scan those of the scan before."""
     made = bench(speed=SEEN)
     for name in ("scan001-M-Xp-ZSmTopo.nc", "scan002-M-Xp-ZSmTopo.nc"):
@@ -172,7 +172,7 @@ def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
         assert gxsm.call("chfname", 4) == "EE: invalid channel"
 
 
-def test_a_scan_that_is_stopped_is_saved_with_the_rows_of_the_one_before(bench: Make) -> None:
+def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> None:
     made = bench(speed=SEEN)
     with calling(made) as gxsm:
         small(gxsm)
@@ -221,7 +221,7 @@ def test_a_decimal_comma_cuts_numbers(bench: Make) -> None:
         assert gxsm.call("get", "RangeX") == 12.75
 
 
-def test_the_bits_of_the_redpitaya_mean_other_things(bench: Make) -> None:
+def test_status_bits_of_the_redpitaya_differ(bench: Make) -> None:
     made = bench(speed=SEEN, card="RPSPMC")
     with calling(made) as gxsm:
         small(gxsm)
@@ -284,13 +284,13 @@ def test_gxsms_own_simulator_has_its_own_names(bench: Make, version: int) -> Non
             assert gxsm.call("rtquery", code)[0] == 0.0 or abs(gxsm.call("rtquery", code)[0]) > 1e-300
 
 
-def test_what_action_returns_in_3_is_not_looked_at(bench: Make) -> None:
+def test_result_of_action_in_gxsm3_is_not_touched(bench: Make) -> None:
     with calling(bench(version=3)) as gxsm:
         assert gxsm.call("action", "CHECK-MainAutoSave") is None
         assert gxsm.call("action", "nonsense") is None
 
 
-def test_the_bridge_passes_on_what_it_was_made_for_and_nothing_else(bench: Make) -> None:
+def test_bridge_passes_on_allowed_methods_only(bench: Make) -> None:
     made = bench()
     with calling(made) as gxsm:
         for method in ("waitscan", "load", "__class__", "signal"):
@@ -311,7 +311,7 @@ PAGE = (
     [PAGE, b'["set", "RangeX", "12"]\n', b"0" * 64 + b'\n["set", "RangeX", "12"]\n', b'\n["set", "RangeX", "12"]\n'],
     ids=["a page", "no secret", "another", "nothing"],
 )
-def test_the_bridge_does_nothing_for_who_does_not_know_the_secret(bench: Make, sent: bytes) -> None:
+def test_bridge_refuses_clients_without_the_secret(bench: Make, sent: bytes) -> None:
     made = bench()
     host, _, port = made.address.rpartition(":")
     with socket.create_connection((host, int(port)), 10.0) as stranger:
@@ -324,7 +324,7 @@ def test_the_bridge_does_nothing_for_who_does_not_know_the_secret(bench: Make, s
 
 
 @pytest.mark.parametrize("line", [b"Host: x", b"{}", b"[]", b"[1]", b'["get", {}]', b"[" * 9000, b"\xff"])
-def test_the_bridge_hangs_up_at_the_first_line_that_is_no_call(bench: Make, line: bytes) -> None:
+def test_bridge_disconnects_at_the_first_malformed_line(bench: Make, line: bytes) -> None:
     made = bench()
     with calling(made) as gxsm:
         assert isinstance(gxsm, SocketClient)
@@ -334,7 +334,7 @@ def test_the_bridge_hangs_up_at_the_first_line_that_is_no_call(bench: Make, line
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions as Unix has them")
-def test_nobody_else_can_read_the_secret(bench: Make) -> None:
+def test_other_users_can_not_read_the_secret(bench: Make) -> None:
     bench()
     file = Path("~/.afspm/gxsm-bridge-secret").expanduser()
     assert file.stat().st_mode & 0o777 == 0o600
@@ -395,7 +395,7 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
         np.testing.assert_allclose(content.spectra[0].values[:, 0], true.values[:, 0], rtol=1e-9)
 
 
-def test_the_frequency_shift_is_that_of_the_picture_and_of_the_setpoint(bench: Make) -> None:
+def test_frequency_shift_matches_picture_and_setpoint(bench: Make) -> None:
     made = bench(speed=20.0, surface="steps", **NON_CONTACT)
 
     def told(code: str) -> float:
@@ -449,7 +449,7 @@ def test_arguments_that_c_does_not_convert_are_refused(bench: Make, kind: dict[s
         assert gxsm.call("get", "PointsX") == 64.0
 
 
-def test_a_scan_that_can_not_be_simulated_does_not_begin(bench: Make) -> None:
+def test_impossible_scan_does_not_start(bench: Make) -> None:
     made = bench(speed=SEEN)
     with calling(made) as gxsm:
         small(gxsm)

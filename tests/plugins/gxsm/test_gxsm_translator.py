@@ -44,7 +44,7 @@ KIND_IDS = ["gxsm3", "gxsm4", "gxsm4-shm", "rpspmc-nm"]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dict[str, Any]) -> None:
+def test_scan_has_exactly_the_frame_that_was_set(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(**kind)
     peer = made.start()
     ready(peer)
@@ -62,7 +62,7 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dic
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, kind: dict[str, Any]) -> None:
+def test_rows_and_columns_match_the_sample(bench: Make, kind: dict[str, Any]) -> None:
     """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT, **kind)
     peer = made.start()
@@ -86,7 +86,7 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, kind: dict[
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_a_scan_that_is_stopped_gives_none(bench: Make, kind: dict[str, Any]) -> None:
+def test_stopped_scan_is_not_published(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(speed=20.0, **kind)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -99,7 +99,7 @@ def test_a_scan_that_is_stopped_gives_none(bench: Make, kind: dict[str, Any]) ->
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
 
 
-def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
+def test_existing_file_numbers_are_skipped(bench: Make) -> None:
     """GXSM begins at 001 with each start: it names what is there already, and then counts each channel by itself."""
     made = bench()
     (made.data / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
@@ -113,7 +113,7 @@ def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
     assert found["I-Tunnel"].filename.endswith("scan001-Xp-ImTunnel.nc")
 
 
-def test_a_scan_that_is_saved_twice_is_published_once(bench: Make) -> None:
+def test_scan_saved_twice_is_published_once(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -137,7 +137,9 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
 @pytest.mark.parametrize(
     ("version", "live_lines_s", "speed", "rows"), [(3, 1.0, 5.0, 40), (4, 1.0, 5.0, 40), (4, 0.05, 1.0, 8)]
 )
-def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: float, speed: float, rows: int) -> None:
+def test_lines_are_published_during_a_scan(
+    bench: Make, version: int, live_lines_s: float, speed: float, rows: int
+) -> None:
     """Of the second scan on: only files tell what channels are called. Before its first line is in, GXSM tells of the
     scan before."""
     made = bench(speed=speed, version=version)
@@ -165,7 +167,7 @@ def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: floa
 
 
 @pytest.mark.parametrize("user_unit", ["Å", "nm", "µm"])
-def test_lengths_are_right_whatever_unit_the_panel_has(bench: Make, user_unit: str) -> None:
+def test_lengths_are_right_in_any_panel_unit(bench: Make, user_unit: str) -> None:
     made = bench(user_unit=user_unit)
     peer = made.start()
     ready(peer)
@@ -176,7 +178,7 @@ def test_lengths_are_right_whatever_unit_the_panel_has(bench: Make, user_unit: s
     assert made.emulator.rig.probe_m == pytest.approx((50e-9, -20e-9), rel=1e-9)
 
 
-def test_the_size_in_x_alone_leaves_that_in_y_as_it_is(bench: Make) -> None:
+def test_setting_the_size_in_x_keeps_the_size_in_y(bench: Make) -> None:
     """Setting RangeX, GXSM changes RangeY, too."""
     made = bench()
     peer = made.start()
@@ -188,7 +190,7 @@ def test_the_size_in_x_alone_leaves_that_in_y_as_it_is(bench: Make) -> None:
     assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], abs=1e-15)
 
 
-def test_what_is_set_is_told_to_the_last_digit(bench: Make) -> None:
+def test_settings_are_reported_to_the_last_digit(bench: Make) -> None:
     peer = bench(user_unit="nm").start()
     ready(peer)
     for name, value in {
@@ -250,9 +252,7 @@ def test_the_feedback_is_not_switched_by_actions_that_this_gxsm_lacks(bench: Mak
 
 
 @pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}, {"card": "simulator"}], ids=["sranger", "rpspmc", "sim"])
-def test_a_pulse_is_a_bias_that_is_put_back(
-    bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pulse_restores_the_bias(bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench(speed=1.0, **settings)
     peer = made.start()
     ready(peer)
@@ -271,7 +271,7 @@ def test_a_pulse_is_a_bias_that_is_put_back(
     assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
 
 
-def test_a_pulse_of_a_translator_that_was_killed_is_ended_by_the_next(bench: Make) -> None:
+def test_pulse_of_a_killed_translator_is_ended_by_the_next(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = made.start()
     ready(peer)
@@ -283,7 +283,7 @@ def test_a_pulse_of_a_translator_that_was_killed_is_ended_by_the_next(bench: Mak
     assert made.emulator.rig.setup.bias_v == 0.1
 
 
-def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_is_defined_in_the_experiment_file(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench(speed=5.0)
     peer = made.start(
         parameters={
@@ -302,7 +302,7 @@ def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pyte
     assert crashes == [pytest.approx((2e-9, 50e-9))]
 
 
-def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
+def test_missing_hardware_features_are_not_supported(bench: Make) -> None:
     """GXSM answers -inf, or worse, for parameters that it does not have: it is not asked for them."""
     made = bench(card="simulator")
     peer = made.start()
@@ -371,7 +371,7 @@ def test_other_parameters_and_actions_of_the_experiment_file(bench: Make) -> Non
 # --- the probe, and spectra ---
 
 
-def test_the_probe_is_sent_into_the_frame_and_nowhere_else(bench: Make) -> None:
+def test_probe_moves_only_within_the_frame(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -393,7 +393,7 @@ def test_the_probe_is_sent_into_the_frame_and_nowhere_else(bench: Make) -> None:
         ("VP", "Bias-mon", {"card": "RPSPMC"}),
     ],
 )
-def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first: str, settings: dict[str, Any]) -> None:
+def test_spectrum_has_its_position(bench: Make, kind: str, first: str, settings: dict[str, Any]) -> None:
     """A scan in between moves the tip: it is sent back first."""
     made = bench(speed=20.0, **settings)
     peer = made.start()
@@ -461,7 +461,7 @@ def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dic
     assert not any(isinstance(one, Spectrum) for one in heard)
 
 
-def test_a_spectrum_is_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) -> None:
+def test_spectrum_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()
     ready(peer)
@@ -474,7 +474,7 @@ def test_a_spectrum_is_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) ->
 
 
 @pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}], ids=["sranger", "rpspmc"])
-def test_a_spectrum_is_not_taken_into_a_scan_that_somebody_began_meanwhile(
+def test_spectrum_is_not_taken_during_a_scan_from_the_panel(
     bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = bench(speed=4.0, **settings)
@@ -544,7 +544,7 @@ def until_line(made: Bench, line: int) -> None:
         pace.wait(0.005)
 
 
-def test_a_scan_that_a_person_begins_again_at_once_is_published_as_two(bench: Make) -> None:
+def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
     """Stopped, and begun again before the translator has looked: the first is broken off, the second is whole."""
     made = bench(speed=10.0)
     peer = made.start()
@@ -597,7 +597,7 @@ def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
     assert len(scanned(peer)) == 4
 
 
-def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Make) -> None:
+def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
     """An hour back is more than a scan lasts: each of them seems to have begun before the one before it."""
     made = bench(speed=20.0)
     peer = made.start()
@@ -607,7 +607,7 @@ def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Ma
         assert len(scanned(peer)) == 4
 
 
-def test_a_scan_that_begins_sooner_after_it_was_asked_for_than_the_one_before_is_new(bench: Make) -> None:
+def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
     """At a hundred times the speed a busy computer takes half a minute to begin one."""
     made = bench()
     peer = made.start()
@@ -622,7 +622,7 @@ def test_a_scan_that_begins_sooner_after_it_was_asked_for_than_the_one_before_is
     assert len(scanned(peer)) == 4
 
 
-def test_what_a_redpitaya_measures_at_its_panel_does_not_publish_the_scan_before_again(bench: Make) -> None:
+def test_redpitaya_measurement_at_the_panel_does_not_republish_the_previous_scan(bench: Make) -> None:
     """It does not tell a spectrum from a scan, and what is in its memory is saved again when it is over."""
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
@@ -634,7 +634,7 @@ def test_what_a_redpitaya_measures_at_its_panel_does_not_publish_the_scan_before
     assert not scans(heard)
 
 
-def test_busy_is_said(bench: Make) -> None:
+def test_busy_microscope_is_reported(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -647,7 +647,7 @@ def test_busy_is_said(bench: Make) -> None:
 # --- over a restart ---
 
 
-def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(bench: Make) -> None:
+def test_scan_ended_without_a_translator_is_published_by_the_next(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -664,7 +664,7 @@ def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(
 
 
 @pytest.mark.parametrize(("version", "told"), [(3, "gxsm3 3.54.0"), (4, "gxsm4 4.4.1")])
-def test_its_version_is_told_once_there_is_a_file_of_it(bench: Make, version: int, told: str) -> None:
+def test_version_is_reported_after_the_first_file(bench: Make, version: int, told: str) -> None:
     made = bench(version=version)
     peer = made.start()
     ready(peer)

@@ -46,7 +46,7 @@ def test_an_error_of_the_controller_leaves_the_connection_as_it_is() -> None:
         assert link.ask("Bias.Get") == (0.5,)
 
 
-def test_the_answer_to_another_question_is_never_taken_for_one() -> None:
+def test_answer_to_another_request_is_refused() -> None:
     """After it nothing on this connection is believed any more."""
     late = wire.reply("Current.Get", wire.body("Current.Get", [0.5], 0))
     with talking(late, GOOD) as link:
@@ -58,7 +58,7 @@ def test_the_answer_to_another_question_is_never_taken_for_one() -> None:
 
 @pytest.mark.parametrize("part", [0, 20, 40, 42, len(GOOD) - 1])
 @pytest.mark.parametrize("silent", [False, True])
-def test_a_reply_that_stops_is_noticed_in_time(part: int, silent: bool) -> None:
+def test_truncated_reply_is_noticed_in_time(part: int, silent: bool) -> None:
     begun_s = time.perf_counter()
     with (
         talking(GOOD[:part], silent=silent) as link,
@@ -68,7 +68,7 @@ def test_a_reply_that_stops_is_noticed_in_time(part: int, silent: bool) -> None:
     assert time.perf_counter() - begun_s < 5.0
 
 
-def test_who_waits_is_woken_by_closing() -> None:
+def test_closing_wakes_a_waiting_thread() -> None:
     errors: list[Exception] = []
     with talking(b"", silent=True) as link:
 
@@ -87,7 +87,7 @@ def test_who_waits_is_woken_by_closing() -> None:
 
 @given(st.binary(max_size=120), st.booleans())
 @settings(max_examples=60)
-def test_any_bytes_are_an_answer_or_an_error_with_a_name(content: bytes, headed: bool) -> None:
+def test_any_bytes_are_an_answer_or_a_named_error(content: bytes, headed: bool) -> None:
     reply = b"Bias.Get".ljust(32, b"\0") + struct.pack(">i", len(content)) + bytes(4) + content if headed else content
     with talking(reply) as link, suppress(ControllerLost, NanonisError):
         assert isinstance(link.ask("Bias.Get")[0], float)

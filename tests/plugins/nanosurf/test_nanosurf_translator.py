@@ -29,7 +29,7 @@ FREE = ScopeState.FREE
 
 @pytest.mark.parametrize("release", [17, 19])
 @pytest.mark.parametrize("direction", ["up", "down"])
-def test_a_scan_shows_the_sample_as_it_lies(bench: Make, release: int, direction: str) -> None:
+def test_scan_shows_the_sample_in_place(bench: Make, release: int, direction: str) -> None:
     made = bench(release=release, tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start(release=release)
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -64,7 +64,7 @@ def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
-def test_lines_come_while_it_scans(bench: Make, direction: str) -> None:
+def test_lines_are_published_during_a_scan(bench: Make, direction: str) -> None:
     made = bench(speed=5.0)
     peer = made.start(live_lines_s=1.0, image_buffer=4410)
     ready(peer, shape=(40, 32))
@@ -124,9 +124,7 @@ def test_a_force_curve_can_be_stopped(bench: Make) -> None:
     assert not any(isinstance(one, Spectrum) for one in heard)
 
 
-def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(
-    bench: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     """They go by two connections."""
     stops: list[StudioProgram] = []
     stop_curve = StudioProgram.stop_curve
@@ -173,7 +171,7 @@ def test_the_tip_is_withdrawn_where_a_second_connection_waits(bench: Make) -> No
     assert not made.emulator.rig.engaged
 
 
-def test_a_run_that_is_stopped_stops_the_scan(bench: Make) -> None:
+def test_stopped_run_stops_the_scan(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start(retracts=True)
     ready(peer, shape=(64, 32))
@@ -198,7 +196,7 @@ def test_settings_reach_the_instrument(bench: Make) -> None:
     assert math.isclose(float(peer.get(names.ZCTRL_IGAIN)), 2500)
 
 
-def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
+def test_restarted_translator_finds_the_scan(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -222,15 +220,13 @@ def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
         ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
     ],
 )
-def test_what_does_not_fit_is_told(
-    bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str
-) -> None:
+def test_mismatches_are_reported(bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str) -> None:
     made = bench(**emulator)
     made.start(**settings)
     made.until_said(told)
 
 
-def test_values_that_studio_refuses_change_none(bench: Make) -> None:
+def test_refused_values_change_none(bench: Make) -> None:
     made = bench()
     peer = made.start(parameters={"scan-speed": {"range": [1e-9, 1.0]}})
     ready(peer)
@@ -242,7 +238,7 @@ def test_values_that_studio_refuses_change_none(bench: Make) -> None:
     assert made.emulator.program.values == before  # type: ignore[attr-defined]
 
 
-def test_no_command_is_called_that_the_release_does_not_have(bench: Make) -> None:
+def test_commands_missing_in_the_release_are_not_called(bench: Make) -> None:
     made = bench(release=19)
     asked: list[bytes] = []
     answer = made.emulator.answer

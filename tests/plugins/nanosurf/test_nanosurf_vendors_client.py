@@ -67,7 +67,7 @@ def emulated() -> Emulated:
     return Emulated(seed=2, start_s=0.01, file_s=0.01)
 
 
-def test_it_finds_the_application_and_its_release(tmp_path: Path, client: Run) -> None:
+def test_client_finds_the_application_and_its_release(tmp_path: Path, client: Run) -> None:
     with emulated().running(tmp_path / "gallery") as address:
         told = client(
             address,
@@ -79,7 +79,7 @@ print(json.dumps({"version": studio.version(), "list": listed}))
     assert told == {"version": [19, 0], "list": ["91-01-000"]}
 
 
-def test_it_measures_as_the_makers_example_does(tmp_path: Path, client: Run) -> None:
+def test_client_measures_as_in_the_makers_example(tmp_path: Path, client: Run) -> None:
     made = emulated()
     with made.running(tmp_path / "gallery") as address:
         told = client(
@@ -220,7 +220,7 @@ print(json.dumps({**found, "said": said}))
     assert len(told["said"]) == 9  # type: ignore[arg-type]
 
 
-def test_an_error_of_a_script_is_an_error_of_the_client(tmp_path: Path, client: Run) -> None:
+def test_script_error_is_raised_by_the_client(tmp_path: Path, client: Run) -> None:
     with emulated().running(tmp_path / "gallery") as address:
         told = client(
             address,

@@ -29,7 +29,7 @@ VARIANTS: list[Settings] = [
 ]
 
 
-def test_a_scan_shows_the_sample_as_it_lies(bench: Make) -> None:
+def test_scan_shows_the_sample_in_place(bench: Make) -> None:
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start()
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -51,9 +51,7 @@ def test_a_scan_shows_the_sample_as_it_lies(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_withdrawn(
-    bench: Make, variant: Settings
-) -> None:
+def test_tip_moves_scans_and_withdraws_with_every_form_of_reply(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = made.start()
     ready(peer)
@@ -67,7 +65,7 @@ def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_w
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, variant: Settings) -> None:
+def test_refusal_has_smartscans_own_text(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = small(made)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
@@ -90,7 +88,7 @@ def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("scanning", [True, False])
-def test_the_tip_is_withdrawn_when_the_run_ends(bench: Make, scanning: bool) -> None:
+def test_tip_is_withdrawn_at_the_end_of_a_run(bench: Make, scanning: bool) -> None:
     made = bench(speed=10.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
@@ -107,7 +105,7 @@ def test_the_tip_is_withdrawn_when_the_run_ends(bench: Make, scanning: bool) -> 
         ("dialog", "a dialog may wait on its screen"),
     ],
 )
-def test_a_bad_reply_has_a_name_and_smartscan_is_found_again(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_smartscan_reconnected(bench: Make, kind: str, told: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=500.0)
@@ -119,21 +117,21 @@ def test_a_bad_reply_has_a_name_and_smartscan_is_found_again(bench: Make, kind: 
     assert scans(peer.until(FREE))
 
 
-def test_a_word_that_is_not_known_is_named_and_not_guessed_at(bench: Make) -> None:
+def test_unknown_word_is_named_and_not_guessed(bench: Make) -> None:
     made = bench(scan_words=("true", "schläft"))
     with pytest.raises(AssertionError):
         small(made, **SOON)
     made.until_said("replied 'schläft' to scan_query")
 
 
-def test_a_word_can_be_taught(bench: Make) -> None:
+def test_words_can_be_added(bench: Make) -> None:
     peer = bench(scan_words=("misst", "ruht")).start(scanning_words=["misst"], idle_words=["Ruht"])
     ready(peer)
     assert scanned(peer)
 
 
 @pytest.mark.parametrize(("kind", "state"), [("late-file", "FREE"), ("half-file", "FREE")])
-def test_a_file_that_is_late_is_waited_for(bench: Make, kind: str, state: str) -> None:
+def test_late_file_is_awaited(bench: Make, kind: str, state: str) -> None:
     made = bench()
     peer = small(made)
     made.strike(kind, duration_s=300.0)
@@ -175,7 +173,7 @@ def test_a_curve_can_be_stopped(bench: Make) -> None:
     assert not any(isinstance(one, Spectrum) for one in heard)
 
 
-def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(bench: Make) -> None:
+def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make) -> None:
     """They go by two connections."""
     made = bench(speed=1.0, force={"duration_s": 20.0})
     peer = small(made)
@@ -194,7 +192,7 @@ def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(bench: Make)
     assert len(stops) > 1
 
 
-def test_a_curve_that_is_stopped_on_the_way_to_it_is_not_taken(bench: Make) -> None:
+def test_curve_stopped_during_the_move_to_it_is_not_taken(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -218,7 +216,7 @@ def test_withdrawing_ends_a_curve(bench: Make) -> None:
     assert not made.emulator.rig.engaged
 
 
-def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
+def test_refused_curve_has_no_result(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
@@ -228,7 +226,7 @@ def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
     made.until_said("busy with a calibration")
 
 
-def test_a_gain_is_set_and_leaves_the_others(bench: Make) -> None:
+def test_setting_one_gain_keeps_the_others(bench: Make) -> None:
     made = bench()
     peer = small(made)
     assert peer.set(names.ZCTRL_IGAIN, 0.25).ok
@@ -238,7 +236,7 @@ def test_a_gain_is_set_and_leaves_the_others(bench: Make) -> None:
     assert peer.set(names.ZCTRL_PGAIN, 1000.0).code == ControlResponse.PARAM_ERROR
 
 
-def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> None:
+def test_unreported_gains_are_not_supported(bench: Make) -> None:
     made = bench(reports_gains=False)
     peer = small(made)
     assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
@@ -247,7 +245,7 @@ def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> No
 
 
 @pytest.mark.parametrize("kind", ["spectrum-refused", "no-file"])
-def test_a_curve_without_a_file_is_told_to_be_missing(bench: Make, kind: str) -> None:
+def test_curve_without_a_file_is_reported(bench: Make, kind: str) -> None:
     made = bench()
     peer = small(made, result_timeout_s=2.0)
     made.strike(kind)
@@ -261,7 +259,7 @@ def test_a_curve_without_a_file_is_told_to_be_missing(bench: Make, kind: str) ->
 
 
 @pytest.mark.parametrize("replies", ["at-end", "at-once"])
-def test_command_that_takes_long_keeps_the_microscope_busy_and_connected(bench: Make, replies: str) -> None:
+def test_long_command_keeps_the_microscope_busy_and_connected(bench: Make, replies: str) -> None:
     made = bench(speed=1.0, replies=replies)  # a sweep takes 3 s, and a reply may take one
     peer = small(made, actions={"x-sweep": {"command": "spm.ncm.sweepAutoFullRange()"}}, reply_timeout_s=1.0)
     assert peer.act("x-sweep").ok
@@ -269,7 +267,7 @@ def test_command_that_takes_long_keeps_the_microscope_busy_and_connected(bench: 
     assert not made.emulator.rig.busy(made.clock.now_s())
 
 
-def test_command_that_smartscan_does_not_know_is_refused_in_its_words(bench: Make) -> None:
+def test_unknown_command_is_refused_with_smartscans_own_text(bench: Make) -> None:
     peer = small(bench(), actions={"x-mode": {"command": "spm.head.setMode('ncm')"}})
     response = peer.act("x-mode")
     assert response.code == ControlResponse.ACTION_ERROR
