@@ -1,4 +1,4 @@
-"""The files of the simulated controller: read back exactly, and readable elsewhere."""
+"""Files of the simulated controller: exact round trips, readable by other programs."""
 
 from __future__ import annotations
 

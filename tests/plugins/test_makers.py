@@ -1,4 +1,4 @@
-"""The contract of every maker's translator, against its emulated controller: one test for all of them."""
+"""The contract of every maker's translator, with its emulated controller."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Maker:
     """A maker.
 
     Attributes:
-        name: of its folder.
-        height: the channel of the heights, forward.
-        number: of a scan, in the name of its file: a pattern with one group.
-        start: a scan at the panel, with the emulator and the time.
+        name: name of its folder.
+        height: channel of the heights, forward.
+        number: pattern for a file name, with the scan's number as its group.
+        start: starts a scan at the panel, given the emulator and the time.
     """
 
     name: str
@@ -86,7 +86,7 @@ def test_consecutive_scans_have_files_of_their_own(maker: Maker, bench: Make) ->
 
 @pytest.mark.parametrize("maker", [MAKERS[name] for name in ("nanonis", "nanosurf", "park")], ids=lambda one: one.name)
 def test_stopped_scan_is_not_published(maker: Maker, bench: Make) -> None:
-    """Of GXSM, and of Asylum, which withdraws the tip, their own tests have more to say."""
+    # GXSM and Asylum (which withdraws the tip) have further tests of their own.
     peer = bench(speed=10.0).start()
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
@@ -114,7 +114,7 @@ def test_scan_from_the_panel_is_published(maker: Maker, bench: Make) -> None:
 
 @pytest.mark.parametrize("maker", [MAKERS[name] for name in ("asylum", "nanosurf", "park")], ids=lambda one: one.name)
 def test_scan_that_does_not_start_is_refused(maker: Maker, bench: Make) -> None:
-    """GXSM and Nanonis, whose scans may begin late, are not waited for."""
+    # Not GXSM and Nanonis, whose scans may start late.
     made = bench()
     peer = small(made)
     made.strike("scan-refused")

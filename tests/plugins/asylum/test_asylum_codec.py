@@ -1,4 +1,4 @@
-"""What needs no socket: requests and replies, frames, and folders."""
+"""Asylum without sockets: requests and replies, frames, folders."""
 
 from __future__ import annotations
 
@@ -188,7 +188,7 @@ def test_frame_at_speed_zero_is_refused(value: float) -> None:
 
 
 def test_asylum_angles_are_clockwise() -> None:
-    """As its software reckons where a scan begins: the fast axis lies along (cos, -sin) of ScanAngle."""
+    # Asylum's software calculates the start of a scan with the fast axis along (cos, -sin) of ScanAngle.
     there = {"XOffset": 0.0, "YOffset": 0.0, "FastScanSize": 2e-6, "SlowScanSize": 1e-6, "ScanAngle": 90.0}
     told = generic(there | {"ScanPoints": 8, "ScanLines": 8, "ScanRate": 1.0})
     corner = (told[names.SCAN_TOP_LEFT_X], told[names.SCAN_TOP_LEFT_Y])

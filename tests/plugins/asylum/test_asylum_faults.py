@@ -1,4 +1,4 @@
-"""What can go wrong at an Asylum microscope: each gives an error with a name, nothing hangs, and it is found again."""
+"""Faults of an Asylum microscope: each is a named error, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNDEFINED = ScopeState.UNDEFINED
 
 
 def scans_again(peer: Peer) -> list[Scan]:
-    """It works."""
+    """Scan once more, to show that the translator works."""
     response = peer.act(names.START_SCAN)
     assert response.ok, response.reason
     found = scans(peer.until(FREE))

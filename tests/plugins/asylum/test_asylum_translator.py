@@ -1,4 +1,4 @@
-"""The Asylum translator against the emulated microscope: everything that a peer may ask for, as it sees it."""
+"""The Asylum translator with the emulated microscope: every request of a peer, and its effects."""
 
 from __future__ import annotations
 
@@ -71,7 +71,8 @@ def test_scan_has_the_set_frame_to_the_last_digit(bench: Make) -> None:
 
 @pytest.mark.parametrize("direction", ["up", "down"])
 def test_rows_and_columns_match_the_sample(bench: Make, direction: str) -> None:
-    """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
+    # Compared with the heights of the simulated sample at each pixel: an offset by half a frame or a mirrored axis
+    # shows.
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start()
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -130,7 +131,6 @@ def test_consecutive_images_from_the_panel_are_each_published_once(bench: Make) 
     ready(peer)
 
     def suffix(last_scan: bool = False) -> int:
-        """Of the image that is being scanned."""
         found: list[float] = []
 
         def at_panel(emulator: Emulated) -> None:
@@ -184,7 +184,6 @@ def test_frame_changed_by_asylum_is_logged(bench: Make) -> None:
 
 
 def test_frame_in_asylums_values(bench: Make) -> None:
-    """Its offsets are the centre, the longer side is ScanSize, and the ratios tell the other one."""
     made = bench()
     peer = made.start()
     ready(peer)
@@ -225,7 +224,7 @@ def test_feedback_is_set_and_switched(bench: Make) -> None:
 
 
 def test_withdrawn_tip_is_not_reported_without_feedback(bench: Make) -> None:
-    """It is in no danger: a scheduler would have it retracted, and call a person."""
+    # A withdrawn tip is in no danger: the scheduler would retract it again and notify a person.
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -355,7 +354,7 @@ def test_controller_name_and_base_name(bench: Make) -> None:
 def test_a_base_name_of_another_night_overwrites_nothing(
     bench: Make, monkeypatch: pytest.MonkeyPatch, without: tuple[str, ...]
 ) -> None:
-    """ARCheckSuffix finds the next number that is free; a release without it would begin with 0000 again."""
+    # ARCheckSuffix finds the next free number; a release without it would start with 0000 again.
     made = bench()
     functions = made.emulator.functions()
     monkeypatch.setattr(made.emulator, "_functions", {k: f for k, f in functions.items() if k not in without})
@@ -489,7 +488,7 @@ def test_force_curve_has_its_position(bench: Make) -> None:
 
 
 def test_force_curve_after_a_scan_is_taken_at_the_probe_position(bench: Make) -> None:
-    """A scan leads the tip away from there."""
+    # A scan moves the tip away.
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
@@ -567,7 +566,6 @@ def test_pulse_restores_the_bias(bench: Make, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_crash_is_an_unsaved_indentation(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the README has it."""
     made = bench(speed=5.0)
     peer = made.start(
         parameters={

@@ -1,4 +1,4 @@
-"""The emulated ZeroMQ-XOP against its reference calls, by plain ZeroMQ clients that know nothing of the translator."""
+"""The emulated ZeroMQ-XOP against its reference calls, with plain ZeroMQ clients."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def client(address: str) -> Iterator[Client]:
 
 
 def values(reply: dict[str, Any]) -> list[Any]:
-    """All that is told in a reply."""
+    """Return all values in a reply."""
     result = reply.get("result", [])
     told = [*(result if isinstance(result, list) else [result]), *reply.get("passByReference", [])]
     return [reply.get("messageID"), *(str(one["value"]) for one in told)]
@@ -145,7 +145,7 @@ def test_numbers_are_read_as_strtod_reads_them(client: Client, text: str, value:
 
 
 def test_errors_are_checked_in_the_xops_order(client: Client) -> None:
-    """How many, then numbers, then what is given back, then what can't be passed."""
+    # Number of parameters, then numbers, then result types, then parameter types.
     for name, parameters, error in (
         ("TestFunctionVariableAndWave", ("1.a",), 102),
         ("TestFunctionVariableAndWave", ("1.a", 1), 106),

@@ -1,4 +1,4 @@
-"""The GXSM translator as a real process, an emulated GXSM beside it, and a peer on the translator's sockets."""
+"""Bench: the GXSM translator as a process, an emulated GXSM, and a peer on the translator's sockets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from afspm.plugins.gxsm.emulator import GxsmEmulator
 
 
 class Emulated(AtPanel, GxsmEmulator):
-    """With somebody at its panel."""
+    """An emulated GXSM with a person at its panel."""
 
 
 class Bench(VendorBench[Emulated]):

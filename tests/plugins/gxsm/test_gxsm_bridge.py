@@ -1,4 +1,4 @@
-"""The script in GXSM's console, attacked from outside: by programs that do not know its secret, and by slow ones."""
+"""Attacks on the bridge from outside: by programs without its secret, and by slow ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROVES_S = 0.3
 
 
 class Gxsm:
-    """The module `gxsm`, as far as the bridge needs it here."""
+    """The part of the module `gxsm` that the bridge needs."""
 
     wanted = 1.0
 
@@ -38,7 +38,7 @@ class Gxsm:
 
 @pytest.fixture
 def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], str]]:
-    """Runs bridges, which end with the test; a client has less time than at a real one."""
+    """Run bridges until the end of the test; deadlines of clients are shorter than in reality."""
     gxsm = Gxsm()
     for name, value in {"gxsm": gxsm, "PROVES_S": PROVES_S, "LOOK_S": 0.02}.items():
         monkeypatch.setattr(bridge, name, value)
@@ -74,7 +74,7 @@ def link(address: str) -> BridgeLink:
 
 @contextmanager
 def listening_in_its_place(answer: Callable[[bytes], bytes]) -> Iterator[tuple[str, bytearray]]:
-    """A program of another user, which listens where the bridge should; all that was sent to it."""
+    """Another user's program in place of the bridge; collects all received bytes."""
     received = bytearray()
 
     def listen(listener: socket.socket) -> None:
@@ -92,7 +92,7 @@ def listening_in_its_place(answer: Callable[[bytes], bytes]) -> Iterator[tuple[s
 
 
 def test_listener_in_place_of_the_bridge_learns_nothing_useful(serving: Callable[[], str]) -> None:
-    """Neither the secret, nor a line that the bridge takes for the proof of a client."""
+    # Neither the secret, nor a line that the bridge would accept as a client's proof.
     address = serving()
     secret = bridge.secret()
     reply = json.dumps({"value": ["0" * 64, "1" * 64]}).encode() + b"\n"
@@ -111,7 +111,7 @@ def test_listener_in_place_of_the_bridge_learns_nothing_useful(serving: Callable
 
 
 def test_a_program_between_client_and_bridge_is_refused(serving: Callable[[], str]) -> None:
-    """It passes on every line, and would then call GXSM itself."""
+    # A relay passes on every line, in order to call GXSM itself afterwards.
     with connected(serving()) as real, real.makefile("rb") as replies:
 
         def pass_on(line: bytes) -> bytes:
@@ -205,7 +205,7 @@ def test_the_readme_describes_the_proofs_of_the_bridge() -> None:
 
 
 def test_script_runs_with_the_standard_library_only() -> None:
-    """Neither another package, nor a newer Python than systems with Gxsm3 have."""
+    # Neither another package, nor a newer Python than on systems with Gxsm3.
     tree = ast.parse(Path(bridge.__file__).read_text(encoding="utf-8"), feature_version=(3, 8))
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     imported |= {one.name for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}

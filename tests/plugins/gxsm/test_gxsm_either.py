@@ -1,6 +1,6 @@
-"""What holds for the emulated GXSM and for a real one: set AFSPM_GXSM to its address ("shm", "127.0.0.1:65431").
+"""Tests for the emulated and a real GXSM: set AFSPM_GXSM to its address ("shm", "127.0.0.1:65431").
 
-Its tip is moved, and it scans some nanometres about where it is: use its own simulator (`-h SPM-SIM:SPM`), or withdraw.
+The tip moves and scans some nanometres at its place: use GXSM's own simulator (`-h SPM-SIM:SPM`), or withdraw.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SHAPE = (24, 32)
 
 @pytest.fixture(params=[*EMULATED, "real"])
 def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
-    """A translator's, with a small frame in force; what was in force is put back."""
+    """A peer of a translator with a small frame; the previous settings are restored."""
     with ExitStack() as stack:
         if request.param != "real":
             found = Bench(tmp_path, stack, 5.0, EMULATED[request.param]).start()

@@ -1,4 +1,4 @@
-"""What can go wrong at GXSM: each gives an error with a name, nothing hangs, and it is found again."""
+"""Faults of GXSM: each is a named error, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BRIDGE: dict[str, Any] = {}
 
 
 def small(made: Bench, **settings: object) -> Peer:
-    """A translator that has found GXSM, with a frame of few pixels in force."""
+    """Start a translator with a small frame."""
     peer = made.start(**settings)
     ready(peer, Region((0.0, 0.0), (100e-9, 1e-6)), (8, 16))
     return peer
@@ -75,7 +75,7 @@ def test_bad_answer_is_logged_and_gxsm_reconnected(bench: Make, kind: str, setti
 
 
 def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
-    """A RedPitaya does not tell that the tip moves."""
+    # RPSPMC does not report that the tip moves.
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
     ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
@@ -89,7 +89,7 @@ def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
 
 
 def test_tip_moved_with_its_frame_counts_as_moving(bench: Make) -> None:
-    """A RedPitaya does not tell that either; and where it goes next, it goes from there."""
+    # RPSPMC does not report this move either, and the next one starts after it.
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
     ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
@@ -220,7 +220,7 @@ def test_scan_without_channels_is_reported(bench: Make) -> None:
 
 
 def stopped_at_panel(made: Bench, peer: Peer) -> None:
-    """A scan is begun, and somebody stops it after a few lines; nothing comes of it."""
+    """Start a scan and stop it at the panel after a few lines; check that it is not published."""
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 2)
@@ -231,7 +231,7 @@ def stopped_at_panel(made: Bench, peer: Peer) -> None:
 
 
 def until_line(made: Bench, peer: Peer, line: int) -> None:
-    """Until so many lines of the running scan are complete."""
+    """Wait until some lines of the running scan are complete."""
     until_s = made.clock.now_s() + 60.0
     last = made.emulator.program.scan.activity
     assert last is not None
@@ -245,7 +245,7 @@ KINDS: list[dict[str, Any]] = [{"version": 3}, {}, SHM, {"card": "RPSPMC"}, {"ca
 @pytest.mark.parametrize("saving", ["afspm", "gxsm"])
 @pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm", "rpspmc", "simulator"])
 def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, kind: dict[str, Any], saving: str) -> None:
-    """GXSM keeps, and saves, the scan before in the rows that it did not come to, and nothing says so."""
+    # GXSM keeps, and saves, the previous scan in rows not yet scanned, without marking them.
     made = bench(speed=1.0, **kind)
     peer = small(made, saving=saving)
     if kind.get("card") == "simulator":
@@ -289,7 +289,7 @@ def test_scan_stopped_in_its_first_line_is_interrupted(bench: Make) -> None:
 
 
 def test_stopped_first_scan_is_interrupted(bench: Make) -> None:
-    """There was none before: its file has zeros."""
+    # There is no previous scan: its file has zeros.
     made = bench(speed=1.0)
     peer = small(made)
     stopped_at_panel(made, peer)
@@ -298,7 +298,7 @@ def test_stopped_first_scan_is_interrupted(bench: Make) -> None:
 
 @pytest.mark.parametrize("seen", [True, False])
 def test_scan_started_and_stopped_at_the_panel_is_interrupted(bench: Make, seen: bool) -> None:
-    """Also if the translator has not seen the scan before."""
+    # Also if the translator has not seen the previous scan.
     made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
@@ -348,7 +348,7 @@ def test_scan_is_saved_after_gxsms_own_work(bench: Make) -> None:
 
 
 def test_a_folder_chosen_at_the_panel_between_two_scans_is_found(bench: Make, tmp_path: Path) -> None:
-    """Until it scans GXSM tells of the folder before."""
+    # GXSM reports the previous folder until it scans.
     made = bench(speed=20.0)
     peer = small(made)
     assert scanned(peer)
@@ -394,7 +394,7 @@ def test_scan_without_files_is_interrupted(bench: Make) -> None:
 
 
 def test_channels_named_only_during_a_scan_are_found(bench: Make) -> None:
-    """Files of before are in its folder, too, and not taken for the new ones."""
+    # Old files in the folder are not taken for the new ones.
     made = bench(speed=20.0)
     peer = small(made)
     assert scanned(peer)
@@ -452,7 +452,7 @@ def test_slow_spectrum_is_awaited(bench: Make, kind: str) -> None:
 
 
 def test_spectrum_with_an_existing_name_is_the_new_one(bench: Make) -> None:
-    """GXSM overwrites it."""
+    # GXSM overwrites the file.
     made = bench(speed=20.0)
     (made.data / "scan001-VP001-VP.vpdata").write_text("of last year")
     peer = small(made)

@@ -1,4 +1,4 @@
-"""Both ways to GXSM, when the other end says anything at all, or nothing."""
+"""Both links to GXSM, with arbitrary or no answers."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_arrays_are_read_alone_and_in_a_tuple(protocol: int, array: np.ndarray) 
 
 
 def test_arrays_of_the_numpy_that_gxsm_has_are_read() -> None:
-    """numpy 1 calls its modules otherwise; the lengths of the names are in the bytes."""
+    # numpy 1 has other module names; their lengths are in the bytes.
     newer = pickle.dumps(np.arange(3.0), 4)
     name = b"numpy._core.multiarray"
     assert name in newer
@@ -144,7 +144,7 @@ def test_damaged_pickles_are_a_value_or_refused(content: bytes, at: int, damage:
 
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[BridgeLink]:
-    """A link to a bridge that answers each call with the next of these bytes, and then hangs up (or not)."""
+    """Open a link to a bridge that answers each call with the next of some bytes, and may then disconnect."""
     secret = Path("~/secret").expanduser()
     secret.write_text("s" * 64)
     secret.chmod(0o600)
@@ -291,7 +291,7 @@ def test_unknown_process_is_reported() -> None:
 
 @on_linux
 def test_a_process_that_the_signal_would_end_is_never_signalled() -> None:
-    """As a GXSM that was started with -s, or anything else of the same name."""
+    # A GXSM started with -s, or another program of the same name.
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         with pytest.raises(ControllerLost, match="does not serve its shared memory"):
             open_link(Address.parse(f"shm:nothing@{process.pid}"), 1.0, time.monotonic)
@@ -340,7 +340,7 @@ def status(block: Path) -> int:
 
 
 def test_request_left_to_an_ended_gxsm_is_withdrawn(block: Path) -> None:
-    """The next one does not clear the memory, and every call would wait for the answer."""
+    # The next GXSM does not clear the memory: every call would wait for that answer.
     command = [sys.executable, "-c", LISTENS]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -1,4 +1,4 @@
-"""The emulated GXSM as programs of others see it: all that the real one was seen to do."""
+"""The emulated GXSM as other programs see it, compared with observations of the real one."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def calling(made: Bench) -> Iterator[SocketClient | MemoryClient]:
 
 
 def until(made: Bench, what: Callable[[], bool]) -> None:
-    """Until it is so; asked as often as a program of others would, which leaves the processor to the emulator."""
+    """Wait for a condition, polled as often as other programs do, so that the emulator gets processor time."""
     until_s = made.clock.monotonic_s() + DEADLINE_S
     pace = Event()
     while not what():
@@ -63,7 +63,7 @@ def bits(gxsm: SocketClient | MemoryClient) -> int:
 
 
 def not_converted(gxsm: SocketClient | MemoryClient, method: str, *arguments: Any) -> bool:
-    """Whether GXSM does not take these arguments: an error in its console, the value -1 through shared memory."""
+    """Return True if GXSM rejects arguments: an error in its console, -1 through shared memory."""
     if isinstance(gxsm, MemoryClient):
         return bool(gxsm.call(method, *arguments) == -1)
     with pytest.raises(RuntimeError, match="SystemError"):
@@ -146,7 +146,7 @@ def test_set_never_reports_a_refusal(bench: Make, kind: dict[str, Any]) -> None:
 
 
 def test_reported_names_may_be_existing_files_until_saving(bench: Make) -> None:
-    """And in the first moments of a scan those of the scan before."""
+    # In the first moments of a scan, the names of the previous scan are reported.
     made = bench(speed=SEEN)
     for name in ("scan001-M-Xp-ZSmTopo.nc", "scan002-M-Xp-ZSmTopo.nc"):
         (made.data / name).write_bytes(b"of last year")
@@ -469,7 +469,7 @@ def test_files_are_counted_beyond_three_digits(tmp_path: Path) -> None:
 
 @contextmanager
 def answering(folder: Path, value: object) -> Iterator[tuple[SharedMemoryBlock, MemoryClient]]:
-    """Shared memory, every call of which is answered with a value, once it is taken."""
+    """Serve shared memory that answers every call with a value."""
     if not sys.platform.startswith("linux"):
         pytest.skip("Gxsm4's shared memory is there on Linux alone")
     name = f"afspm_test_{os.getpid()}_{id(value)}"

@@ -1,4 +1,4 @@
-"""The GXSM translator against the emulated program: everything that a peer may ask for, as it sees it."""
+"""The GXSM translator with the emulated program: every request of a peer, and its effects."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def test_scan_has_exactly_the_frame_that_was_set(bench: Make, kind: dict[str, An
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
 def test_rows_and_columns_match_the_sample(bench: Make, kind: dict[str, Any]) -> None:
-    """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
+    # Compared with the heights of the simulated sample at each pixel: an offset by half a frame or a mirrored axis
+    # shows.
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT, **kind)
     peer = made.start()
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -100,7 +101,7 @@ def test_stopped_scan_is_not_published(bench: Make, kind: dict[str, Any]) -> Non
 
 
 def test_existing_file_numbers_are_skipped(bench: Make) -> None:
-    """GXSM begins at 001 with each start: it names what is there already, and then counts each channel by itself."""
+    # GXSM starts with 001: it reports names of existing files, then counts each channel by itself.
     made = bench()
     (made.data / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
     (made.data / "scan002-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
@@ -140,8 +141,8 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
 def test_lines_are_published_during_a_scan(
     bench: Make, version: int, live_lines_s: float, speed: float, rows: int
 ) -> None:
-    """Of the second scan on: only files tell what channels are called. Before its first line is in, GXSM tells of the
-    scan before."""
+    # From the second scan on, since only files have the names of channels. GXSM reports the previous scan before the
+    # first line.
     made = bench(speed=speed, version=version)
     peer = made.start(live_lines_s=live_lines_s)
     ready(peer, shape=(rows, 32))
@@ -179,7 +180,7 @@ def test_lengths_are_right_in_any_panel_unit(bench: Make, user_unit: str) -> Non
 
 
 def test_setting_the_size_in_x_keeps_the_size_in_y(bench: Make) -> None:
-    """Setting RangeX, GXSM changes RangeY, too."""
+    # GXSM changes RangeY with RangeX.
     made = bench()
     peer = made.start()
     ready(peer)
@@ -303,7 +304,7 @@ def test_crash_is_defined_in_the_experiment_file(bench: Make, monkeypatch: pytes
 
 
 def test_missing_hardware_features_are_not_supported(bench: Make) -> None:
-    """GXSM answers -inf, or worse, for parameters that it does not have: it is not asked for them."""
+    # GXSM answers -inf, or worse, for unknown parameters: they are not requested.
     made = bench(card="simulator")
     peer = made.start()
     peer.until(FREE)
@@ -394,7 +395,7 @@ def test_probe_moves_only_within_the_frame(bench: Make) -> None:
     ],
 )
 def test_spectrum_has_its_position(bench: Make, kind: str, first: str, settings: dict[str, Any]) -> None:
-    """A scan in between moves the tip: it is sent back first."""
+    # A scan in between moves the tip: it is sent back first.
     made = bench(speed=20.0, **settings)
     peer = made.start()
     ready(peer)
@@ -511,7 +512,7 @@ def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
 def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_is_not(
     bench: Make, kind: dict[str, Any], saving: str
 ) -> None:
-    """GXSM never stops scanning: the next one runs already."""
+    # GXSM never stops scanning: the next scan runs already.
     made = bench(speed=10.0, **kind)
     peer = made.start(saving=saving)
     ready(peer, shape=(24, 32))
@@ -537,7 +538,7 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
 
 
 def until_line(made: Bench, line: int) -> None:
-    """Until so many lines of the running scan are complete."""
+    """Wait until some lines of the running scan are complete."""
     last, pace = made.emulator.program.scan.activity, Event()
     assert last is not None
     while last.lines_done(made.clock.now_s()) < line:
@@ -545,7 +546,7 @@ def until_line(made: Bench, line: int) -> None:
 
 
 def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
-    """Stopped, and begun again before the translator has looked: the first is broken off, the second is whole."""
+    # Stopped and restarted between two polls: the first scan is interrupted, the second complete.
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(24, 32))
@@ -598,7 +599,7 @@ def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
 
 
 def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
-    """An hour back is more than a scan lasts: each of them seems to have begun before the one before it."""
+    # An hour back is more than a scan: each scan seems to have started before its predecessor.
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
@@ -608,7 +609,7 @@ def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
 
 
 def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
-    """At a hundred times the speed a busy computer takes half a minute to begin one."""
+    # At a hundred times the speed, a busy computer takes half a minute to start one.
     made = bench()
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -623,7 +624,7 @@ def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
 
 
 def test_redpitaya_measurement_at_the_panel_does_not_republish_the_previous_scan(bench: Make) -> None:
-    """It does not tell a spectrum from a scan, and what is in its memory is saved again when it is over."""
+    # RPSPMC does not distinguish spectra from scans, and GXSM saves its memory again after a spectrum.
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
     ready(peer)

@@ -1,4 +1,4 @@
-"""What can go wrong at a Nanonis controller: each gives an error with a name, nothing hangs, and it is found again."""
+"""Faults of a Nanonis controller: each is a named error, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def test_scan_that_does_not_start_is_interrupted_and_the_previous_one_not_publis
 
 @pytest.mark.parametrize("kinds", [("late-start",), ("ends-at-once",), ("ends-at-once", "late-start")])
 def test_late_scan_is_published(bench: Make, kinds: tuple[str, ...]) -> None:
-    """It is asked for the end of the scan before that has begun: what it hears of another, or of none, is no end."""
+    # The wait for its end starts early: an event of another scan, or of none, is not its end.
     made = bench(speed=SEEN)
     peer = small(made)
     assert peer.act(names.START_SCAN).ok
@@ -299,7 +299,7 @@ def test_scan_in_the_air_is_not_published(bench: Make) -> None:
 
 
 def test_tip_being_shaped_is_busy_after_a_reconnection(bench: Make) -> None:
-    """Nanonis does not tell that it holds the tip in the surface."""
+    # Nanonis does not report that it holds the tip in the surface.
     made = bench(speed=2.0)
     peer = small(made)
     assert peer.set(names.CRASH_SPEED, 1, "nm/s").ok
@@ -374,7 +374,7 @@ def test_unused_address_is_named(bench: Make) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_translator_survives_nonsense_replies(bench: Make, seed: int) -> None:
-    """Nothing of it is a measurement, and once the controller is right again, so is all that it says."""
+    # No reply of it becomes a measurement, and afterwards all values are right again.
     made = bench(seed=seed)
     peer = small(made, **SOON)
     made.strike("nonsense", duration_s=200.0)  # two seconds in real time

@@ -1,4 +1,4 @@
-"""Calls that nobody means well by; `make soak` makes more of them."""
+"""Malicious requests; `make soak` makes more of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One connection to a controller that says anything at all, or nothing."""
+"""One connection to a controller with arbitrary or no answers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
 
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[Link]:
-    """A link to somebody who answers each request with the next of these bytes, and then hangs up (or not)."""
+    """Open a link to a server that answers each request with the next of some bytes, and may then disconnect."""
     with answering(*replies, silent=silent) as address:
         link = Link(address, 0.3 if silent else 10.0, time.monotonic)
         try:
@@ -47,7 +47,7 @@ def test_an_error_of_the_controller_leaves_the_connection_as_it_is() -> None:
 
 
 def test_answer_to_another_request_is_refused() -> None:
-    """After it nothing on this connection is believed any more."""
+    # After it the connection is not trusted any more.
     late = wire.reply("Current.Get", wire.body("Current.Get", [0.5], 0))
     with talking(late, GOOD) as link:
         with pytest.raises(ControllerLost, match=r"replied to 'Current.Get' instead of Bias.Get"):

@@ -1,4 +1,4 @@
-"""The bytes of the protocol: against reference bytes, for every release, and against any bytes at all."""
+"""The bytes of the protocol: reference bytes, every release, and arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ def test_any_body_is_results_or_a_named_error(name: str, body: bytes, release: i
 
 @given(st.sampled_from(NAMES), st.data())
 def test_damaged_reply_is_results_or_a_named_error(name: str, data: st.DataObject) -> None:
-    """What is nearly right gets further than what is not at all."""
+    # Nearly right replies get further than random bytes.
     release = data.draw(st.sampled_from(RELEASE_NUMBERS))
     sent = [EXAMPLES[code] for code, _ in protocol.functions()[name].results]
     body = bytearray(wire.body(name, sent, release))
@@ -158,7 +158,6 @@ def _read(name: str, body: bytes, release: int) -> None:
 
 
 def _peak_bytes(name: str, body: bytes, release: int) -> int:
-    """The memory that reading it takes."""
     tracemalloc.start()
     try:
         with suppress(BadReply, NanonisError):
@@ -244,7 +243,7 @@ def test_wait_end_of_line_returns_at_each_line(tmp_path: Path) -> None:
 
 
 def test_functions_that_the_makers_client_lacks_are_as_documented(tmp_path: Path) -> None:
-    """By the document of April 2025 (release 14718)."""
+    # After the document of April 2025 (release 14718).
     nan = float("nan")
     with NanonisEmulator(port=0).running(tmp_path) as address:
         for name, set_, got in (
@@ -316,7 +315,7 @@ def test_session_path_changes_within_its_folder(tmp_path: Path) -> None:
 
 
 def test_frequency_shift_matches_setpoint_and_picture(tmp_path: Path) -> None:
-    """All clients read the same sensor: signals, PLL, the picture, and the file's header."""
+    # All clients read the same sensor: signals, PLL, the picture and the file's header.
     emulator = NanonisEmulator(feedback={"mode": "frequency-shift", "setpoint": -20.0})
     with emulator.running(tmp_path, ExperimentClock.starting_now(speed=2.0)) as address:  # its end is awaited
 
@@ -343,7 +342,6 @@ def test_frequency_shift_matches_setpoint_and_picture(tmp_path: Path) -> None:
 
 
 def _texts(reply: bytes) -> list[str]:
-    """The texts of a list that a reply begins with."""
     found, at = [], 8
     for _ in range(struct.unpack_from(">i", reply, 4)[0]):
         length = struct.unpack_from(">i", reply, at)[0]
@@ -353,7 +351,6 @@ def _texts(reply: bytes) -> list[str]:
 
 
 def _asked(address: str, name: str, body: bytes = b"") -> bytes:
-    """The body of the reply to a request, which must be under the name that it was asked by."""
     host, port = address.split(":")
     with socket.create_connection((host, int(port)), timeout=20.0) as connection:
         connection.sendall(name.encode().ljust(32, b"\0") + struct.pack(">iHH", len(body), 1, 0) + body)

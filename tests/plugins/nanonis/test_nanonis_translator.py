@@ -1,4 +1,4 @@
-"""The Nanonis translator against the emulated controller: everything that a peer may ask for, as it sees it."""
+"""The Nanonis translator with the emulated controller: every request of a peer, and its effects."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
 @pytest.mark.parametrize("direction", ["up", "down"])
 @pytest.mark.parametrize("fetch", [False, True])
 def test_rows_and_columns_match_the_sample(bench: Make, direction: str, fetch: bool) -> None:
-    """Against the heights of the simulated sample at each pixel: half a pixel off, or a mirrored axis, would show."""
+    # Compared with the heights of the simulated sample at each pixel: an offset by half a pixel or a mirrored axis
+    # shows.
     seen = 20.0 if fetch else 100.0  # what is in no file must be seen running
     made = bench(seen, surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
@@ -149,7 +150,7 @@ def test_settings_are_reported_to_the_last_digit_despite_float32(bench: Make) ->
 
 
 def test_setting_the_resolution_keeps_the_frame(bench: Make) -> None:
-    """Nanonis' range is that of whole pixels: with more of them it is another for the same pixel centres."""
+    # Nanonis' range goes from edge to edge of its pixels: for the same pixel centres it depends on their number.
     made = bench()
     peer = made.start()
     ready(peer)

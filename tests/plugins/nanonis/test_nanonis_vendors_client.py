@@ -1,6 +1,6 @@
-"""The vendor's own client drives the emulated controller: it knows nothing of us.
+"""The vendor's own client drives the emulated controller.
 
-Of nanonis-spm 1.0.9 some functions can't read any reply (`MISREAD`): those are not called here.
+Some functions of nanonis-spm 1.0.9 can't read any reply (`MISREAD`): they are not called here.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SEEN = pytest.mark.parametrize("client", [2.0], indirect=True)
 
 @pytest.fixture
 def client(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
-    """Of an emulator at speed 100, or as marked."""
+    """Connect the client to an emulator, at speed 100 or as marked."""
     with connected(tmp_path, getattr(request, "param", 100.0)) as client:
         yield client
 
@@ -48,14 +48,14 @@ def connected(folder: Path, speed: float, **settings: Any) -> Iterator[Any]:
 
 
 def ask(client: Any, function: str, *arguments: Any) -> list[Any]:
-    """The results of a function; its errors are failures."""
+    """Call a function; its errors are failures of the test."""
     error, _, results = getattr(client, function)(*arguments)
     assert error == ""
     return list(results)
 
 
 def flat(values: Any) -> list[float]:
-    """Its lists are of tuples of one."""
+    """Return the items of the client's lists, which are tuples of one."""
     return [value[0] for value in values]
 
 
@@ -127,7 +127,7 @@ ALIVE = (
 
 
 def test_client_reads_the_error_of_every_function(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Behind the results of its own list of fields: so ours has the same."""
+    # After the results of the client's own list of fields: the emulator has the same list.
     send, misread = client.send, set()
     for name in FUNCTIONS:
         client.send = lambda command, _body, _codes: send(command, [[1]], ["*B"])  # a byte fits nothing
@@ -191,7 +191,7 @@ def test_client_stops_a_scan_which_ends_the_wait(client: Any) -> None:
 
 @pytest.mark.parametrize(("module", "first"), [("BiasSpectr", "Bias calc (V)"), ("ZSpectr", "Z rel (m)")])
 def test_client_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: str, first: str) -> None:
-    """As in the examples that come with it."""
+    # As in the client's examples.
     ask(client, f"{module}_Open")
     _, count, names, rows, _, values, *_ = ask(client, f"{module}_Start", 1, "curve")
     assert (names[0], rows) == (first, count)
@@ -269,7 +269,7 @@ def test_client_compensates_drift(client: Any) -> None:
 
 
 def test_tracked_atom_measures_drift_and_rotation(tmp_path: Path) -> None:
-    """A minute of it is over at once: a millimetre from where it turns, that moves it by 10 pm/s."""
+    # A minute of tracking is skipped: a millimetre from the centre of rotation, the sample moves by 10 pm/s.
     turns = {"rotation_rad_per_s": 1e-8, "about_m": [-1e-3, 0.0], "velocity_m_per_s": [3e-12, 0.0, 1e-12]}
     with connected(tmp_path, 1e5, drift=turns) as client:
         ask(client, "AtomTrack_QuickCompStart", 1)
@@ -337,7 +337,7 @@ def test_client_receives_a_text_for_each_refusal(client: Any, capsys: pytest.Cap
 
 
 def measured(client: Any) -> tuple[float, float, float]:
-    """Mean and standard deviation of the current, and the mean frequency shift."""
+    """Return mean and standard deviation of the current, and the mean frequency shift."""
     current, noise_a = mean_and_noise(client, "Current_Get")
     names = ask(client, "Signals_NamesGet")[-1]
     return current, noise_a, mean_and_noise(client, "Signals_ValGet", names.index("OC M1 Freq. Shift (Hz)"), 1)[0]
@@ -382,7 +382,7 @@ def test_the_current_falls_when_the_tip_is_lifted_with_the_controller_off(client
 
 @pytest.mark.parametrize("bias_v", [0.1, 0.25, 1.0, -1.0])
 def test_the_current_is_the_setpoint_at_any_bias(tmp_path: Path, bias_v: float) -> None:
-    """Of the emulator as it is by default."""
+    # With the emulator's default settings.
     with connected(tmp_path, 100.0, surface="steps") as client:
         ask(client, "Bias_Set", bias_v)
         for setpoint_a in (ask(client, "ZCtrl_SetpntGet")[0], 50e-12, 1e-9):
@@ -393,7 +393,7 @@ def test_the_current_is_the_setpoint_at_any_bias(tmp_path: Path, bias_v: float) 
 
 
 def test_frequency_shift_current_and_z_show_the_state_of_the_tip(tmp_path: Path) -> None:
-    """A check of the tip must find the difference, and a withdrawn tip must not pass it."""
+    # A tip check must find the difference, and a withdrawn tip must not pass it.
     found = {}
     for condition in ("sharp", "blunt", "double", "contaminated"):
         with connected(tmp_path / condition, 100.0, surface="steps", tip={"condition": condition}) as client:
@@ -507,7 +507,7 @@ def test_a_grid_of_spectra_takes_its_time_and_can_be_stopped(client: Any) -> Non
 
 
 def test_repeated_waits_find_the_end_of_a_scan_at_any_clock_speed(client: Any) -> None:
-    """A scan has ended before it is waited for, or between two questions: a hundred times too often."""
+    # A scan may end before the wait, or between two waits: a hundred times as often as in real time.
     ask(client, "Scan_BufferSet", [0], 16, 16)
     ask(client, "Scan_SpeedSet", 1e-6, 1e-6, 0.05, 0.05, 2, 1.0)
     for _ in range(3):
@@ -555,7 +555,7 @@ def test_signals_are_logged_on_a_port_of_their_own(tmp_path: Path) -> None:
 def test_the_makers_own_examples_run_as_they_are(
     example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """But for the port that they connect to."""
+    # Only the port is changed.
     spec = importlib.util.find_spec("nanonis_spm_examples")
     assert spec is not None
     assert spec.submodule_search_locations is not None

@@ -1,4 +1,4 @@
-"""What can go wrong at Nanosurf Studio: each has a name in the log, nothing hangs, and Studio is found again."""
+"""Faults of Nanosurf Studio: each is named in the log, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 

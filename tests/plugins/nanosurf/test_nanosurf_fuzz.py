@@ -1,4 +1,4 @@
-"""Random scripts do not end the emulated Studio, nor leave it unfit, nor write outside its folder."""
+"""Random scripts neither end the emulated Studio, nor spoil it, nor write outside its folder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ENDS = ('{1,{"not enough memory"}}', '{1,{"the script runs too long"}}')
 
 @pytest.fixture
 def clients(tmp_path: Path) -> Iterator[list[socket.socket]]:
-    """Two clients of an emulator."""
+    """Connect two clients to an emulator."""
     with NanosurfEmulator(port=0).running(tmp_path, ExperimentClock.starting_now(speed=1e4)) as address:
         host, _, port = address.rpartition(":")
         with ExitStack() as stack:

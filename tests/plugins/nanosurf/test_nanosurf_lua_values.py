@@ -1,4 +1,4 @@
-"""What Studio replies is read as Lua reads it."""
+"""Lua values in Studio's replies are parsed as Lua does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Nanosurf translator against an emulated Studio: what is asked happens, where it should, and is published."""
+"""The Nanosurf translator with an emulated Studio: requests, their effects, and publications."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_force_curve_can_be_stopped(bench: Make) -> None:
 
 
 def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They go by two connections."""
+    # Start and stop use two connections.
     stops: list[StudioProgram] = []
     stop_curve = StudioProgram.stop_curve
 

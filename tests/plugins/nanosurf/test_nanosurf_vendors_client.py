@@ -1,4 +1,4 @@
-"""The maker's own client (nanosurf-core), unmodified, drives the emulated Studio as the maker's examples do."""
+"""The maker's own client (nanosurf-core), unmodified, drives the emulated Studio as in the maker's examples."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DEADLINE_S = 60.0
 
 @pytest.fixture
 def client(tmp_path: Path) -> Run:
-    """Run a script with the client in a process of its own; it writes into its own folder, so it has a copy."""
+    """Run a script with the client in a process; the client gets a copy of its own, since it writes to its folder."""
     if CLIENT is None or CLIENT.origin is None:
         pytest.skip("nanosurf-core is not installed")
     site = tmp_path / "site"
@@ -242,7 +242,7 @@ print(json.dumps({"said": said}))
 
 
 def wait_for_files(folder: Path, count: int) -> None:
-    """Wait until so many whole files are there."""
+    """Wait for a number of complete files."""
     deadline_s = time.monotonic() + DEADLINE_S
     while time.monotonic() < deadline_s:
         try:

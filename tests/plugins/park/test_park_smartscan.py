@@ -1,4 +1,4 @@
-"""The emulated SmartScan without its socket: what scripts measure and move, on a clock that the test moves."""
+"""The emulated SmartScan without its socket: measurements and moves of scripts, on the test's own clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from afspm.simulation.instrument import Instrument, InstrumentBusy
 
 
 class SmartScan(SmartScanProgram):
-    """With calls as a script makes them, and a clock that goes on until what was called is done."""
+    """SmartScan with calls in the form of scripts, on a clock that advances until a call has ended."""
 
     def __init__(self, folder: Path) -> None:
         self.clock = FakeClock()
@@ -216,7 +216,7 @@ def test_sweep_of_the_drive_frequency_keeps_the_instrument_busy(smartscan: Smart
 
 
 def run_on(script: Script) -> tuple[object, str] | None:
-    """The value of a script; None once it waits for the instrument."""
+    """Return the value of a script; None once it waits for the instrument."""
     while (found := script.step()) is None and not script.waits:
         pass
     return found

@@ -1,4 +1,4 @@
-"""The Park translator against an emulated SmartScan: what is asked happens, where it should, and is published."""
+"""The Park translator with an emulated SmartScan: requests, their effects, and publications."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_a_curve_can_be_stopped(bench: Make) -> None:
 
 
 def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make) -> None:
-    """They go by two connections."""
+    # Start and stop use two connections.
     made = bench(speed=1.0, force={"duration_s": 20.0})
     peer = small(made)
     stops: list[float] = []

@@ -28,7 +28,7 @@ DEADLINE_S = 60.0
 
 @pytest.fixture
 def client() -> Run:
-    """Run a script with the client in a process of its own."""
+    """Run a script with the client in a process."""
     if importlib.util.find_spec("SmartRemote") is None:
         pytest.skip("smartremote is not installed")
 
