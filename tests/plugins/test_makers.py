@@ -92,9 +92,9 @@ def test_stopped_scan_is_not_published(maker: Maker, bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
 
 
@@ -104,10 +104,10 @@ def test_scan_from_the_panel_is_published(maker: Maker, bench: Make) -> None:
     peer = made.start()
     ready(peer, shape=(40, 32))
     made.at_panel(lambda emulator: maker.start(emulator, made.clock.now_s()))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert scans(heard)
-    for region in {scan.region for scan in scans(heard)}:  # Nanonis has a float32 of each length
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert scans(received)
+    for region in {scan.region for scan in scans(received)}:  # Nanonis has a float32 of each length
         assert (*region.center_m, *region.size_m) == pytest.approx((*TURNED.center_m, *TURNED.size_m), rel=1e-6)
         assert region.angle_rad == pytest.approx(TURNED.angle_rad)
 

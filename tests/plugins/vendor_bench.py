@@ -45,10 +45,10 @@ PATIENT: Mapping[str, Any] = {"reply_timeout_s": 10.0}
 """As long as a controller on a busy computer may need to answer."""
 
 SOON: Mapping[str, Any] = {"reply_timeout_s": 2.5}
-"""Where its silence is what is tested."""
+"""For tests of a silent controller."""
 
 TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
-"""A frame that is no square, not in the middle and not straight: what is mistaken for something else shows."""
+"""An oblong, rotated frame away from the middle, so that no two values can be confused."""
 
 SHAPE = (12, 32)
 FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
@@ -107,23 +107,23 @@ class Peer:
 
     def until(self, wanted: Callable[[Any], bool] | ScopeState) -> list[Any]:
         """Return all published packets up to the first wanted one."""
-        heard: list[Any] = []
+        received: list[Any] = []
         deadline_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < deadline_s:
             try:
-                heard.append(self.next())
+                received.append(self.next())
             except zmq.Again:
                 break
-            newest = heard[-1]
+            newest = received[-1]
             if newest == ScopeStatus(wanted) if isinstance(wanted, ScopeState) else wanted(newest):
-                return heard
-        raise AssertionError(f"waited for {wanted}, heard {heard}")
+                return received
+        raise AssertionError(f"waited for {wanted}, received {received}")
 
     def close(self) -> None:
         self._context.destroy(linger=0)
 
 
-class Said:
+class TranslatorLog:
     """The lines of a translator's standard error, over all its restarts."""
 
     def __init__(self) -> None:
@@ -141,8 +141,8 @@ class Said:
     def until(self, *wanted: str) -> None:
         """Wait for a line with one of the texts."""
         with self._more:
-            said = self._more.wait_for(lambda: any(words in self.text for words in wanted), DEADLINE_S)
-            assert said, f"it never said {wanted}:\n{self.text}"
+            found = self._more.wait_for(lambda: any(words in self.text for words in wanted), DEADLINE_S)
+            assert found, f"the translator never logged {wanted}:\n{self.text}"
 
 
 class TranslatorProcess:
@@ -155,7 +155,7 @@ class TranslatorProcess:
         folder: Path,
         stack: ExitStack,
         clock: ExperimentClock,
-        said: Said | None = None,
+        log: TranslatorLog | None = None,
         *,
         retracts: bool = False,
     ) -> None:
@@ -174,7 +174,7 @@ class TranslatorProcess:
         # where the lock on the controller lies, which one that is killed leaves behind
         own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
         self._process = host(own)
-        self._listening = Thread(target=(said or Said()).listen, args=(self._process.stderr,))
+        self._listening = Thread(target=(log or TranslatorLog()).listen, args=(self._process.stderr,))
         self._listening.start()
         stack.callback(self._end)
         self._process.stdin.write(launch.to_json().encode() + b"\n")
@@ -237,8 +237,8 @@ class VendorBench(Generic[Emulated]):
         self.folder, self._stack = folder, stack
         self.clock = ExperimentClock.starting_now(speed=speed)
         self.data = folder / self.data_name
-        self._said = Said()
-        stack.callback(lambda: print(self._said.text))  # noqa: T201 (shown of a test that failed)
+        self._log = TranslatorLog()
+        stack.callback(lambda: print(self._log.text))  # noqa: T201 (shown of a test that failed)
         self._emulator_settings: dict[str, Any] = {"port": FreePorts().take(), "surface": "steps", **emulator}
         self._controller = stack.enter_context(ExitStack())
         self.start_controller_again()
@@ -270,7 +270,7 @@ class VendorBench(Generic[Emulated]):
         """Start the translator as a process."""
         given = {"address": self.address, **self.settings, **settings}
         self._process = TranslatorProcess(
-            self.translator, given, self.folder, self._stack, self.clock, self._said, retracts=retracts
+            self.translator, given, self.folder, self._stack, self.clock, self._log, retracts=retracts
         )
         return self._process.peer
 
@@ -282,13 +282,13 @@ class VendorBench(Generic[Emulated]):
         """Stop the translator as a stopped run does; return its exit code."""
         return self._process.let_go()
 
-    def said(self) -> str:
+    def log_text(self) -> str:
         """Return the translator's log so far; complete once it is killed."""
-        return self._said.text
+        return self._log.text
 
-    def until_said(self, *wanted: str) -> None:
+    def until_logged(self, *wanted: str) -> None:
         """Wait until the translator's log contains one of the texts."""
-        self._said.until(*wanted)
+        self._log.until(*wanted)
 
 
 OneBench = TypeVar("OneBench", bound=VendorBench[Any])
@@ -304,16 +304,16 @@ def benches(kind: type[OneBench], folder: Path) -> Iterator[Callable[..., OneBen
         yield make
 
 
-# --- what was heard, and what a test begins with ---
+# --- received packets, and starts of tests ---
 
 
-def states(heard: Sequence[Any]) -> list[str]:
+def states(received: Sequence[Any]) -> list[str]:
     """Return the states in received packets."""
-    return [one.state.name for one in heard if isinstance(one, ScopeStatus)]
+    return [one.state.name for one in received if isinstance(one, ScopeStatus)]
 
 
-def scans(heard: Sequence[Any]) -> list[Scan]:
-    return [one for one in heard if isinstance(one, Scan)]
+def scans(received: Sequence[Any]) -> list[Scan]:
+    return [one for one in received if isinstance(one, Scan)]
 
 
 def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
@@ -340,10 +340,10 @@ def scanned(peer: Peer) -> dict[str, Scan]:
     """Scan; return the scan by channel."""
     response = peer.act(names.START_SCAN)
     assert response.ok, response.reason
-    heard = peer.until(ScopeState.FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    found = scans(heard)
-    assert heard[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
+    received = peer.until(ScopeState.FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    found = scans(received)
+    assert received[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
     return {scan.channel: scan for scan in found}
 
 
@@ -351,9 +351,9 @@ def moved(peer: Peer, x_m: float, y_m: float) -> list[Any]:
     """Move the probe; return all packets received meanwhile."""
     response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
     assert response.ok, response.reason
-    heard = peer.until(ScopeState.FREE)
-    assert states(heard) == ["MOVING", "FREE"]
-    return heard
+    received = peer.until(ScopeState.FREE)
+    assert states(received) == ["MOVING", "FREE"]
+    return received
 
 
 def left_in_danger(made: VendorBench[Any], *, scanning: bool, retracts: bool) -> None:

@@ -35,9 +35,9 @@ def test_request_arrives_unchanged_at_the_xop(parameters: list[Any]) -> None:
     except InvalidValue:
         assert any(isinstance(one, str) and not _sendable(one) for one in parameters)
         return
-    heard = wire.call(message)
-    assert (heard.name, heard.message_id) == ("F", "7")
-    for sent, text in zip(parameters, heard.parameters, strict=True):
+    received = wire.call(message)
+    assert (received.name, received.message_id) == ("F", "7")
+    for sent, text in zip(parameters, received.parameters, strict=True):
         if isinstance(sent, str):
             assert text == sent
         else:

@@ -48,7 +48,7 @@ def test_bad_reply_is_logged_and_igor_reconnected(bench: Make, kind: str, told: 
     made.strike(kind, count=6 if kind == "nan" else 1, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(told)
     scans_again(peer)
 
 
@@ -70,7 +70,7 @@ def test_lasting_fault_is_reported_until_it_ends(bench: Make, kind: str, told: s
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(told)
 
 
 def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
@@ -80,8 +80,8 @@ def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
     peer.until(ScopeState.MOVING)
     made.strike("unknown")
-    heard = peer.until(FREE)
-    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["UNDEFINED", "MOVING", "FREE"]
     assert made.clock.now_s() >= arrives_s
 
 
@@ -101,8 +101,8 @@ def test_missing_procedures_are_named(bench: Make) -> None:
     made = bench(procedures="none")
     peer = made.start()
     peer.until(UNDEFINED)
-    made.until_said("there is no such function (101")
-    made.until_said("is afspm.ipf included in Igor's procedures")
+    made.until_logged("there is no such function (101")
+    made.until_logged("is afspm.ipf included in Igor's procedures")
 
 
 def test_procedures_of_the_published_afspm_suffice_to_scan(bench: Make) -> None:
@@ -151,7 +151,7 @@ def test_saving_is_switched_on_if_off(bench: Make) -> None:
     peer = small(made)
     made.at_panel(lambda emulator: emulator.controller.values.put("SaveImage", 0))
     scans_again(peer)
-    made.until_said("Asylum did not save its measurements (SaveImage)")
+    made.until_logged("Asylum did not save its measurements (SaveImage)")
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])
@@ -170,10 +170,10 @@ def test_scan_without_a_complete_file_is_reported_and_not_confused_with_the_next
     peer = small(made, result_timeout_s=5.0)
     made.strike(kind, duration_s=lasts_s)
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    made.until_said("ended without a result")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(received)
+    made.until_logged("ended without a result")
     assert scans_again(peer)[0].values.shape == (8, 16)
 
 
@@ -202,14 +202,14 @@ def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, partial: bool) ->
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("stopped")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
 def test_scan_reported_by_one_source_counts(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.emulator.faults.demand(Fault("status-stuck", 0.0, 1, 20.0), made.clock.now_s())
-    heard = peer.until(ScopeState.SCANNING)
-    assert states(heard) == ["SCANNING"]
+    received = peer.until(ScopeState.SCANNING)
+    assert states(received) == ["SCANNING"]

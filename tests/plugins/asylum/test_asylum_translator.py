@@ -100,9 +100,9 @@ def test_stopped_scan_is_not_published_and_withdraws_the_tip(bench: Make) -> Non
     peer.until(ScopeState.SCANNING)
     assert peer.get("x-engaged") == "true"
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Scan) for one in received)
     assert peer.get("x-engaged") == "false"
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
     assert peer.act(names.ENGAGE).ok
@@ -120,9 +120,9 @@ def test_images_from_the_panel_are_published(bench: Make) -> None:
         made.emulator.controller.scan(made.clock.now_s(), True)
 
     made.at_panel(press)
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {one.region for one in heard if isinstance(one, Scan)} == {TURNED}
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert {one.region for one in received if isinstance(one, Scan)} == {TURNED}
 
 
 def test_consecutive_images_from_the_panel_are_each_published_once(bench: Make) -> None:
@@ -141,13 +141,13 @@ def test_consecutive_images_from_the_panel_are_each_published_once(bench: Make) 
         return round(found[0])
 
     made.at_panel(lambda emulator: emulator.controller.scan(made.clock.now_s(), True))
-    heard = peer.until(lambda one: one == ScopeStatus(ScopeState.SCANNING))
+    received = peer.until(lambda one: one == ScopeStatus(ScopeState.SCANNING))
     deadline_s = made.clock.monotonic_s() + 20.0
     while suffix() < 2:
         assert made.clock.monotonic_s() < deadline_s
     last = f"Image{suffix(last_scan=True):04d}.ibw"
-    heard += peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
-    files = [Path(one.filename).name for one in heard if isinstance(one, Scan) and one.channel == "HeightTrace"]
+    received += peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
+    files = [Path(one.filename).name for one in received if isinstance(one, Scan) and one.channel == "HeightTrace"]
     assert files == [f"Image{i:04d}.ibw" for i in range(len(files))]
     assert len(files) > 2
     assert states(peer.until(FREE)) == ["FREE"]
@@ -177,7 +177,7 @@ def test_frame_changed_by_asylum_is_logged(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
     scan = scanned(peer)["HeightTrace"]
     assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
-    made.until_said("the scan is published as the file has it")
+    made.until_logged("the scan is published as the file has it")
 
 
 # --- parameters ---
@@ -231,8 +231,8 @@ def test_withdrawn_tip_is_not_reported_without_feedback(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.act(names.STOP_SCAN).ok
-    heard = [*peer.until(lambda one: isinstance(one, Feedback)), *peer.until(FREE)]
-    assert [one.on for one in heard if isinstance(one, Feedback)] == [None]
+    received = [*peer.until(lambda one: isinstance(one, Feedback)), *peer.until(FREE)]
+    assert [one.on for one in received if isinstance(one, Feedback)] == [None]
     assert (peer.get(names.FEEDBACK_ON), peer.get(names.ENGAGED)) == ("false", "false")
     assert peer.act(names.ENGAGE).ok
     peer.until(lambda one: isinstance(one, Feedback) and one.on is True)
@@ -254,7 +254,7 @@ def test_feedback_is_switched_on_after_its_other_settings(bench: Make, monkeypat
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(True, 0.5, 20.0, 0.625)).ok
     assert engaged_with == [0.625], "with the setpoint of before the tip may crash"
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
-    assert engaged_with == [0.625], "it is on: nobody presses Engage again"
+    assert engaged_with == [0.625], "it is on: Engage is not pressed again"
 
 
 def test_switching_feedback_on_waits_for_the_tip(bench: Make) -> None:
@@ -274,7 +274,7 @@ def test_tip_without_feedback_is_retracted_at_the_end_of_a_run(bench: Make, scan
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
     why = "Asylum withdrew the tip" if scanning else "the run is stopping with the feedback off"
-    assert why in made.said()
+    assert why in made.log_text()
 
 
 def test_tip_without_feedback_stays_if_the_file_allows_it(bench: Make) -> None:
@@ -465,9 +465,9 @@ def test_force_curve_has_its_position(bench: Make) -> None:
     moved_exactly(peer, 70e-9, 10e-9)
     response = peer.act(names.START_SPEC)
     assert response.ok, response.reason
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert curve.position_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
     assert (curve.kind, curve.names) == ("force", ("Raw", "Defl", "ZSnsr", "Time"))
     assert curve.units == ("m", "m", "m", "s")
@@ -496,9 +496,9 @@ def test_force_curve_after_a_scan_is_taken_at_the_probe_position(bench: Make) ->
     scanned(peer)
     made.at_panel(lambda emulator: setattr(emulator.rig, "_probe_m", (120e-9, 5e-9)))
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert curve.position_m == pytest.approx((70e-9, 10e-9))
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
 
@@ -512,9 +512,9 @@ def test_force_curve_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert "SPEC" not in states(heard)
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert "SPEC" not in states(received)
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 def test_stopped_force_curve_is_not_published(bench: Make) -> None:
@@ -524,9 +524,9 @@ def test_stopped_force_curve_is_not_published(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 def test_force_curve_from_the_panel_has_the_position_in_its_file(bench: Make) -> None:
@@ -542,7 +542,7 @@ def test_force_curve_from_the_panel_has_the_position_in_its_file(bench: Make) ->
     assert curve.position_m == pytest.approx((x, y), rel=1e-4, abs=1e-12)
 
 
-# --- what is done to the tip ---
+# --- the tip ---
 
 
 def test_pulse_restores_the_bias(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -106,7 +106,7 @@ class MemoryClient:
         for _ in range(10_000):
             if self.status() != 1:
                 break
-            select.select([], [], [], 0.001)  # the memory wakes nobody
+            select.select([], [], [], 0.001)  # shared memory wakes no thread
         if self.status() != 0:
             raise RuntimeError(f"status {self.status()}")
         length = struct.unpack("<Q", self.memory[128:136])[0]

@@ -44,8 +44,8 @@ def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
                 pytest.skip(f"{REAL} is not set: no real GXSM to ask")
             clock = ExperimentClock.real()
             found = TranslatorProcess(Bench.translator, {"address": address}, tmp_path, stack, clock).peer
-        heard = found.until(FREE)
-        before = next(one for one in heard if isinstance(one, ScanParameters))
+        received = found.until(FREE)
+        before = next(one for one in received if isinstance(one, ScanParameters))
         rate = found.get_response("x-pixel-rate")
         if rate.ok:  # GXSM's own simulator
             kept = found.get("x-pixel-rate")
@@ -66,9 +66,9 @@ def in_force(peer: Peer, wanted: ScanParameters) -> None:
 
 def test_scan_of_a_rotated_oblong_frame(peer: Peer) -> None:
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    found = scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    found = scans(received)
     assert found
     for scan in found:
         assert scan.region == Region.from_top_left(FRAME.top_left_m, FRAME.size_m, FRAME.angle_rad)
@@ -84,9 +84,9 @@ def test_stopped_scan(peer: Peer) -> None:
     peer.until(ScopeState.SCANNING)
     assert peer.set(names.SCAN_SIZE_X, 60e-9).code == ControlResponse.NOT_FREE
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
 def test_parameters_are_as_they_were_set(peer: Peer) -> None:

@@ -69,7 +69,7 @@ def test_bad_answer_is_logged_and_gxsm_reconnected(bench: Make, kind: str, setti
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(told)
     assert scanned(peer)
     assert not Path("evil").exists()
 
@@ -83,8 +83,8 @@ def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
     peer.until(ScopeState.MOVING)
     made.strike("error")
-    heard = peer.until(FREE)
-    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["UNDEFINED", "MOVING", "FREE"]
     assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((400e-9, 0.0))
 
 
@@ -111,7 +111,7 @@ def test_hanging_gxsm_is_lost_and_reconnected(bench: Make, settings: dict[str, A
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    made.until_said("no answer to")
+    made.until_logged("no answer to")
     assert peer.get(names.SCAN_RESOLUTION_X) == "16"
 
 
@@ -142,7 +142,7 @@ def test_memory_of_an_ended_gxsm_is_not_trusted(bench: Make, left_behind: Path) 
     assert left_behind.exists()
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
-    made.until_said("no process is called", "has ended")
+    made.until_logged("no process is called", "has ended")
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_stopped_script_is_reported_until_it_runs_again(bench: Make) -> None:
     made.strike("script-stopped")
     peer.until(UNDEFINED)
     assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
-    made.until_said("is bridge.py running in GXSM's console?")
+    made.until_logged("is bridge.py running in GXSM's console?")
     made.at_panel(lambda emulator: emulator.run_script())
     peer.until(FREE)
     assert scanned(peer)
@@ -179,7 +179,7 @@ def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     peer = made.start()
     peer.until(UNDEFINED)
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
-    made.until_said("start GXSM with LC_NUMERIC=C")
+    made.until_logged("start GXSM with LC_NUMERIC=C")
     assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.setup.bias_v == 0.1
 
 
@@ -203,10 +203,10 @@ def test_scan_that_did_not_start_is_reported_and_an_old_one_not_published(bench:
     made.at_panel(lambda emulator: emulator.woken.post())
     made.strike("no-start")
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    made.until_said("it was stopped or never began")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(received)
+    made.until_logged("it was stopped or never began")
 
 
 def test_scan_without_channels_is_reported(bench: Make) -> None:
@@ -215,7 +215,7 @@ def test_scan_without_channels_is_reported(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.program.channels.clear())
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("a channel is set")
+    made.until_logged("a channel is set")
     assert made.emulator.program.dialogs == ["no channel is set"]
 
 
@@ -225,9 +225,9 @@ def stopped_at_panel(made: Bench, peer: Peer) -> None:
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 2)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"], made.log_text()
+    assert not scans(received)
 
 
 def until_line(made: Bench, peer: Peer, line: int) -> None:
@@ -252,7 +252,7 @@ def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, kind: dict[str, A
         assert peer.set("x-pixel-rate", 1000).ok
     scanned(peer)
     stopped_at_panel(made, peer)
-    made.until_said("still holds the previous scan")
+    made.until_logged("still holds the previous scan")
     assert scanned(peer), "the next one is whole, and published"
 
 
@@ -293,7 +293,7 @@ def test_stopped_first_scan_is_interrupted(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     stopped_at_panel(made, peer)
-    made.until_said("lacks lines")
+    made.until_logged("lacks lines")
 
 
 @pytest.mark.parametrize("seen", [True, False])
@@ -310,9 +310,9 @@ def test_scan_started_and_stopped_at_the_panel_is_interrupted(bench: Make, seen:
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 4)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"], made.log_text()
+    assert not scans(received)
 
 
 def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Make) -> None:
@@ -325,9 +325,9 @@ def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Mak
     made.kill()
     made.at_panel(lambda emulator: emulator.rig.stop_scan(emulator.clock.now_s()))
     peer = made.start()
-    heard = peer.until(FREE)
-    assert "INTERRUPTED" in states(heard)
-    assert {Path(scan.filename).name[:7] for scan in scans(heard)} == {"scan001"}, "the one before, once more"
+    received = peer.until(FREE)
+    assert "INTERRUPTED" in states(received)
+    assert {Path(scan.filename).name[:7] for scan in scans(received)} == {"scan001"}, "the one before, once more"
 
 
 def test_slow_lines_of_gxsms_simulator_are_scanned_to_their_end(bench: Make) -> None:
@@ -378,7 +378,7 @@ def test_missing_channel_is_named_and_the_others_published(bench: Make, kind: st
     made.strike(kind, duration_s=1e6)
     found = scanned(peer)  # the last channel is written first
     assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
-    made.until_said("GXSM did not save Xp-Phase.nc")
+    made.until_logged("GXSM did not save Xp-Phase.nc")
     assert len(scanned(peer)) == 4, "it is not given up for ever"
 
 
@@ -387,9 +387,9 @@ def test_scan_without_files_is_interrupted(bench: Make) -> None:
     peer = small(made, result_timeout_s=20.0)
     made.strike("file-missing", count=4)
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("no new file in")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.until_logged("no new file in")
     assert scanned(peer)
 
 
@@ -416,7 +416,7 @@ def test_unreachable_folder_is_named(bench: Make, tmp_path: Path) -> None:
     peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("does not exist on this computer")
+    made.until_logged("does not exist on this computer")
 
 
 def test_scan_that_ended_while_gxsm_hung_is_published(bench: Make) -> None:
@@ -425,9 +425,9 @@ def test_scan_that_ended_while_gxsm_hung_is_published(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("wedge", duration_s=160.0)
-    heard = peer.until(FREE)
-    assert "UNDEFINED" in states(heard)
-    assert scans(heard)
+    received = peer.until(FREE)
+    assert "UNDEFINED" in states(received)
+    assert scans(received)
 
 
 # --- spectra ---
@@ -437,9 +437,9 @@ def test_unsaved_spectrum_is_reported(bench: Make) -> None:
     made = bench(speed=20.0, probe_auto_save=False)
     peer = small(made, result_timeout_s=20.0)
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
-    made.until_said("switch on Auto Save of probes")
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "INTERRUPTED", "FREE"]
+    made.until_logged("switch on Auto Save of probes")
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file"])

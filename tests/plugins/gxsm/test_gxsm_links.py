@@ -358,7 +358,7 @@ def test_request_left_to_an_ended_gxsm_is_withdrawn(block: Path) -> None:
         file.write((1).to_bytes(8, "little"))
     with pytest.raises(ControllerLost, match="no process is called"):
         open_link(address, 0.2, time.monotonic)
-    assert status(block) == 0, "a request of somebody before"
+    assert status(block) == 0, "a request of an earlier caller"
 
 
 def test_a_gxsm_that_ends_during_a_call_is_noticed_at_once(block: Path) -> None:

@@ -139,7 +139,7 @@ def test_set_never_reports_a_refusal(bench: Make, kind: dict[str, Any]) -> None:
         assert gxsm.call("set", "nonsense", "1") == 0
         assert gxsm.call("gets", "nonsense") == "ERROR"
         assert not_converted(gxsm, "set", "RangeX", 12.5)
-        assert gxsm.call("moveto_scan_xy", 10.0, 0.0) == -1, "in ångström, whatever the unit: 15 from side to side"
+        assert gxsm.call("moveto_scan_xy", 10.0, 0.0) == -1, "in ångström in any unit: 15 from side to side"
         assert gxsm.call("moveto_scan_xy", 7.0, 0.0) == 0
         assert not_converted(gxsm, "moveto_scan_xy", "7", "0")
         assert not_converted(gxsm, "set")
@@ -351,7 +351,7 @@ def test_shared_memory_without_the_lock_mixes_answers_up(bench: Make) -> None:
     other.ask("gets", "RangeX")
     one.answer()
     until(made, lambda: one.status() != 1)
-    assert one.answer() == other.answer(), "who asked for what is not known any more"
+    assert one.answer() == other.answer(), "the caller of each request is unknown"
     one.close()
     other.close()
 

@@ -117,7 +117,7 @@ def looked_at(
 
 _CALL = re.compile(r"(\w+)\((.*)\)")
 OTHERWISE = (
-    "gets('',)", "gets('R',)",  # the first name is that of another entry
+    "gets('',)", "gets('R',)",  # the first name belongs to another entry
     "get('RangeX',) after abc",  # a step of its converter, which is another one
     "y_current()",  # of a session with scans before
     "list_",  # those of its hardware
@@ -173,7 +173,7 @@ def test_a_scan_stopped_while_the_panel_repeats_is_not_published(tmp_path: Path)
         ScopeState.FREE,
     ]
     assert ("autosave",) not in link.called
-    assert ("action", "CHECK-MainAutoSave") in link.called, "GXSM saves what is begun at its panel"
+    assert ("action", "CHECK-MainAutoSave") in link.called, "GXSM saves measurements from its panel"
 
 
 def test_repeated_scans_are_separated_by_their_lines_alone(tmp_path: Path) -> None:

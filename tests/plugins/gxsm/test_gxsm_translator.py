@@ -94,9 +94,9 @@ def test_stopped_scan_is_not_published(bench: Make, kind: dict[str, Any]) -> Non
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
 
 
@@ -120,8 +120,8 @@ def test_scan_saved_twice_is_published_once(bench: Make) -> None:
     ready(peer)
     made.at_panel(lambda emulator: setattr(emulator.program, "auto_save", True))
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert len({scan.channel for scan in scans(heard)}) == len(scans(heard)) == 4
+    received = peer.until(FREE)
+    assert len({scan.channel for scan in scans(received)}) == len(scans(received)) == 4
     assert len(scanned(peer)) == 4
 
 
@@ -149,9 +149,9 @@ def test_lines_are_published_during_a_scan(
     assert peer.act(names.START_SCAN).ok
     assert not any(isinstance(one, ScanLines) for one in peer.until(FREE))
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    for whole in scans(heard):
-        lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == whole.channel]
+    received = peer.until(FREE)
+    for whole in scans(received):
+        lines = [one for one in received if isinstance(one, ScanLines) and one.channel == whole.channel]
         assert len(lines) >= 2
         assert lines[0].first_row + len(lines[0].values) == rows, "the highest first"
         picture = None
@@ -218,8 +218,12 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     peer = made.start()
     ready(peer)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.25, setpoint=0.5e-9)).ok
-    heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (True, 0.25, pytest.approx(0.5e-9))
+    received = peer.until(lambda one: isinstance(one, Feedback))
+    assert (received[-1].on, received[-1].proportional_gain, received[-1].setpoint) == (
+        True,
+        0.25,
+        pytest.approx(0.5e-9),
+    )
     assert made.emulator.rig.setup.feedback.proportional_gain == 0.25
     assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "as it was"
     assert peer.get("x-feedback-on") == "true"
@@ -227,7 +231,7 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     assert response.code == ControlResponse.PARAM_ERROR
     assert "is read-only" in response.reason
     # peers send back the whole message that was published, with one part changed
-    again = replace(heard[-1], proportional_gain=0.5)
+    again = replace(received[-1], proportional_gain=0.5)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, again).ok
     assert made.emulator.rig.setup.feedback.proportional_gain == 0.5
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, replace(again, on=False)).code == ControlResponse.PARAM_ERROR
@@ -239,8 +243,8 @@ def test_the_feedback_is_switched_where_gxsm_has_actions_for_it(bench: Make) -> 
     peer = made.start(feedback_actions=["FB-ON", "FB-OFF"])
     ready(peer)
     assert peer.set("x-feedback-on", False).ok
-    heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert heard[-1].on is False
+    received = peer.until(lambda one: isinstance(one, Feedback))
+    assert received[-1].on is False
     assert made.emulator.rig.setup.feedback.on is False
     assert peer.set("x-feedback-on", True).ok
     assert made.emulator.rig.setup.feedback.on
@@ -314,7 +318,7 @@ def test_missing_hardware_features_are_not_supported(bench: Make) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
     assert peer.set("x-pixel-rate", 4000).ok
     assert peer.act(names.START_SPEC).code == ControlResponse.ACTION_NOT_SUPPORTED
-    made.until_said("unsupported: move-speed, sample-slope-x")
+    made.until_logged("unsupported: move-speed, sample-slope-x")
     assert peer.get("x-controller") == "GXSM (simulator)"
 
 
@@ -403,9 +407,9 @@ def test_spectrum_has_its_position(bench: Make, kind: str, first: str, settings:
     scanned(peer)
     assert peer.set(names.SPEC_KIND, kind).ok
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (spectrum,) = (one for one in heard if isinstance(one, Spectrum))
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (spectrum,) = (one for one in received if isinstance(one, Spectrum))
     assert spectrum.position_m == (52.3456789e-9, -20e-9)
     assert spectrum.kind == kind
     assert spectrum.names[0] == first
@@ -457,9 +461,9 @@ def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dic
         assert "RPSPMC" in response.reason
         return
     assert response.ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 def test_spectrum_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
@@ -469,8 +473,8 @@ def test_spectrum_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
     assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
     assert peer.act(names.START_SPEC).ok
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "INTERRUPTED", "FREE"]
     assert made.emulator.rig.spectrum is None
 
 
@@ -487,11 +491,11 @@ def test_spectrum_is_not_taken_during_a_scan_from_the_panel(
     assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
     assert peer.act(names.START_SPEC).ok
     made.at_panel(lambda emulator: emulator.program.start_scan())
-    heard = peer.until(ScopeState.SCANNING) + peer.until(FREE)
-    assert "INTERRUPTED" in states(heard)
-    assert {scan.region for scan in scans(heard)} == {TURNED}, "the scan is published"
+    received = peer.until(ScopeState.SCANNING) + peer.until(FREE)
+    assert "INTERRUPTED" in states(received)
+    assert {scan.region for scan in scans(received)} == {TURNED}, "the scan is published"
     assert began == []
-    made.until_said("another measurement began")
+    made.until_logged("another measurement began")
 
 
 def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
@@ -524,17 +528,17 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
     made.at_panel(begin)
     found: list[str] = []
     for number in (1, 2, 3):
-        heard = peer.until(FREE)
-        assert states(heard) == ["SCANNING", "FREE"]
-        assert {Path(scan.filename).name[4:7] for scan in scans(heard)} == {f"00{number}"}
-        found += [scan.channel for scan in scans(heard)]
+        received = peer.until(FREE)
+        assert states(received) == ["SCANNING", "FREE"]
+        assert {Path(scan.filename).name[4:7] for scan in scans(received)} == {f"00{number}"}
+        found += [scan.channel for scan in scans(received)]
     assert len(found) == 3 * len(set(found)), "each channel of each scan, once"
     peer.until(ScopeState.SCANNING)
     until_line(made, 8)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
 def until_line(made: Bench, line: int) -> None:
@@ -565,20 +569,20 @@ def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
         program.scan.shows_s = 0.0
 
     made.at_panel(again)
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert len(scans(heard)) == 4
-    made.until_said("its last row still holds the previous scan", "whether this one came to its end is unknown")
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert len(scans(received)) == 4
+    made.until_logged("its last row still holds the previous scan", "whether this one came to its end is unknown")
 
 
 def test_autosave_is_off_only_while_a_scan_of_the_translator_runs(bench: Make) -> None:
     made = bench(speed=10.0, auto_save=False)
     peer = made.start()
     ready(peer, shape=(24, 32))
-    assert made.emulator.program.panel.auto_save, "GXSM saves what is begun at its panel"
+    assert made.emulator.program.panel.auto_save, "GXSM saves measurements from its panel"
     assert peer.act(names.START_SCAN).ok
     assert not made.emulator.program.panel.auto_save, "one that is stopped is not to be saved"
     assert peer.act(names.STOP_SCAN).ok
@@ -630,9 +634,9 @@ def test_redpitaya_measurement_at_the_panel_does_not_republish_the_previous_scan
     ready(peer)
     assert len(scanned(peer)) == 4
     made.at_panel(lambda emulator: emulator.program.take_curve("IV"))
-    heard = peer.until(FREE)
-    assert states(heard)[0] == "SCANNING", "it is taken for one"
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received)[0] == "SCANNING", "it is taken for one"
+    assert not scans(received)
 
 
 def test_busy_microscope_is_reported(bench: Make) -> None:
@@ -659,8 +663,8 @@ def test_scan_ended_without_a_translator_is_published_by_the_next(bench: Make) -
     while made.emulator.rig.busy(made.clock.now_s()) and made.clock.now_s() < until_s:
         pass
     peer = made.start()
-    heard = peer.until(FREE)
-    assert {scan.region for scan in scans(heard)} == {TURNED}
+    received = peer.until(FREE)
+    assert {scan.region for scan in scans(received)} == {TURNED}
     assert len(list(made.data.glob("*.nc"))) == 4
 
 

@@ -39,7 +39,7 @@ def test_bad_reply_is_logged_and_the_controller_reconnected(bench: Make, kind: s
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(told)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
 
@@ -53,7 +53,7 @@ def test_dialog_on_the_screen_silences_the_controller(bench: Make) -> None:
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    made.until_said("Nanonis is silent while a dialog waits for an answer on its screen")
+    made.until_logged("Nanonis is silent while a dialog waits for an answer on its screen")
 
 
 def test_slow_reply_is_awaited(bench: Make) -> None:
@@ -62,7 +62,7 @@ def test_slow_reply_is_awaited(bench: Make) -> None:
     made.strike("slow", duration_s=0.5)
     assert peer.get(names.TIP_BIAS_VOLTAGE) is not None
     made.kill()
-    assert "can't be reached" not in made.said()
+    assert "can't be reached" not in made.log_text()
 
 
 def test_refusal_has_the_controllers_own_text(bench: Make) -> None:
@@ -136,8 +136,8 @@ def test_scan_without_a_file_is_fetched(bench: Make, kind: str) -> None:
     assert peer.act(names.START_SCAN).ok
     found = scans(peer.until(FREE))
     assert found[0].filename.endswith("nanonis-0001.nc")
-    # by the name that Nanonis had said, or by the folder if it had not said any in time
-    made.until_said("unnamed001.sxm); it was fetched over TCP", "session); it was fetched over TCP")
+    # by the path that Nanonis reported, or by the folder without one
+    made.until_logged("unnamed001.sxm); it was fetched over TCP", "session); it was fetched over TCP")
 
 
 def test_scan_that_does_not_start_is_interrupted_and_the_previous_one_not_published(bench: Make) -> None:
@@ -147,10 +147,10 @@ def test_scan_that_does_not_start_is_interrupted_and_the_previous_one_not_publis
     assert scans(peer.until(FREE))
     made.strike("no-start")
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    made.until_said("the controller never reported it as running")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(received)
+    made.until_logged("the controller never reported it as running")
 
 
 @pytest.mark.parametrize("kinds", [("late-start",), ("ends-at-once",), ("ends-at-once", "late-start")])
@@ -163,9 +163,9 @@ def test_late_scan_is_published(bench: Make, kinds: tuple[str, ...]) -> None:
     for kind in kinds:
         made.strike(kind, duration_s=4.0)  # which is over before the scan is
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    second = scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    second = scans(received)
     assert len(second) == len(first)
     assert all(scan.filename.endswith("unnamed002.sxm") for scan in second)
 
@@ -185,14 +185,14 @@ def test_lost_start_does_not_publish_the_previous_scan(bench: Make, monkeypatch:
 
     monkeypatch.setattr(made.emulator, "_answer", lose)
     assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
-    heard = peer.until(FREE)
-    made.until_said("never reported it as running", "was fetched over TCP")
+    received = peer.until(FREE)
+    made.until_logged("never reported it as running", "was fetched over TCP")
     monkeypatch.undo()
     assert peer.act_once_free(names.START_SCAN).ok
-    heard += peer.until(lambda one: isinstance(one, Scan) and one.filename.endswith(".sxm"))
-    heard += peer.until(FREE)
-    assert len(scans(heard)) == 6, "Z, current and frequency shift, both ways, of the second scan alone"
-    assert all(scan.filename.endswith(".sxm") for scan in scans(heard))
+    received += peer.until(lambda one: isinstance(one, Scan) and one.filename.endswith(".sxm"))
+    received += peer.until(FREE)
+    assert len(scans(received)) == 6, "Z, current and frequency shift, both ways, of the second scan alone"
+    assert all(scan.filename.endswith(".sxm") for scan in scans(received))
 
 
 def test_retracting_withdraws_the_tip_even_if_the_scan_can_not_be_stopped(bench: Make) -> None:
@@ -204,7 +204,7 @@ def test_retracting_withdraws_the_tip_even_if_the_scan_can_not_be_stopped(bench:
     made.strike("refused")
     assert peer.act(names.RETRACT).ok
     assert not made.emulator.rig.engaged
-    made.until_said("it is not possible now")
+    made.until_logged("it is not possible now")
 
 
 def test_path_of_an_older_file_is_not_trusted(bench: Make) -> None:
@@ -239,15 +239,15 @@ def test_unsaved_spectrum_from_the_panel_is_not_the_previous_one(bench: Make) ->
     made.at_panel(lambda emulator: setattr(emulator.software.spectra.sweeps["BiasSpectr"], "saves", False))
     made.at_panel(lambda emulator: emulator.software.spectra.start("BiasSpectr", ""))
     peer.until(ScopeState.SPEC)
-    heard = peer.until(FREE)
-    assert not [one for one in heard if isinstance(one, Spectrum)], "nobody has its data"
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    made.until_said("its data was not requested from Nanonis")
+    received = peer.until(FREE)
+    assert not [one for one in received if isinstance(one, Spectrum)], "its data is lost"
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    made.until_logged("its data was not requested from Nanonis")
 
 
 def test_unsaved_scan_is_fetched_at_once(bench: Make) -> None:
     made = bench(speed=1.0)
-    peer = small(made, result_timeout_s=1e6)  # whoever waits for a file waits longer than this test does
+    peer = small(made, result_timeout_s=1e6)  # the wait for a file is longer than this test
     made.strike("autosave-off", duration_s=1e6)
     assert peer.act(names.START_SCAN).ok
     made.emulator.ends_as_awaited = True
@@ -264,9 +264,9 @@ def test_scan_stopped_at_the_panel_is_interrupted(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
 def test_safe_tip_blocks_measurements_until_the_tip_is_engaged(bench: Make) -> None:
@@ -278,7 +278,7 @@ def test_safe_tip_blocks_measurements_until_the_tip_is_engaged(bench: Make) -> N
         assert response.code in (ControlResponse.ACTION_ERROR, ControlResponse.NOT_FREE), action
     response = peer.act_once_free(names.START_SCAN)
     assert "safe tip" in response.reason
-    made.until_said("Nanonis' safe tip withdrew the tip")
+    made.until_logged("Nanonis' safe tip withdrew the tip")
     assert peer.act(names.ENGAGE).ok
     assert peer.act_once_free(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
@@ -291,10 +291,10 @@ def test_scan_in_the_air_is_not_published(bench: Make) -> None:
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("safe-tip-unnoticed")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    made.until_said("Nanonis' safe tip withdrew the tip")
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
+    made.until_logged("Nanonis' safe tip withdrew the tip")
     assert "safe tip" in peer.act_once_free(names.START_SCAN).reason
 
 
@@ -341,8 +341,8 @@ def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((600e-9, 0.0))).ok
     peer.until(ScopeState.MOVING)
     made.strike("cut")
-    heard = peer.until(FREE)
-    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["UNDEFINED", "MOVING", "FREE"]
     assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((600e-9, 0.0), abs=1e-9)
 
 
@@ -368,8 +368,8 @@ def test_unused_address_is_named(bench: Make) -> None:
     peer = made.start()
     response = peer.get_response(names.TIP_BIAS_VOLTAGE)
     assert response.code == ControlResponse.NO_RESPONSE
-    made.until_said(f"{made.address}: no connection")
-    made.until_said("is Nanonis running")
+    made.until_logged(f"{made.address}: no connection")
+    made.until_logged("is Nanonis running")
 
 
 @pytest.mark.parametrize("seed", [1, 2])

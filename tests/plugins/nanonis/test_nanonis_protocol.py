@@ -152,7 +152,7 @@ def test_damaged_reply_is_results_or_a_named_error(name: str, data: st.DataObjec
 
 
 def _read(name: str, body: bytes, release: int) -> None:
-    # what is traced is the whole process: a thread of another test may want memory too, but not each time
+    # tracing covers the whole process: a thread of another test may need memory too, but not each time
     peaks = (_peak_bytes(name, body, release) for _ in range(3))
     assert any(peak < 200_000 for peak in peaks), "no more memory than what came can fill"
 

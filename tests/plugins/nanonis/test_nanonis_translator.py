@@ -53,7 +53,7 @@ def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
 def test_rows_and_columns_match_the_sample(bench: Make, direction: str, fetch: bool) -> None:
     # Compared with the heights of the simulated sample at each pixel: an offset by half a pixel or a mirrored axis
     # shows.
-    seen = 20.0 if fetch else 100.0  # what is in no file must be seen running
+    seen = 20.0 if fetch else 100.0  # a scan without a file must be seen running
     made = bench(seen, surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -83,9 +83,9 @@ def test_lines_are_published_during_a_scan(bench: Make) -> None:
     ready(peer, shape=(40, 32))
     assert peer.set(names.SCAN_DIRECTION, "down").ok
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Z Forward"]
-    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Z Forward")
+    received = peer.until(FREE)
+    lines = [one for one in received if isinstance(one, ScanLines) and one.channel == "Z Forward"]
+    whole = next(one for one in received if isinstance(one, Scan) and one.channel == "Z Forward")
     assert len(lines) >= 2
     assert lines[0].first_row + len(lines[0].values) == 40, "the highest first"
     picture = None
@@ -168,8 +168,8 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     peer = made.start()
     ready(peer)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, proportional_gain=0.25, setpoint=0.5)).ok
-    heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (False, 0.25, 0.5)
+    received = peer.until(lambda one: isinstance(one, Feedback))
+    assert (received[-1].on, received[-1].proportional_gain, received[-1].setpoint) == (False, 0.25, 0.5)
     assert made.emulator.rig.setup.feedback.on is False
     assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "P alone changes T, and I stays"
     assert peer.set("x-feedback-on", True).ok
@@ -218,9 +218,9 @@ def test_spectrum_has_its_position(bench: Make, kind: str, first: str, fetch: bo
     moved(peer, 12.3456789e-9, -50e-9)
     assert peer.set(names.SPEC_KIND, kind).ok
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (spectrum,) = (one for one in heard if isinstance(one, Spectrum))
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (spectrum,) = (one for one in received if isinstance(one, Spectrum))
     assert spectrum.position_m == (12.3456789e-9, -50e-9)
     assert spectrum.kind == kind
     assert spectrum.names[0] == first
@@ -238,9 +238,9 @@ def test_stopped_spectrum_is_not_published(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 # --- what a tip needs besides ---
@@ -269,9 +269,9 @@ def test_retracting_stops_a_scan(bench: Make) -> None:
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
     assert peer.act(names.RETRACT).ok
-    heard = peer.until(FREE)
-    assert states(heard)[:2] == ["SCANNING", "INTERRUPTED"]
-    assert not any(isinstance(one, Scan) for one in heard)
+    received = peer.until(FREE)
+    assert states(received)[:2] == ["SCANNING", "INTERRUPTED"]
+    assert not any(isinstance(one, Scan) for one in received)
     assert not made.emulator.rig.engaged
 
 
@@ -291,7 +291,7 @@ def test_tip_without_feedback_is_retracted_at_the_end_of_a_run(bench: Make, scan
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
-    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.log_text()
 
 
 @pytest.mark.parametrize("kind", ["slow", "dialog", "refused", "cut"])
@@ -303,7 +303,7 @@ def test_tip_is_retracted_despite_slow_refusing_or_lost_nanonis(bench: Make, kin
     made.strike(kind, count=2, duration_s=10.0)  # two seconds, real time
     assert made.let_go() == ExitCode.ORPHAN
     assert not made.emulator.rig.engaged
-    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.log_text()
 
 
 def test_tip_without_feedback_stays_if_the_file_allows_it(bench: Make) -> None:
@@ -356,7 +356,7 @@ def test_continuous_scan_without_saving_is_switched_off(bench: Make) -> None:
 
 
 def test_saving_can_be_left_alone(bench: Make) -> None:
-    made = bench(speed=5.0)  # what is not saved must be seen running
+    made = bench(speed=5.0)  # an unsaved scan must be seen running
     made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(autosave="off"))
     peer = made.start(autosave=False)
     ready(peer)

@@ -88,7 +88,7 @@ def flat(values: Any) -> list[float]:
 def test_client_reads_the_values_that_it_sets(client: Any, setter: str, getter: str, values: list[float]) -> None:
     ask(client, setter, *values)
     got = ask(client, getter)
-    if setter == "Scan_SpeedSet":  # what is kept counts from 0 here, and the times follow from the frame
+    if setter == "Scan_SpeedSet":  # SpeedGet counts `keep` from 0, and the times follow from the frame
         values = [1e-6, 2e-6, 1.0, 0.5, 0, 2.0]
     assert got[: len(values)] == pytest.approx(values, rel=1e-6)
 
@@ -411,7 +411,7 @@ def test_frequency_shift_current_and_z_show_the_state_of_the_tip(tmp_path: Path)
     assert all(abs(found[worse][3] - sharp_m) > 3e-11 for worse in ("blunt", "double"))
 
 
-# --- what is set and what it does ---
+# --- settings and their effects ---
 
 
 @pytest.mark.parametrize(
@@ -515,7 +515,7 @@ def test_repeated_waits_find_the_end_of_a_scan_at_any_clock_speed(client: Any) -
         while ask(client, "Scan_StatusGet") == [1]:
             pass
         assert ask(client, "Scan_WaitEndOfScan", 5000)[0] == 0
-    assert ask(client, "Scan_WaitEndOfScan", 1)[0] == 1, "an end is told once"
+    assert ask(client, "Scan_WaitEndOfScan", 1)[0] == 1, "an end is reported once"
     started_s = time.monotonic()
     assert ask(client, "Scan_WaitEndOfScan", 500)[0] == 1
     assert time.monotonic() - started_s >= 0.5, "a client's patience is in real time"

@@ -37,7 +37,7 @@ def test_bad_reply_is_logged_and_studio_reconnected(bench: Make, kind: str, told
     made.strike(kind, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(told)
     scans_again(peer)
 
 
@@ -47,7 +47,7 @@ def test_studio_is_reconnected_when_it_answers(bench: Make, kind: str, told: str
     peer = small(made, **SOON)
     made.strike(kind, duration_s=600.0)
     peer.until(UNDEFINED)
-    made.until_said(told)
+    made.until_logged(told)
     peer.until(FREE)
     scans_again(peer)
 
@@ -59,9 +59,9 @@ def test_scan_stopped_at_the_panel_is_not_published(bench: Make, kind: str) -> N
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike(kind)
-    heard = peer.until(FREE)
-    assert not scans(heard)
-    assert states(heard)[-1] == "FREE"
+    received = peer.until(FREE)
+    assert not scans(received)
+    assert states(received)[-1] == "FREE"
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])

@@ -70,9 +70,9 @@ def test_lines_are_published_during_a_scan(bench: Make, direction: str) -> None:
     ready(peer, shape=(40, 32))
     assert peer.set(names.SCAN_DIRECTION, direction).ok
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Height Forward"]
-    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Height Forward")
+    received = peer.until(FREE)
+    lines = [one for one in received if isinstance(one, ScanLines) and one.channel == "Height Forward"]
+    whole = next(one for one in received if isinstance(one, Scan) and one.channel == "Height Forward")
     assert len(lines) >= 2
     for part in lines:
         rows = whole.values[part.first_row : part.first_row + len(part.values)]
@@ -87,9 +87,9 @@ def test_a_force_curve_is_taken_where_the_tip_was_sent(bench: Make) -> None:
     moved(peer, 120e-9, -40e-9)
     scanned(peer)
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert curve.position_m == (120e-9, -40e-9)
     assert curve.kind == "force"
     taken = made.emulator.rig.spectrum
@@ -120,8 +120,8 @@ def test_a_force_curve_can_be_stopped(bench: Make) -> None:
     peer.until(ScopeState.SPEC)
     made.at_panel(lambda emulator: None)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,7 +166,7 @@ def test_the_tip_is_withdrawn_where_a_second_connection_waits(bench: Make) -> No
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.act(names.RETRACT).ok
-    made.until_said("the tip is withdrawn by the first")
+    made.until_logged("the tip is withdrawn by the first")
     peer.until(FREE)
     assert not made.emulator.rig.engaged
 
@@ -204,9 +204,9 @@ def test_restarted_translator_finds_the_scan(bench: Make) -> None:
     peer.until(ScopeState.SCANNING)
     made.kill()
     peer = made.start()
-    heard = peer.until(FREE)
-    assert "SCANNING" in states(heard)
-    assert {scan.region for scan in scans(heard)} == {TURNED}
+    received = peer.until(FREE)
+    assert "SCANNING" in states(received)
+    assert {scan.region for scan in scans(received)} == {TURNED}
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_restarted_translator_finds_the_scan(bench: Make) -> None:
 def test_mismatches_are_reported(bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str) -> None:
     made = bench(**emulator)
     made.start(**settings)
-    made.until_said(told)
+    made.until_logged(told)
 
 
 def test_refused_values_change_none(bench: Make) -> None:

@@ -212,7 +212,7 @@ for call in (
 print(json.dumps({**found, "said": said}))
 """,
         )
-    sensitivity = 60e-9 * 1.2  # that of the maker of the cantilever, before it is calibrated
+    sensitivity = 60e-9 * 1.2  # nominal value of the cantilever, before the calibration
     assert told["V"] == [0.7, -10.0, 10.0]
     assert told["m"] == pytest.approx([0.7 * sensitivity, -10.0 * sensitivity, 10.0 * sensitivity])
     assert told["after"] == pytest.approx(30e-9 / sensitivity)

@@ -111,7 +111,7 @@ def test_bad_reply_is_logged_and_smartscan_reconnected(bench: Make, kind: str, t
     made.strike(kind, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(told)
     response = peer.act_once_free(names.START_SCAN)
     assert response.ok, response.reason
     assert scans(peer.until(FREE))
@@ -121,7 +121,7 @@ def test_unknown_word_is_named_and_not_guessed(bench: Make) -> None:
     made = bench(scan_words=("true", "schläft"))
     with pytest.raises(AssertionError):
         small(made, **SOON)
-    made.until_said("replied 'schläft' to scan_query")
+    made.until_logged("replied 'schläft' to scan_query")
 
 
 def test_words_can_be_added(bench: Make) -> None:
@@ -136,9 +136,9 @@ def test_late_file_is_awaited(bench: Make, kind: str, state: str) -> None:
     peer = small(made)
     made.strike(kind, duration_s=300.0)
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert scans(heard)
-    assert states(heard)[-1] == state
+    received = peer.until(FREE)
+    assert scans(received)
+    assert states(received)[-1] == state
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -151,9 +151,9 @@ def test_a_curve_is_taken_where_the_tip_was_sent(bench: Make, kind: str, swept: 
     scanned(peer)
     assert peer.set(names.SPEC_KIND, kind).ok
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert (curve.kind, curve.names[0], curve.position_m) == (kind, swept, (120e-9, -40e-9))
     taken = made.emulator.rig.spectrum
     assert taken is not None
@@ -169,8 +169,8 @@ def test_a_curve_can_be_stopped(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make) -> None:
@@ -221,9 +221,9 @@ def test_refused_curve_has_no_result(bench: Make) -> None:
     peer = small(made)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
     peer.act(names.START_SPEC)
-    heard = peer.until(FREE)
-    assert states(heard)[-2:] == ["INTERRUPTED", "FREE"]
-    made.until_said("busy with a calibration")
+    received = peer.until(FREE)
+    assert states(received)[-2:] == ["INTERRUPTED", "FREE"]
+    made.until_logged("busy with a calibration")
 
 
 def test_setting_one_gain_keeps_the_others(bench: Make) -> None:
@@ -241,7 +241,7 @@ def test_unreported_gains_are_not_supported(bench: Make) -> None:
     peer = small(made)
     assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
     assert scanned(peer)
-    made.until_said("does not report the gains")
+    made.until_logged("does not report the gains")
 
 
 @pytest.mark.parametrize("kind", ["spectrum-refused", "no-file"])
@@ -250,9 +250,9 @@ def test_curve_without_a_file_is_reported(bench: Make, kind: str) -> None:
     peer = small(made, result_timeout_s=2.0)
     made.strike(kind)
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert not any(isinstance(one, Spectrum) for one in heard)
-    assert "INTERRUPTED" in states(heard)
+    received = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in received)
+    assert "INTERRUPTED" in states(received)
     made.strike("late-file", duration_s=100.0)
     assert peer.act(names.START_SPEC).ok
     assert [one.kind for one in peer.until(FREE) if isinstance(one, Spectrum)] == ["force"]

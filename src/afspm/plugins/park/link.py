@@ -135,8 +135,8 @@ def _fields(raw: bytes) -> Plain:
     if not isinstance(reply, dict):
         raise ControllerLost(f"a reply that is not JSON-RPC: {raw[:_SHOWN]!r}")
     if reply.get("error"):
-        error = reply["error"]
-        raise SmartScanError(str(error.get("message", error) if isinstance(error, dict) else error))
+        failure = reply["error"]
+        raise SmartScanError(str(failure.get("message", failure) if isinstance(failure, dict) else failure))
     if "result" not in reply:
         raise ControllerLost(f"a reply without a result: {raw[:_SHOWN]!r}")
     return reply
