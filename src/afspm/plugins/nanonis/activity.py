@@ -175,6 +175,7 @@ class NanonisActivity(Activity):
         if scanning:
             return self._scanning(path)
         if self._files.what == SCAN and not self._files.was_seen and not self._files.has_file():
+            # It may still be moving to its first line; until it is seen, Nanonis' memory holds the previous scan.
             if self._clock.monotonic_s() < self._shows_until_s:
                 self._listener.scan()  # an earlier event belonged to the scan before
                 return ScopeStatus(ScopeState.SCANNING)

@@ -44,6 +44,7 @@ class Grabbing:
 
     def image(self, raw: np.ndarray, *, upwards: bool, backward: bool) -> np.ndarray:
         """Return the image [y, x] with both axes ascending."""
+        # Unconfirmed: a public note on one instrument says that the top row comes first in both directions.
         rows = raw if self.rows == "recorded" and upwards else raw[::-1]
         pixels = rows[:, ::-1] if backward and self.backward == "mirrored" else rows
         return np.ascontiguousarray(pixels, dtype=np.float64)
@@ -82,6 +83,7 @@ def images(ask: Ask, how: Grabbing) -> list[Image]:
 def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLines]:
     """Return the complete lines beyond the first `start`, in scanning order."""
     lines = []
+    # Lines not yet scanned are NaN; channels may differ by the line being scanned.
     done = min((int(np.isfinite(image.values).all(axis=1).sum()) for image in found), default=0)
     for image in found if done > start else ():
         shape = (image.values.shape[0], image.values.shape[1])

@@ -25,6 +25,7 @@ NEWEST: Final = 1 << 31
 LARGEST_BODY: Final = 1 << 28
 """Bytes; eight channels of the largest scan are less, so a longer body is no reply."""
 
+# Big-endian: name padded with zeros, size of the body, 1 to request a reply, zero.
 _HEADER: Final = struct.Struct(">32sihh")
 _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
 
@@ -101,6 +102,7 @@ def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> by
                 body += _WRITERS[code](value)
             except (struct.error, OverflowError, TypeError, ValueError) as error:
                 raise InvalidValue(f"{name}: {value!r} can't be sent as {code}: {error}") from error
+    # A reply is always requested: without one, a refusal would go unnoticed.
     return _HEADER.pack(name.encode("ascii"), len(body), 1, 0) + body
 
 
@@ -129,6 +131,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
         BadReply: the body does not fit the function.
     """
     try:
+        # The fields depend on the release: wrong ones leave bytes over, or need more than there are.
         found, status, text = _parsed(body, function(name).result_codes(release))
     except BadReply as whole:
         try:
@@ -159,6 +162,7 @@ def _depends_on_release(name: str) -> bool:
 def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object, ...], int, str]:
     reader = _Reader(memoryview(body))
     found = tuple(_READERS[code](reader) for code in codes)
+    # The error block at the end of every reply: a status, and a text.
     status, text = reader.number("I"), reader.text()
     if reader.left:
         raise BadReply(f"it has {reader.left} bytes too many")

@@ -79,6 +79,7 @@ class NanonisFiles(ResultFiles):
         """
         running = self._kept["running"]
         if running is not None:
+            # Without access to the folder no file can appear: fetch at once.
             patience_s = self._patience_s if Path(running["folder"]).is_dir() else 0.0
             self._ends({"reported": path, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
         ended = self._kept["ended"]
@@ -123,6 +124,7 @@ class NanonisFiles(ResultFiles):
             if not ended.get("seen", True):
                 raise FileError("the controller never reported it as running")
             content = fetch(ended)
+            # A stopped scan stays in Nanonis' memory with NaN in the missing lines.
             if missing := lines_missing(content):
                 raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
         except LOST:

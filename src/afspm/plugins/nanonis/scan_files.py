@@ -47,6 +47,7 @@ def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
     scans = []
     for (name, way, unit), image in zip(images, stack, strict=True):
         rows = image if upwards else image[::-1]
+        # In real files, forward and backward images agree only after mirroring one of them.
         pixels = rows[:, ::-1] if way == "Backward" else rows
         scans.append(Scan(region, f"{name} {way}", unit, pixels.astype(np.float64), end, str(path)))
     return FileContent(CONTROLLER, tuple(scans), header=header, start_ns=begun, end_ns=end, upwards=upwards)

@@ -59,6 +59,7 @@ class Link:
         """
 
         def read(receiver: Receiver) -> tuple[object, ...]:
+            # A reply may exceed one segment of TCP: 128 names of signals, or a scan, do.
             size = protocol.body_bytes(bytes(receiver.exactly(protocol.HEADER_BYTES)), name)
             return protocol.results(name, receiver.exactly(size), self.release)
 
@@ -92,7 +93,9 @@ class Session:
         try:
             driver.prove()
             self.controller = f"Nanonis, release {release}"
+            # The fields of requests and replies depend on the release.
             self._link.release = release or self._found_release()
+            # The spectroscopy modules of the real software answer only after their Open.
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             second = Link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
             self._listener = self.listener = Listener(second, driver.wake)
@@ -225,5 +228,6 @@ class Listener:
 
     def _curve(self, module: str, base_name: str) -> ListenerEvent:
         with_data = 1
+        # With data requested, Start replies at the end of the spectrum, and blocks this connection until then.
         names, values, _ = self._link.ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
         return CurveEnded(tuple(names), values)

@@ -90,6 +90,7 @@ class ScanFrame(Group):
 
 
 def _share(pixels: int) -> float:
+    # Nanonis' range goes from edge to edge of the pixels, afspm's from centre to centre.
     return (pixels - 1) / pixels if pixels > 1 else 1.0
 
 
@@ -153,6 +154,7 @@ class FeedbackOn(Group):
     def write(self, values: Mapping[str, Value]) -> None:
         wanted = bool(values[FEEDBACK_ON])
         self._ask("ZCtrl.OnOffSet", int(wanted))
+        # OnOffGet reports the real-time controller, which follows with a delay.
         self._wait_for(lambda: self.read()[FEEDBACK_ON] is wanted)
 
 
@@ -162,6 +164,7 @@ class MoveSpeed(Group):
     names = (names.MOVE_SPEED,)
 
     def read(self) -> dict[str, Value]:
+        # Without a speed of its own, the tip moves at the scan speed between scans, too.
         speed_m_s, own = self._numbers("FolMe.SpeedGet")
         return {names.MOVE_SPEED: speed_m_s if own else self._numbers("Scan.SpeedGet")[0]}
 
@@ -198,6 +201,7 @@ class DriftRate(Group):
         on, _, _, up_m_s, _, _, _, *limit = self._numbers("Piezo.DriftCompGet")
         x, y = (float(self.merged(values)[name]) for name in self.names)
         follows = bool(x or y or (on and up_m_s))
+        # Release 2021 has no limit.
         limit_percent = limit[0] if limit else self._usual_limit_percent
         self._ask("Piezo.DriftCompSet", _ON if follows else _OFF, x, y, up_m_s, limit_percent)
 
@@ -230,6 +234,7 @@ class Probe(Group):
             return self._goal_m
         if self._seen_m is not None and self._ask("Scan.StatusGet")[0]:
             return self._seen_m
+        # The position has noise of the converters: within their resolution it counts as unchanged.
         x, y = self._numbers("FolMe.XYPosGet", 0)
         if self._seen_m is None or not self._near((x, y), self._seen_m):
             self._seen_m = (x, y)
@@ -242,6 +247,7 @@ class Probe(Group):
         before_m = self.xy_m()
         x, y = (float(values.get(name, was)) for name, was in zip(self.names, before_m, strict=True))
         self._range_m = self._numbers("Piezo.RangeGet")[:2]
+        # Nanonis would clip the position to the range without an error.
         for name, value, whole in zip(self.names, (x, y), self._range_m, strict=True):
             if abs(value) > whole / 2:
                 raise refuse_value(
@@ -291,5 +297,6 @@ def same_float32(name: str, got: Value, other: Value, among: Mapping[str, Value]
         return got == other
     if name == names.SCAN_ANGLE:  # a controller may return 350 degrees as -10
         return abs(math.remainder(got - other, math.tau)) <= _DIGITS * math.tau
+    # A corner is centre minus half the size: its rounding error is relative to the larger of them.
     largest = max(abs(float(among[part])) for part in _ADDED_UP & among.keys()) if name in _ADDED_UP else 0.0
     return math.isclose(got, other, rel_tol=_DIGITS, abs_tol=_DIGITS * largest)

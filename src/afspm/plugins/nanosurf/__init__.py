@@ -189,6 +189,7 @@ class Nanosurf(Driver):
             f"{_STORAGE}.nhf_backend_enabled": True,
             f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
         }
+        # The other modes append to the current file or save nothing, and results are recognised by new files.
         if session.values(list(wanted)) != wanted:
             self.log.warning("Studio did not save each measurement to a new .nhf file; it does from now on")
             session.put(wanted)
@@ -199,9 +200,11 @@ class Nanosurf(Driver):
 
     def _check_table(self, session: Session) -> None:
         rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
+        # The tree differs between releases and licences: a missing path would fail in the middle of a night.
         for path in session.missing(rows):
             raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")
         expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
+        # A value in another unit would be converted by a wrong factor: refuse at the start.
         for path, unit in session.units(expected).items():
             if unit not in expected[path]:
                 problem = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"

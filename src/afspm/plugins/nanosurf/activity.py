@@ -89,6 +89,7 @@ class StudioActivity(Activity):
 
     def start_scan(self) -> None:
         """Scan the frame. Raises Refused: Studio reports an error, or no scan is seen."""
+        # A short scan may be over before the next poll: then the count of started scans has risen.
         before = self._session.scanning().started
 
         def is_seen() -> bool:
@@ -124,6 +125,7 @@ class StudioActivity(Activity):
         try:
             self.call = self._session.begin("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
         except ControllerLost as lost:
+            # A Studio may serve one client only; the first connection then waits for the end of the withdrawal.
             self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
             self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
 

@@ -78,6 +78,7 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
             if min(rows, columns) < 2:
                 raise FileError(f"holds an image of {columns} x {rows} pixels")
             values = _values(dataset).reshape(rows, columns)
+            # A stopped image: the remaining lines were not scanned.
             if acquired < rows:
                 upwards = hdf5.text(group.attrs.get("image_scan_direction", "up")) == "up"
                 values[slice(acquired, None) if upwards else slice(rows - acquired)] = np.nan
@@ -144,6 +145,7 @@ def _values(dataset: h5py.Dataset) -> Array:
     prefix = "signal" if "signal_name" in attributes else "base"
     kind = attributes.get("dataset_element_type", 7)
     kind = hdf5.text(kind) if isinstance(kind, str | bytes) else _TYPES.get(int(kind), "double")
+    # Floating-point values are stored in their unit.
     if kind == "double" or f"{prefix}_calibration_max" not in attributes:
         return raw
     low, high = (float(attributes[f"{prefix}_calibration_{end}"]) for end in ("min", "max"))

@@ -11,6 +11,7 @@ from afspm.plugins.nanosurf.lua_values import BadLua, parse
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
 
+# Length of a script or reply in bytes, least significant byte first.
 _LENGTH: Final = struct.Struct("<I")
 _LONGEST_REPLY: Final = 1 << 28
 _SHOWN: Final = 60
@@ -45,6 +46,7 @@ class Link:
     def begin(self, script: str) -> None:
         """Start a script; `reply` must be received before the next one. Raises ControllerLost."""
         raw = script.encode()
+        # Studio executes one script at a time on a connection, and replies at its end.
         self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
 
     def reply(self, what: str) -> tuple[bool, list[Any]]:
@@ -70,6 +72,7 @@ def _read(receiver: Receiver) -> tuple[Any, dict[Any, Any]]:
         reply = parse(text)
     except BadLua as error:
         raise ControllerLost(f"a reply that is not Lua: {error}") from error
+    # {0,{values…}} after success, {1,{text}} after an error.
     if not (isinstance(reply, dict) and reply.get(1) in (0, 1) and isinstance(reply.get(2), dict)):
         raise ControllerLost(f"a reply without a status: {text[:60]!r}")
     return reply[1], reply[2]

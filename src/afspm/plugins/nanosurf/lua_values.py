@@ -108,6 +108,7 @@ def _unescaped(found: re.Match[str]) -> str:
 
 
 def _special(text: str) -> float:
+    # The text of NaN and infinity depends on Lua's C library.
     if "huge" in text or "inf" in text or "1e9999" in text:
         return -math.inf if text.lstrip("(").startswith("-") else math.inf
     return math.nan

@@ -68,6 +68,7 @@ def _sections(text: str) -> dict[str, Section]:
 def _channels(sections: Mapping[str, Section], data: bytes) -> Iterator[tuple[Section, Array]]:
     dataset, at = sections["DataSet"], 0
     listed = ((_CHANNEL.fullmatch(key), name) for key, name in dataset.items())
+    # The values of channels follow each other in the order of their group and channel numbers.
     for _, name in sorted((tuple(map(int, key.groups())), name) for key, name in listed if key is not None):
         channel = sections[name]
         kind = np.dtype(_BITS[int(channel["SaveBits"])])
@@ -79,6 +80,7 @@ def _channels(sections: Mapping[str, Section], data: bytes) -> Iterator[tuple[Se
             raise FileError(f"ends within {name}")
         raw = np.frombuffer(data, kind, shape[0] * shape[1], at).reshape(shape)
         at += size
+        # Signed integers span the range Dim2Min to Dim2Min + Dim2Range.
         steps = 2.0 ** (8 * kind.itemsize)
         yield channel, (raw / steps + 0.5) * float(channel["Dim2Range"]) + float(channel["Dim2Min"])
 
@@ -140,6 +142,7 @@ def _taken(channel: Section, values: Array, line: int) -> Array:
 
 
 def _points(channel: Section, line: int) -> int:
+    # A curve may have fewer points than its line in the file.
     most = int(channel["Points"])
     points = int(channel.get(f"LineDim{line}Points", most))
     if not 0 <= points <= most:

@@ -80,6 +80,7 @@ class Session:
         Raises:
             ControllerLost: a value is missing or not finite, so that the reply can't be trusted.
         """
+        # One request for all values: they belong to the same moment, and a poll stays short.
         script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
         found = dict(zip(paths, self._returned(script), strict=False))
         for path in paths:
@@ -110,6 +111,7 @@ class Session:
 
     def scanning(self) -> Scanning:
         """Return whether a scan runs, and how many were started. Raises ControllerLost."""
+        # Newer releases have no is_scanning: handlers of their signals count scans instead.
         script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
         found = self._returned(script)
         if len(found) != 2 or not isinstance(found[0], bool) or not isinstance(found[1], int):
@@ -121,6 +123,7 @@ class Session:
         link = self._open_link()
         try:
             self._select(link)
+            # A long command blocks its connection: the first one stays free for polls and stops.
             link.begin(f"{first} return {WORKFLOW}.{command}()")
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
@@ -154,6 +157,7 @@ class Session:
 
     def _select(self, link: Link) -> None:
         try:
+            # The selection of a session belongs to a connection: each one needs its own.
             link.run(f"return root.session.select({written(self._name)}, {self._level})")
         except StudioError as error:
             raise ControllerLost(f"Studio's session {self._name!r} can't be selected: {error}") from error

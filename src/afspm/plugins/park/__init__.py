@@ -91,6 +91,7 @@ class Park(Driver):
         self.close()
         session = self._session = Session(self._open_link, self._scanning, self._idle)
         self.prove()
+        # Another SmartScan may answer after a reconnection: start from the complete table.
         self.table = self._whole_table
         if not self._gains.are_reported():
             self.log.warning("SmartScan does not report the gains of its feedback: they are not supported")

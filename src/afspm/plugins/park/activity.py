@@ -88,6 +88,7 @@ class SmartScanActivity(Activity):
     def start_curve(self, kind: str, place_m: XY) -> None:
         """Take a curve where the tip was sent; the tip moves there first, as a scan moves it."""
         self._stopping = False
+        # The scanner is where the scan has left it: the curve needs a move first.
         self.watch(self._session.begin(kind, way_to(place_m)))
         self.curve_awaited, self._curve_at = kind, place_m
 
@@ -122,6 +123,7 @@ class SmartScanActivity(Activity):
     def stopped(self) -> None:
         """Register a stop: the running measurement has no result. A move of the tip continues."""
         if self.call is not None and self.curve_awaited:
+            # The script of a move can't be stopped: the tip is busy until it arrives.
             self.call.what = MOVE
         super().stopped()
 

@@ -54,6 +54,7 @@ class Link:
             SmartScanError: it failed. ControllerLost: no reply, or an untrustworthy one; the connection is closed.
         """
         reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
+        # `wrapped` always returns a text: without one the script did not run to its end.
         if not reply.get("value"):
             raise self._bad(f"SmartScan gave no value of {shown(expression)}")
         return self._outcome(reply)

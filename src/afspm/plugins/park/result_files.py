@@ -33,6 +33,7 @@ class ParkFiles(FolderFiles):
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
         """Return all new files once no more appear; before that an empty list."""
         listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
+        # By time and not by name: SmartScan's names can be chosen freely.
         files = sorted(one for one in listed if one[1] > measured["newest_ns"])
         now_s = self._monotonic_s()
         if files != self._seen[0]:

@@ -84,6 +84,7 @@ def _tags(path: Path) -> Tags:
             tags = dict(image.tag_v2)
     except UnidentifiedImageError as error:
         raise FileError("is not a TIFF") from error
+    # Pillow reads the tags only, and does not notice a truncated picture.
     ends = [at + size for at, size in zip(tags.get(STRIPS, ()), tags.get(STRIP_SIZES, ()), strict=True)]
     if max(ends, default=0) > path.stat().st_size:
         raise FileError("ends within the picture")
@@ -96,6 +97,7 @@ def _scan(header: np.void, tags: Tags, path: Path, *, newer: bool) -> Scan:
     shape = int(header["rows"]), int(header["columns"])
     numbers = _numbers(tags, DATA_TAG, header, shape, newer=newer)
     unit, factor = in_si(text(header["unit"]) or "um")
+    # A scale of 0 is unset.
     scale = float(header["scale"]) or 1.0
     values = factor * float(header["gain"]) * (numbers * scale + float(header["offset"]))
     size = (abs(float(header["width_um"])) * MICROMETRE, abs(float(header["height_um"])) * MICROMETRE)
@@ -140,6 +142,7 @@ def _places(raw: bytes, count: int) -> list[XY | None]:
 def _numbers(
     tags: Tags, tag: int, header: np.void, shape: tuple[int, ...], *, newer: bool
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
+    # The first version of the format has 16-bit integers only.
     data, number = bytes(tags.get(tag, b"")), int(header["numbers"]) if newer else 0
     if number not in NUMBERS:
         raise FileError(f"has numbers of kind {number}, which afspm does not know")

@@ -38,6 +38,7 @@ class Session:
         self._open_link, self._scanning, self._idle = open_link, scanning, idle
         self._link = open_link()
         try:
+            # An unknown word in an answer must show now, not during the first scan.
             self._link.ask(IS_CONNECTED)
             self.scanning()
         except SmartScanError as error:
@@ -71,6 +72,7 @@ class Session:
 
     def put_members(self, path: str, members: Mapping[str, Value]) -> None:
         """Set members of an object, which SmartScan accepts only as a whole. Raises Refused."""
+        # SmartScan's gains are one object: setting a member alone has no effect.
         given = "".join(f"all[{json.dumps(name)}] = {json.dumps(value)}; " for name, value in members.items())
         changed = f"spm.{path} = (function (all) {{ {given}return all; }})(spm.{path})"
         self._do(changed, path, ControlResponse.PARAM_ERROR)
@@ -113,6 +115,7 @@ class Session:
         except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
+        # A value of None means that SmartScan has replied before the end of the script.
         return LongCall(what, link, lambda value: value is None and self.script_runs())
 
     def close(self) -> None:

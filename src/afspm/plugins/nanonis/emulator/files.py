@@ -70,6 +70,7 @@ def sxm(scan: SxmContent) -> bytes:
         ),
     }
     header = "".join(f":{key}:\n{value}\n" for key, value in fields.items()) + ":SCANIT_END:\n\n\n"
+    # As in real files: backward lines from right to left, rows in recording order.
     images = (image for *_, forward, backward in scan.channels for image in (forward, backward[:, ::-1]))
     recorded = (image if scan.upwards else image[::-1] for image in images)
     values = b"".join(np.asarray(image, dtype=">f4").tobytes() for image in recorded)

@@ -329,6 +329,7 @@ class ScanModule:
         self, continuous: int, bouncy: int, autosave: int, series: str, comment: str, *rest: Any
     ) -> Answer:
         props = self.properties
+        # In PropsSet 0 is no change, 1 on, 2 off.
         props.continuous = bool(chosen(continuous, props.continuous, 1, 0))
         props.bouncy = bool(chosen(bouncy, props.bouncy, 1, 0))
         props.autosave = chosen(autosave, props.autosave, *_AUTOSAVE)
@@ -343,6 +344,7 @@ class ScanModule:
     def _properties(self) -> Answer:
         props = self.properties
         counts, table = [1] * len(props.modules), [["Setpoint"] for _ in props.modules]
+        # PropsGet counts differently from PropsSet, which has 0 for no change: all 0, next 1, off 2.
         flags = int(props.continuous), int(props.bouncy), _AUTOSAVE.index(props.autosave)
         return *flags, props.series, props.comment, list(props.modules), counts, table, props.autopaste
 

@@ -207,6 +207,7 @@ def body(name: str, results: Sequence[object], release: int, encoding: str = "ut
 
 def error_body(name: str, text: str, release: int, *, bare: bool) -> bytes:
     """Encode the body of a reply with an error, after results of zeros, or without results."""
+    # The specification does not define if results are present after an error: both can be emulated.
     codes = [] if bare or name not in functions() else functions()[name].result_codes(release)
     return b"".join(_packed(code, ZEROS[code], "utf-8") for code in codes) + error_block(text, 1)
 
@@ -218,6 +219,7 @@ def error_block(text: str, status: int) -> bytes:
 
 def _packed(code: str, value: Any, encoding: str) -> bytes:
     if code == "S":
+        # The real software on Windows may send texts in Latin-1.
         raw = str(value).encode(encoding, "replace")
         return struct.pack(">i", len(raw)) + raw
     if code == "A":

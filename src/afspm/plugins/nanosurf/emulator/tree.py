@@ -145,6 +145,7 @@ class CommandTree:
     def _session(self, workflow: Nested, level: int) -> Nested:
         # A licence of a higher level adds commands to the application's own ones.
         imaging = workflow["imaging"]
+        # The real tree has the old commands at the highest level only.
         if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:
             imaging = {**imaging, "is_scanning": lambda: self._program.scanning}
         found: Nested = {"workflow": {**workflow, "imaging": imaging}}
