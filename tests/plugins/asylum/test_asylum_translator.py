@@ -177,7 +177,7 @@ def test_frame_changed_by_asylum_is_logged(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
     scan = scanned(peer)["HeightTrace"]
     assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
-    made.until_logged("the scan is published as the file has it")
+    made.until_logged("has the frame 300 x 300 nm at (40, -25) nm, 30° instead of 300 x 100 nm at (40, -25) nm, 30°")
 
 
 # --- parameters ---

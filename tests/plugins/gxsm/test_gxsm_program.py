@@ -112,6 +112,15 @@ def _readable(path: Path) -> bool:
         return False
 
 
+@pytest.mark.parametrize("fault", ["nan", "error", "wrong-type"])
+def test_faults_of_answers_spare_the_scripts_own_look(bench: Make, fault: str) -> None:
+    made = bench()
+    made.strike(fault)
+    found: list[object] = []
+    made.at_panel(lambda emulator: found.append(emulator._calls.answer("get", ("script-control",))))
+    assert found == [1.0], "the script would end"
+
+
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
 def test_set_never_reports_a_refusal(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(user_unit="nm", **kind)

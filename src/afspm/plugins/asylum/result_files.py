@@ -12,8 +12,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 
 from afspm.basics.errors import ConfigError
+from afspm.basics.formatting import area_text, position_text
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import Scan, Spectrum
+from afspm.model import Region, Scan, Spectrum
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.result_files import Entry, FilePrecision, as_region, modified_ns
 
@@ -63,8 +64,8 @@ class AsylumFiles(FolderFiles):
             self._log.warning(
                 "%s has the frame %s instead of %s, which was set; it is published with the file's frame",
                 path.name,
-                one.region,
-                wanted,
+                _frame_text(one.region),
+                _frame_text(wanted),
             )
 
     def _goes_on(self, running: Entry) -> None:
@@ -81,6 +82,10 @@ class AsylumFiles(FolderFiles):
 
     def _files(self, folder: Path) -> list[Path]:
         return _numbered(folder)
+
+
+def _frame_text(region: Region) -> str:
+    return f"{area_text(region.size_m)} at {position_text(region.center_m)}, {math.degrees(region.angle_rad):.5g}°"
 
 
 def free_suffix(folder: Path, base: str) -> int:

@@ -146,7 +146,7 @@ class GxsmEmulator(Emulator):
             self.listening("")
             self.show_button("run-the-script-again", "the script in the console has ended", self.run_script)
         if self.faults.strikes("script-stopped", now_s):
-            self.program.entries.put("script-control", 0.0)
+            self.program.entries.put(calls.SCRIPT_CONTROL, 0.0)
         next_s = self.program.advance(now_s)
         self._answer_all()
         return next_s
