@@ -1,4 +1,16 @@
-"""Driver of Asylum Research microscopes, over ZeroMQ-XOP in Igor Pro. See the README in this folder."""
+"""Driver of Asylum Research microscopes, over ZeroMQ-XOP in Igor Pro. See the README in this folder.
+
+**Theory of operation.** Each request calls one Igor function (`xop`, `link`), and Igor answers when it is idle. The
+state is polled from two sources, ARGetStatus and the values behind the panels (`session`).
+
+    comes in      replies, matched by their id; new .ibw files in Asylum's data folder
+    state         the running and the ended measurement, the frame of the open image (origin of spots), whether a scan
+                  has moved the tip: all persistent (`activity`)
+    goes out      calls of Asylum's functions and of `afspm.ipf`; scans and force curves from files (`result_files`)
+    always holds  one request is in flight; a reply without a result (NaN) is neither success nor failure: the state
+                  decides; all dependent values of a frame are set together, since PV updates none of them; a scan runs
+                  once (LastScan)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,17 @@
-"""Driver of GXSM 3 and 4, over Gxsm4's shared memory or a script in its console. See the README in this folder."""
+"""Driver of GXSM 3 and 4, over Gxsm4's shared memory or a script in its console. See the README in this folder.
+
+**Theory of operation.** GXSM reports no errors, no events, and no end of a measurement: `set` and `action` return 0 for
+anything. So names are checked against GXSM's own lists at the start, values are read back, and states are derived from
+polls of status bits, line numbers and file names (`activity`).
+
+    comes in      results of calls (`link`: `shared_memory` or `bridge_client`); new files, which appear late, one by
+                  one, and half written (`result_files`)
+    state         the running and the ended measurement, rows of GXSM's memory before it (`scan_memory`), the position
+                  where the tip was sent: all persistent
+    goes out      calls; scans and spectra from files; lines of the running scan from memory
+    always holds  one call at a time; a blocking call is never made, as it would wedge GXSM; a scan whose first or last
+                  row still holds the previous scan is not published; a file is read only once it has stopped growing
+"""
 
 from __future__ import annotations
 

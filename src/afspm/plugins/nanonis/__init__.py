@@ -1,4 +1,18 @@
-"""Driver of Nanonis controllers (SPECS), over their TCP programming interface. See the README in this folder."""
+"""Driver of Nanonis controllers (SPECS), over their TCP programming interface. See the README in this folder.
+
+**Theory of operation.** The first connection carries quick requests, the second one blocking call at a time, in a
+thread of its own (`session`): the wait for the end of a scan, or a spectrum with its data. Nanonis sends nothing
+unrequested.
+
+    comes in      replies, decoded by the fields of the software's release (`protocol`); events of the second
+                  connection; new files in the session folder
+    state         the running and the ended measurement, and the present occupation, all persistent (`activity`);
+                  the goal of the tip (`settings`)
+    goes out      requests; scans and spectra from files (`result_files`), or from Nanonis' memory (`fetched`)
+    always holds  a reply that does not fit its request ends the connection; a value of a getter never goes into a
+                  setter as it is, since both count differently; a scan that was never seen running is not published,
+                  because Nanonis' memory then holds the previous one
+"""
 
 from __future__ import annotations
 

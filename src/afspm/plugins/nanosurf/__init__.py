@@ -1,4 +1,14 @@
-"""Driver of Nanosurf microscopes, over the scripting interface of Nanosurf Studio. See the README in this folder."""
+"""Driver of Nanosurf microscopes, over the scripting interface of Nanosurf Studio. See the README in this folder.
+
+**Theory of operation.** Every request is a Lua script, and its value the reply (`link`, `lua_values`). Quick scripts
+share the first connection; each long command (approach, withdrawal, curve) has a connection of its own (`session`).
+
+    comes in      values of scripts; new .nhf files in Studio's gallery
+    state         the running and the ended measurement (persistent), the running long command (`activity`)
+    goes out      scripts (`commands`); scans and force curves from files; lines from a low-level buffer
+    always holds  all commands and units are checked before the first is used; values are set all or none; a stop that
+                  may have overtaken its start is repeated
+"""
 
 from __future__ import annotations
 

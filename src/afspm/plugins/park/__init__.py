@@ -1,4 +1,15 @@
-"""Driver of Park microscopes, over SmartScan's SmartRemote. See the README in this folder."""
+"""Driver of Park microscopes, over SmartScan's SmartRemote. See the README in this folder.
+
+**Theory of operation.** Every request is a JavaScript expression in JSON-RPC over ZeroMQ (`link`), wrapped so that it
+returns its own error. Each long script has a connection of its own (`session`). Several answers of SmartScan are
+unconfirmed: the driver accepts each plausible form, and refuses unknown words instead of guessing.
+
+    comes in      replies; new TIFF files below SmartScan's base folder, one for each channel and direction
+    state         the running and the ended measurement, the position where the tip was sent: persistent; the running
+                  long script (`activity`)
+    goes out      expressions; scans and curves from files
+    always holds  a reply of unknown form ends the connection; the files of a scan are taken once no more appear
+"""
 
 from __future__ import annotations
 
