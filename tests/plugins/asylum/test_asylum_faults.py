@@ -28,7 +28,7 @@ def scans_again(peer: Peer) -> list[Scan]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no reply to"),
         ("wrong-id", "no reply to"),
@@ -41,19 +41,19 @@ def scans_again(peer: Peer) -> list[Scan]:
         ("unknown", "an error without a name (1"),
     ],
 )
-def test_bad_reply_is_logged_and_igor_reconnected(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_igor_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     # of nan the first two are of the status, where they mean that a release has no such value
     made.strike(kind, count=6 if kind == "nan" else 1, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_logged(told)
+    made.until_logged(logged)
     scans_again(peer)
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("dialog", "Igor does not answer while a dialog is open on its screen"),
         ("busy", "no reply to"),
@@ -61,7 +61,7 @@ def test_bad_reply_is_logged_and_igor_reconnected(bench: Make, kind: str, told: 
         ("restart", "nothing listens at this address"),
     ],
 )
-def test_lasting_fault_is_reported_until_it_ends(bench: Make, kind: str, told: str) -> None:
+def test_lasting_fault_is_reported_until_it_ends(bench: Make, kind: str, logged: str) -> None:
     made = bench(speed=1.0)
     peer = small(made, **SOON)
     made.strike(kind, duration_s=8.0)
@@ -70,7 +70,7 @@ def test_lasting_fault_is_reported_until_it_ends(bench: Make, kind: str, told: s
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    made.until_logged(told)
+    made.until_logged(logged)
 
 
 def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:

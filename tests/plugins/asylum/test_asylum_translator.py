@@ -62,11 +62,11 @@ def test_scan_has_the_set_frame_to_the_last_digit(bench: Make) -> None:
     peer.until(FREE)
     odd = Region((1e-6 / 3, -1e-7 / 7), (1e-6 / 9, 1e-6 / 7), 1 / 3)
     assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(odd, SHAPE, "")).ok
-    told = peer.until(lambda one: isinstance(one, ScanParameters) and one.shape == SHAPE)[-1]
-    assert told.region.size_m == pytest.approx(odd.size_m, rel=1e-14)
-    assert told.region.center_m == pytest.approx(odd.center_m, rel=1e-12)
+    packet = peer.until(lambda one: isinstance(one, ScanParameters) and one.shape == SHAPE)[-1]
+    assert packet.region.size_m == pytest.approx(odd.size_m, rel=1e-14)
+    assert packet.region.center_m == pytest.approx(odd.center_m, rel=1e-12)
     peer.until(FREE)
-    assert {scan.region for scan in scanned(peer).values()} == {told.region}
+    assert {scan.region for scan in scanned(peer).values()} == {packet.region}
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
@@ -215,9 +215,9 @@ def test_feedback_is_set_and_switched(bench: Make) -> None:
     peer = made.start()
     peer.until(FREE)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(False, 0.5, 20.0, 0.6)).ok
-    told = peer.until(lambda one: isinstance(one, Feedback) and one.on is False)[-1]
-    assert (told.proportional_gain, told.integral_gain) == pytest.approx((0.5, 20.0))
-    assert told.setpoint == pytest.approx(0.6)
+    packet = peer.until(lambda one: isinstance(one, Feedback) and one.on is False)[-1]
+    assert (packet.proportional_gain, packet.integral_gain) == pytest.approx((0.5, 20.0))
+    assert packet.setpoint == pytest.approx(0.6)
     assert made.emulator.controller.values.get("AmplitudeSetpointVolts") == pytest.approx(0.6)
     assert peer.set(names.FEEDBACK_ON, True).ok
     assert peer.get(names.FEEDBACK_ON) == "true"
@@ -581,8 +581,8 @@ def test_crash_is_an_unsaved_indentation(bench: Make, monkeypatch: pytest.Monkey
     assert peer.set(names.CRASH_DEPTH, 2, "um").ok
     assert peer.set(names.CRASH_SPEED, 5, "um/s").ok
     assert peer.act(names.CRASH).ok
-    told = peer.until(FREE)
+    packets = peer.until(FREE)
     assert crashes == [pytest.approx((2e-6, 5e-6))]
-    assert not [one for one in told if isinstance(one, Spectrum)]
+    assert not [one for one in packets if isinstance(one, Spectrum)]
     assert peer.get("x-save-force") == "2"
     assert not list(made.data.glob("*.ibw"))

@@ -49,7 +49,7 @@ def scanned(peer: Peer) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "settings", "told"),
+    ("kind", "settings", "logged"),
     [
         ("garbage", BRIDGE, "reports its state as"),
         ("nan", BRIDGE, "GXSM returned nan for"),
@@ -63,13 +63,15 @@ def scanned(peer: Peer) -> list[str]:
         ("huge", SHM, "GXSM replied 2147483648 bytes"),
     ],
 )
-def test_bad_answer_is_logged_and_gxsm_reconnected(bench: Make, kind: str, settings: dict[str, Any], told: str) -> None:
+def test_bad_answer_is_logged_and_gxsm_reconnected(
+    bench: Make, kind: str, settings: dict[str, Any], logged: str
+) -> None:
     made = bench(**settings)
     peer = small(made)
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_logged(told)
+    made.until_logged(logged)
     assert scanned(peer)
     assert not Path("evil").exists()
 

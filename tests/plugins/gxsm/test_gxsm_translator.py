@@ -668,12 +668,12 @@ def test_scan_ended_without_a_translator_is_published_by_the_next(bench: Make) -
     assert len(list(made.data.glob("*.nc"))) == 4
 
 
-@pytest.mark.parametrize(("version", "told"), [(3, "gxsm3 3.54.0"), (4, "gxsm4 4.4.1")])
-def test_version_is_reported_after_the_first_file(bench: Make, version: int, told: str) -> None:
+@pytest.mark.parametrize(("version", "shown"), [(3, "gxsm3 3.54.0"), (4, "gxsm4 4.4.1")])
+def test_version_is_reported_after_the_first_file(bench: Make, version: int, shown: str) -> None:
     made = bench(version=version)
     peer = made.start()
     ready(peer)
     hardware = peer.get(names.CONTROLLER).removeprefix("GXSM ")
     assert hardware.startswith("(")
     scanned(peer)
-    assert peer.get(names.CONTROLLER) == f"{told} {hardware}"
+    assert peer.get(names.CONTROLLER) == f"{shown} {hardware}"

@@ -21,7 +21,7 @@ SEEN = 5.0
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no answer to"),
         ("cut", "was closed after 0 of 40 bytes"),
@@ -33,13 +33,13 @@ SEEN = 5.0
         ("nan", "returned nan"),
     ],
 )
-def test_bad_reply_is_logged_and_the_controller_reconnected(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_the_controller_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_logged(told)
+    made.until_logged(logged)
     assert peer.act(names.START_SCAN).ok
     assert scans(peer.until(FREE))
 

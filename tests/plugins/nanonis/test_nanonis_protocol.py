@@ -117,7 +117,7 @@ def test_unsendable_arguments_are_refused(name: str, arguments: list[Any]) -> No
 
 
 @pytest.mark.parametrize(
-    ("header", "told"),
+    ("header", "problem"),
     [
         (b"Bias.Set".ljust(32, b"\0") + struct.pack(">i", 8) + bytes(4), "replied to 'Bias.Set'"),
         (b"Bias.Get".ljust(32, b"\0") + struct.pack(">i", -1) + bytes(4), "announced -1 bytes"),
@@ -125,8 +125,8 @@ def test_unsendable_arguments_are_refused(name: str, arguments: list[Any]) -> No
         (b"\xff" * 40, "replied to 'ÿ"),
     ],
 )
-def test_malformed_header_is_refused(header: bytes, told: str) -> None:
-    with pytest.raises(BadReply, match=told):
+def test_malformed_header_is_refused(header: bytes, problem: str) -> None:
+    with pytest.raises(BadReply, match=problem):
         protocol.body_bytes(header, "Bias.Get")
 
 
@@ -236,9 +236,9 @@ def test_wait_end_of_line_returns_at_each_line(tmp_path: Path) -> None:
         timed_out = _asked(address, "Scan.WaitEndOfLine", struct.pack(">i", 50))
         assert (len(timed_out), struct.unpack(">IiHi", timed_out[:-8])[0]) == (22, 1)
         _asked(address, "Scan.Action", struct.pack(">HI", 0, 1))
-        told = [struct.unpack(">IiHi", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:-8]) for _ in range(6)]
-    assert all(timed_out == 0 and 1 <= line <= 16 for timed_out, line, _, _ in told)
-    passes = [2 * line + backward for _, line, backward, _ in told]
+        replies = [struct.unpack(">IiHi", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:-8]) for _ in range(6)]
+    assert all(timed_out == 0 and 1 <= line <= 16 for timed_out, line, _, _ in replies)
+    passes = [2 * line + backward for _, line, backward, _ in replies]
     assert passes == sorted(set(passes))
 
 

@@ -21,7 +21,7 @@ def scans_again(peer: Peer) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no answer to"),
         ("late-reply", "no answer to"),
@@ -31,23 +31,23 @@ def scans_again(peer: Peer) -> None:
         ("error", "Studio's session is not what it was: an emulated error"),
     ],
 )
-def test_bad_reply_is_logged_and_studio_reconnected(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_studio_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_logged(told)
+    made.until_logged(logged)
     scans_again(peer)
 
 
-@pytest.mark.parametrize(("kind", "told"), [("dialog", "a dialog may wait on its screen"), ("restart", "connection")])
-def test_studio_is_reconnected_when_it_answers(bench: Make, kind: str, told: str) -> None:
+@pytest.mark.parametrize(("kind", "logged"), [("dialog", "a dialog may wait on its screen"), ("restart", "connection")])
+def test_studio_is_reconnected_when_it_answers(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=600.0)
     peer.until(UNDEFINED)
-    made.until_logged(told)
+    made.until_logged(logged)
     peer.until(FREE)
     scans_again(peer)
 

@@ -210,7 +210,7 @@ def test_restarted_translator_finds_the_scan(bench: Make) -> None:
 
 
 @pytest.mark.parametrize(
-    ("emulator", "settings", "told"),
+    ("emulator", "settings", "logged"),
     [
         ({"release": 19}, {"release": 18}, "Studio is release 19, not 18"),
         ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
@@ -220,10 +220,12 @@ def test_restarted_translator_finds_the_scan(bench: Make) -> None:
         ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
     ],
 )
-def test_mismatches_are_reported(bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str) -> None:
+def test_mismatches_are_reported(
+    bench: Make, emulator: dict[str, int], settings: dict[str, object], logged: str
+) -> None:
     made = bench(**emulator)
     made.start(**settings)
-    made.until_logged(told)
+    made.until_logged(logged)
 
 
 def test_refused_values_change_none(bench: Make) -> None:

@@ -122,16 +122,16 @@ def test_the_makers_demo_runs_to_its_end(tmp_path: Path, client: Run) -> None:
             f"""
 from contextlib import redirect_stdout
 from io import StringIO
-said = StringIO()
-with redirect_stdout(said):
+printed = StringIO()
+with redirect_stdout(printed):
     runpy.run_path({str(SCRIPTS / "studio_scripting.py")!r}, run_name="__main__")
-print(json.dumps({{"said": said.getvalue()}}))
+print(json.dumps({{"printed": printed.getvalue()}}))
 """,
             ELSEWHERE,
         )
         wait_for_files(tmp_path / "gallery", 1)
-    assert str(told["said"]).endswith("Session complete.\n"), told
-    assert "Studio error" not in str(told["said"])
+    assert str(told["printed"]).endswith("Session complete.\n"), told
+    assert "Studio error" not in str(told["printed"])
     (file,) = (tmp_path / "gallery").glob("demo_20??-??-??_00001.nhf")
     assert afspm.read(file).scans[0].values.shape == (256, 256)
 
@@ -149,7 +149,7 @@ names, failed = {{}}, []
 for number, source in enumerate(code, 1):
     try:
         exec(source, names)
-    except Exception as error:
+    except Exception as error:  # any error of a cell is reported with its source
         failed.append(f"cell {{number}}: {{type(error).__name__}} {{error}}")
 studio = names["session"].workflow
 print(json.dumps({{
@@ -194,7 +194,7 @@ found["m"] = [control.setpoint, control.setpoint_min, control.setpoint_max]
 control.setpoint = 30e-9
 control.setpoint_unit = "V"
 found["after"] = control.setpoint
-said = []
+printed = []
 for call in (
     lambda: setattr(control, "setpoint_unit", "N"), calibration.apply,
     lambda: session.workflow.spectroscopy.select_cycle_by_id("none"),
@@ -208,8 +208,8 @@ for call in (
     try:
         call()
     except StudioScriptError as error:
-        said.append(str(error))
-print(json.dumps({**found, "said": said}))
+        printed.append(str(error))
+print(json.dumps({**found, "printed": printed}))
 """,
         )
     sensitivity = 60e-9 * 1.2  # nominal value of the cantilever, before the calibration
@@ -217,7 +217,7 @@ print(json.dumps({**found, "said": said}))
     assert told["m"] == pytest.approx([0.7 * sensitivity, -10.0 * sensitivity, 10.0 * sensitivity])
     assert told["after"] == pytest.approx(30e-9 / sensitivity)
     assert told["units"] == ["V", "m"]
-    assert len(told["said"]) == 9  # type: ignore[arg-type]
+    assert len(told["printed"]) == 9  # type: ignore[arg-type]
 
 
 def test_script_error_is_raised_by_the_client(tmp_path: Path, client: Run) -> None:
@@ -226,16 +226,16 @@ def test_script_error_is_raised_by_the_client(tmp_path: Path, client: Run) -> No
             address,
             """
 session = studio.select_measurement_session()
-said = []
+printed = []
 for value in (1e9, 0):
     try:
         session.workflow.imaging.points_per_line = value
     except StudioScriptError as error:
-        said.append(str(error))
-print(json.dumps({"said": said}))
+        printed.append(str(error))
+print(json.dumps({"printed": printed}))
 """,
         )
-    assert told["said"] == [
+    assert told["printed"] == [
         "Script Error: imaging.points_per_line: 1000000000.0 is not within 2 to 8192",
         "Script Error: imaging.points_per_line: 0 is not within 2 to 8192",
     ]

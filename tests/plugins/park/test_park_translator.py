@@ -95,7 +95,7 @@ def test_tip_is_withdrawn_at_the_end_of_a_run(bench: Make, scanning: bool) -> No
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no reply to"),
         ("late-reply", "no reply to"),
@@ -105,13 +105,13 @@ def test_tip_is_withdrawn_at_the_end_of_a_run(bench: Make, scanning: bool) -> No
         ("dialog", "a dialog may wait on its screen"),
     ],
 )
-def test_bad_reply_is_logged_and_smartscan_reconnected(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_smartscan_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_logged(told)
+    made.until_logged(logged)
     response = peer.act_once_free(names.START_SCAN)
     assert response.ok, response.reason
     assert scans(peer.until(FREE))

@@ -188,7 +188,7 @@ class Slope(Group):
 
 
 class DriftRate(Group):
-    """The controller's own drift compensation, off if x and y are 0. The z velocity is kept."""
+    """The controller's own drift compensation, off if all velocities are 0. The z velocity is kept."""
 
     names = (DRIFT_RATE_X, DRIFT_RATE_Y)
     _usual_limit_percent: ClassVar[float] = 10.0
@@ -234,7 +234,7 @@ class Probe(Group):
             return self._goal_m
         if self._seen_m is not None and self._ask("Scan.StatusGet")[0]:
             return self._seen_m
-        # The position has noise of the converters: within their resolution it counts as unchanged.
+        # A difference below the converters' resolution does not count as a move.
         x, y = self._numbers("FolMe.XYPosGet", 0)
         if self._seen_m is None or not self._near((x, y), self._seen_m):
             self._seen_m = (x, y)

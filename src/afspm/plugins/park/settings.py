@@ -62,7 +62,7 @@ class FrameSettings(SettingsGroup):
                 "rotation": math.degrees(region.angle_rad),
             }
         )
-        # The line rate is not part of the geometry. Set last: the speed follows from the new width.
+        # The line rate is not part of the geometry.
         self._session().put({_RATE: speed_m_s / (_SPEED_PATH * width)})
 
 
