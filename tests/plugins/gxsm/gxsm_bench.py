@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
-from vendor_bench import PATIENT, AtPanel, VendorBench
+from vendor_bench import DEADLINE_S, PATIENT, AtPanel, VendorBench
 
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 
@@ -29,3 +31,12 @@ class Bench(VendorBench[Emulated]):
         self.settings = {**PATIENT, "result_timeout_s": 8.0 * speed}
         block = f"afspm_test_{os.getpid()}_{id(self)}"
         super().__init__(folder, stack, speed, {"block": block, **emulator})
+
+
+def until(made: Bench, what: Callable[[], bool]) -> None:
+    """Wait for a condition, polled as often as other programs do, so that the emulator gets processor time."""
+    until_s = made.clock.monotonic_s() + DEADLINE_S
+    pace = Event()
+    while not what():
+        assert made.clock.monotonic_s() < until_s
+        pace.wait(0.005)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from gxsm_bench import Bench
+from gxsm_bench import Bench, until
 from vendor_bench import SHAPE, SOON, Peer, ready, scans, states
 
 from afspm.model import (
@@ -171,7 +171,10 @@ def test_ended_script_can_be_run_again(bench: Make) -> None:
     peer = small(made)
     made.strike("script-stopped")
     peer.until(UNDEFINED)
-    (made.data / "delete-to-run-the-script-again.txt").unlink()
+    # the connection ends before the script does, and the button appears after both
+    button = made.data / "delete-to-run-the-script-again.txt"
+    until(made, button.exists)
+    button.unlink()
     peer.until(FREE)
     assert scanned(peer)
 

@@ -12,12 +12,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Event, Thread
+from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
-from gxsm_bench import Bench
+from gxsm_bench import Bench, until
 from raw_clients import MemoryClient, SocketClient, client
 from vendor_bench import DEADLINE_S
 
@@ -42,15 +42,6 @@ def calling(made: Bench) -> Iterator[SocketClient | MemoryClient]:
         yield caller
     finally:
         caller.close()
-
-
-def until(made: Bench, what: Callable[[], bool]) -> None:
-    """Wait for a condition, polled as often as other programs do, so that the emulator gets processor time."""
-    until_s = made.clock.monotonic_s() + DEADLINE_S
-    pace = Event()
-    while not what():
-        assert made.clock.monotonic_s() < until_s
-        pace.wait(0.005)
 
 
 def small(gxsm: SocketClient | MemoryClient) -> None:
