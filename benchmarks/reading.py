@@ -14,7 +14,7 @@ from time import perf_counter
 import numpy as np
 
 import afspm
-from afspm.plugins.asylum.emulator import ibw
+from afspm.plugins.asylum.emulator.files import igor_note, igor_wave
 from afspm.plugins.gxsm.emulator import files as gxsm
 from afspm.plugins.nanonis.emulator import files as nanonis
 from benchmarks.effort import effort
@@ -37,9 +37,9 @@ def picture(channel: int) -> np.ndarray:
 
 def igor(folder: Path) -> Paths:
     values = np.stack([picture(k).T for k in range(len(CHANNELS))], axis=2)
-    note = ibw.note({"XOffset": 0.0, "YOffset": 0.0, "ScanAngle": 0.0, "ScanDown": 0.0, "ScanRate": 1.0}.items())
+    note = igor_note({"XOffset": 0.0, "YOffset": 0.0, "ScanAngle": 0.0, "ScanDown": 0.0, "ScanRate": 1.0}.items())
     path = folder / "scan0001.ibw"
-    path.write_bytes(ibw.wave("scan0001", values, "m", [(1e-9, "m"), (1e-9, "m")], CHANNELS, note, 0.0))
+    path.write_bytes(igor_wave("scan0001", values, "m", [(1e-9, "m"), (1e-9, "m")], CHANNELS, note, 0.0))
     return [path]
 
 

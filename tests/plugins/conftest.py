@@ -1,4 +1,4 @@
-"""For the tests of all vendors."""
+"""Fixtures for the tests of all makers."""
 
 from __future__ import annotations
 

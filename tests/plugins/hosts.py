@@ -1,4 +1,4 @@
-"""Where the translators of these tests run: hundreds of them, most of whose time would go by importing the same."""
+"""Processes for translators in these tests: forked, since importing takes most of the time of hundreds of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IMPORTED = [HOST, "numpy", *entry_points.modules(entry_points.DRIVERS)]
 
 
 class Host(Protocol):
-    """What of `subprocess.Popen` is used."""
+    """The used part of `subprocess.Popen`."""
 
     stdin: IO[bytes]
     stderr: IO[bytes]
@@ -29,8 +29,10 @@ class Host(Protocol):
 
 
 def host(environment: Mapping[str, str]) -> Host:
-    """A process like `python -m afspm.supervisor.host`; where the system can, forked from one that has imported what
-    all of them need. (How one starts by itself is what the tests of experiments see to.)"""
+    """Start a process like `python -m afspm.supervisor.host`, forked from a process with the imports if possible.
+
+    The tests of experiments cover its ordinary start.
+    """
     if "forkserver" in multiprocessing.get_all_start_methods():
         return _Forked(environment)
     pipes: Any = subprocess.Popen(
@@ -61,7 +63,6 @@ class _Forked:
 
 
 def _run(stdin: Connection, stderr: Connection, environment: Mapping[str, str], folder: Path) -> None:
-    """In the new process."""
     from afspm.supervisor import host
 
     for number, pipe in ((0, stdin), (2, stderr)):

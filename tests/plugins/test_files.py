@@ -1,4 +1,4 @@
-"""The files of the simulated controller: read back exactly, and readable elsewhere."""
+"""Files of the simulated controller: exact round trips, readable by other programs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CHANNELS = {
 }
 
 
-def test_a_scan_comes_back_exactly(tmp_path: Path) -> None:
+def test_scan_survives_a_round_trip_exactly(tmp_path: Path) -> None:
     (tmp_path / "a.nc").write_bytes(encode_scan(REGION, CHANNELS, MEASURED))
     scans = read(tmp_path / "a.nc")
     for scan, (channel, (unit, values)) in zip(scans, CHANNELS.items(), strict=True):
@@ -30,7 +30,7 @@ def test_a_scan_comes_back_exactly(tmp_path: Path) -> None:
         assert np.array_equal(scan.values, values, equal_nan=True)
 
 
-def test_a_spectrum_comes_back_exactly(tmp_path: Path) -> None:
+def test_spectrum_survives_a_round_trip_exactly(tmp_path: Path) -> None:
     values = np.random.default_rng(2).normal(size=(4, 2))
     spectrum = Spectrum((1e-9, -2e-9), "IV", ("Bias", "Current"), ("V", "A"), values)
     (tmp_path / "a.nc").write_bytes(encode_spectrum(spectrum, MEASURED))
@@ -66,6 +66,6 @@ def test_every_truncated_file_is_refused(tmp_path: Path) -> None:
             read(path)
 
 
-def test_a_missing_file_is_said_with_its_name(tmp_path: Path) -> None:
+def test_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(FileError, match=r"none\.nc"):
         read(tmp_path / "none.nc")

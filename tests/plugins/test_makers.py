@@ -1,4 +1,4 @@
-"""The contract of every maker's translator, against its emulated controller: one test for all of them."""
+"""The contract of every maker's translator, with its emulated controller."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Maker:
     """A maker.
 
     Attributes:
-        name: of its folder.
-        height: the channel of the heights, forward.
-        number: of a scan, in the name of its file: a pattern with one group.
-        start: a scan at the panel, with the emulator and the time.
+        name: name of its folder.
+        height: channel of the heights, forward.
+        number: pattern for a file name, with the scan's number as its group.
+        start: starts a scan at the panel, given the emulator and the time.
     """
 
     name: str
@@ -72,7 +72,7 @@ def bench(maker: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iter
 
 
 @each
-def test_scans_follow_each_other_each_in_a_file_of_its_own(maker: Maker, bench: Make) -> None:
+def test_consecutive_scans_have_files_of_their_own(maker: Maker, bench: Make) -> None:
     peer = bench().start()
     ready(peer)
     found = [scanned(peer)[maker.height] for _ in range(3)]
@@ -86,35 +86,35 @@ def test_scans_follow_each_other_each_in_a_file_of_its_own(maker: Maker, bench: 
 
 @pytest.mark.parametrize("maker", [MAKERS[name] for name in ("nanonis", "nanosurf", "park")], ids=lambda one: one.name)
 def test_stopped_scan_is_not_published(maker: Maker, bench: Make) -> None:
-    """Of GXSM, and of Asylum, which withdraws the tip, their own tests have more to say."""
+    # GXSM and Asylum (which withdraws the tip) have further tests of their own.
     peer = bench(speed=10.0).start()
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
 
 
 @each
-def test_scan_begun_at_the_panel_is_published(maker: Maker, bench: Make) -> None:
+def test_scan_from_the_panel_is_published(maker: Maker, bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer, shape=(40, 32))
     made.at_panel(lambda emulator: maker.start(emulator, made.clock.now_s()))
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert scans(heard)
-    for region in {scan.region for scan in scans(heard)}:  # Nanonis has a float32 of each length
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert scans(received)
+    for region in {scan.region for scan in scans(received)}:  # Nanonis has a float32 of each length
         assert (*region.center_m, *region.size_m) == pytest.approx((*TURNED.center_m, *TURNED.size_m), rel=1e-6)
         assert region.angle_rad == pytest.approx(TURNED.angle_rad)
 
 
 @pytest.mark.parametrize("maker", [MAKERS[name] for name in ("asylum", "nanosurf", "park")], ids=lambda one: one.name)
-def test_scan_that_does_not_begin_is_refused(maker: Maker, bench: Make) -> None:
-    """GXSM and Nanonis, whose scans may begin late, are not waited for."""
+def test_scan_that_does_not_start_is_refused(maker: Maker, bench: Make) -> None:
+    # Not GXSM and Nanonis, whose scans may start late.
     made = bench()
     peer = small(made)
     made.strike("scan-refused")

@@ -1,4 +1,4 @@
-"""How long a program that controls a microscope is waited for, however fast the experiment's time passes."""
+"""The wait for a program that controls a microscope, in real time at any speed of the experiment's clock."""
 
 from __future__ import annotations
 

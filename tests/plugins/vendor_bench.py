@@ -1,4 +1,4 @@
-"""What the tests of all vendors share: a translator as a real process, an emulated microscope, and a raw peer."""
+"""Shared parts of the makers' tests: a translator as a process, an emulated microscope, and a raw peer."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ PATIENT: Mapping[str, Any] = {"reply_timeout_s": 10.0}
 """As long as a controller on a busy computer may need to answer."""
 
 SOON: Mapping[str, Any] = {"reply_timeout_s": 2.5}
-"""Where its silence is what is tested."""
+"""For tests of a silent controller."""
 
 TURNED = Region((40e-9, -25e-9), (300e-9, 100e-9), math.radians(30))
-"""A frame that is no square, not in the middle and not straight: what is mistaken for something else shows."""
+"""An oblong, rotated frame away from the middle, so that no two values can be confused."""
 
 SHAPE = (12, 32)
 FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "scar_probability": 0.0}}
@@ -56,7 +56,7 @@ FLAT = {"noise": {"white_m": 0.0, "one_over_f_m": 0.0, "line_offset_m": 0.0, "sc
 
 
 class Peer:
-    """What a scheduler is to the translator."""
+    """The translator's scheduler, as a raw peer."""
 
     def __init__(self, serve: str, publish: str) -> None:
         self._context: zmq.Context[Any] = zmq.Context()
@@ -80,7 +80,7 @@ class Peer:
         return self.ask(ControlRequest.ACTION, action)
 
     def act_once_free(self, action: str) -> Response:
-        """The first answer that is not that it is busy: for what may be over before anybody sees it."""
+        """Repeat a request until the answer is not "busy"; return the answer."""
         deadline_s = time.monotonic() + DEADLINE_S
         while (response := self.act(action)).code == ControlResponse.NOT_FREE:
             assert time.monotonic() < deadline_s, response.reason
@@ -101,37 +101,37 @@ class Peer:
         return value
 
     def next(self) -> Any:
-        """The next thing that is published."""
+        """Return the next published packet."""
         envelope, payload, *_ = self._packets.recv_multipart()
         return wire.decode(envelope.decode(), payload)
 
     def until(self, wanted: Callable[[Any], bool] | ScopeState) -> list[Any]:
-        """All that is published up to the first that is wanted."""
-        heard: list[Any] = []
+        """Return all published packets up to the first wanted one."""
+        received: list[Any] = []
         deadline_s = time.monotonic() + DEADLINE_S
         while time.monotonic() < deadline_s:
             try:
-                heard.append(self.next())
+                received.append(self.next())
             except zmq.Again:
                 break
-            newest = heard[-1]
+            newest = received[-1]
             if newest == ScopeStatus(wanted) if isinstance(wanted, ScopeState) else wanted(newest):
-                return heard
-        raise AssertionError(f"waited for {wanted}, heard {heard}")
+                return received
+        raise AssertionError(f"waited for {wanted}, received {received}")
 
     def close(self) -> None:
         self._context.destroy(linger=0)
 
 
-class Said:
-    """What a translator says on its standard error, over all its lives."""
+class TranslatorLog:
+    """The lines of a translator's standard error, over all its restarts."""
 
     def __init__(self) -> None:
         self.text = ""
         self._more = Condition()
 
     def listen(self, pipe: IO[bytes]) -> None:
-        """Until there is nobody any more to say anything."""
+        """Collect lines until the stream ends."""
         with pipe:
             for line in pipe:
                 with self._more:
@@ -139,14 +139,14 @@ class Said:
                     self._more.notify_all()
 
     def until(self, *wanted: str) -> None:
-        """Wait until it has said one of these."""
+        """Wait for a line with one of the texts."""
         with self._more:
-            said = self._more.wait_for(lambda: any(words in self.text for words in wanted), DEADLINE_S)
-            assert said, f"it never said {wanted}:\n{self.text}"
+            found = self._more.wait_for(lambda: any(words in self.text for words in wanted), DEADLINE_S)
+            assert found, f"the translator never logged {wanted}:\n{self.text}"
 
 
 class TranslatorProcess:
-    """A translator as a process of its own, and the peer that it has; both end with the stack."""
+    """A translator as a process, and its peer; both end with the stack."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class TranslatorProcess:
         folder: Path,
         stack: ExitStack,
         clock: ExperimentClock,
-        said: Said | None = None,
+        log: TranslatorLog | None = None,
         *,
         retracts: bool = False,
     ) -> None:
@@ -174,7 +174,7 @@ class TranslatorProcess:
         # where the lock on the controller lies, which one that is killed leaves behind
         own = {**os.environ, "TMPDIR": str(folder), "TEMP": str(folder)}
         self._process = host(own)
-        self._listening = Thread(target=(said or Said()).listen, args=(self._process.stderr,))
+        self._listening = Thread(target=(log or TranslatorLog()).listen, args=(self._process.stderr,))
         self._listening.start()
         stack.callback(self._end)
         self._process.stdin.write(launch.to_json().encode() + b"\n")
@@ -188,7 +188,7 @@ class TranslatorProcess:
         self._listening.join(DEADLINE_S)
 
     def let_go(self) -> int:
-        """End its standard input, as a run that is stopped does; returns the exit code."""
+        """Close its standard input, as a stopped run does; return the exit code."""
         self._process.stdin.close()
         code = self._process.wait(DEADLINE_S)
         self._listening.join(DEADLINE_S)
@@ -200,7 +200,7 @@ class TranslatorProcess:
 
 
 class AtPanel(Emulator):
-    """An emulator with somebody at its panel."""
+    """An emulator with a person at its panel."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(**settings)
@@ -216,19 +216,16 @@ Emulated = TypeVar("Emulated", bound=AtPanel)
 
 
 class VendorBench(Generic[Emulated]):
-    """An emulator and a translator of it. Each vendor's says which they are::
+    """An emulator and its translator. Each maker's bench names both::
 
-        class Bench(VendorBench[Emulated]):
-            emulated = Emulated
-            translator = "afspm.plugins.mine.Mine"
-            data_name = "mine"
-            settings = PATIENT
+        class Bench(VendorBench[Emulated]): emulated = Emulated translator = "afspm.plugins.mine.Mine" data_name =
+            "mine" settings = PATIENT
 
     Attributes:
-        emulated: the class of the emulator.
-        translator: the class of the translator, as in an experiment file.
-        data_name: of the folder that the emulator saves in.
-        settings: of the translator, besides the address, where a test gives no others.
+        emulated: class of the emulator.
+        translator: class of the translator, as in an experiment file.
+        data_name: name of the folder in which the emulator saves.
+        settings: default settings of the translator, besides the address.
     """
 
     emulated: type[Emulated]
@@ -240,20 +237,20 @@ class VendorBench(Generic[Emulated]):
         self.folder, self._stack = folder, stack
         self.clock = ExperimentClock.starting_now(speed=speed)
         self.data = folder / self.data_name
-        self._said = Said()
-        stack.callback(lambda: print(self._said.text))  # noqa: T201 (shown of a test that failed)
+        self._log = TranslatorLog()
+        stack.callback(lambda: print(self._log.text))  # noqa: T201 (shown of a test that failed)
         self._emulator_settings: dict[str, Any] = {"port": FreePorts().take(), "surface": "steps", **emulator}
         self._controller = stack.enter_context(ExitStack())
         self.start_controller_again()
 
     def start_controller_again(self) -> None:
-        """Another one where the last was, which knows nothing of it, once that has let go of its address."""
+        """Start a new controller at the address of the last one, without its state."""
         self._controller.close()
         self.emulator = self.emulated(**self._emulator_settings)
         self.address = self._controller.enter_context(self.emulator.running(self.data, self.clock))
 
     def at_panel(self, do: Callable[[Emulated], object]) -> None:
-        """Do something in the emulator's own thread; returns when it is done."""
+        """Execute something in the emulator's thread; return when done."""
         done = Event()
 
         def job() -> None:
@@ -265,40 +262,40 @@ class VendorBench(Generic[Emulated]):
         assert done.wait(DEADLINE_S)
 
     def strike(self, kind: str, count: int = 1, duration_s: float = 1.0) -> None:
-        """Have something go wrong from now on."""
+        """Trigger a fault now."""
         fault = Fault(kind, 0.0, count, duration_s)
         self.at_panel(lambda emulator: emulator.faults.demand(fault, self.clock.now_s()))
 
     def start(self, *, retracts: bool = False, **settings: Any) -> Peer:
-        """The translator, as a process of its own."""
+        """Start the translator as a process."""
         given = {"address": self.address, **self.settings, **settings}
         self._process = TranslatorProcess(
-            self.translator, given, self.folder, self._stack, self.clock, self._said, retracts=retracts
+            self.translator, given, self.folder, self._stack, self.clock, self._log, retracts=retracts
         )
         return self._process.peer
 
     def kill(self) -> None:
-        """The translator."""
+        """Kill the translator."""
         self._process.kill()
 
     def let_go(self) -> int:
-        """Stop the translator as a run that is stopped does; returns its exit code."""
+        """Stop the translator as a stopped run does; return its exit code."""
         return self._process.let_go()
 
-    def said(self) -> str:
-        """The translator's log: all of it once it is killed, before that as far as it has come."""
-        return self._said.text
+    def log_text(self) -> str:
+        """Return the translator's log so far; complete once it is killed."""
+        return self._log.text
 
-    def until_said(self, *wanted: str) -> None:
-        """Wait until the translator's log has one of these in it."""
-        self._said.until(*wanted)
+    def until_logged(self, *wanted: str) -> None:
+        """Wait until the translator's log contains one of the texts."""
+        self._log.until(*wanted)
 
 
 OneBench = TypeVar("OneBench", bound=VendorBench[Any])
 
 
 def benches(kind: type[OneBench], folder: Path) -> Iterator[Callable[..., OneBench]]:
-    """The `bench` fixture of a vendor: makes benches that end with the test."""
+    """Yield a maker's `bench` fixture: makes benches that end with the test."""
     with ExitStack() as stack:
 
         def make(speed: float = 100.0, **emulator: Any) -> OneBench:
@@ -307,20 +304,20 @@ def benches(kind: type[OneBench], folder: Path) -> Iterator[Callable[..., OneBen
         yield make
 
 
-# --- what was heard, and what a test begins with ---
+# --- received packets, and starts of tests ---
 
 
-def states(heard: Sequence[Any]) -> list[str]:
-    """The states among what was heard, in words."""
-    return [one.state.name for one in heard if isinstance(one, ScopeStatus)]
+def states(received: Sequence[Any]) -> list[str]:
+    """Return the states in received packets."""
+    return [one.state.name for one in received if isinstance(one, ScopeStatus)]
 
 
-def scans(heard: Sequence[Any]) -> list[Scan]:
-    return [one for one in heard if isinstance(one, Scan)]
+def scans(received: Sequence[Any]) -> list[Scan]:
+    return [one for one in received if isinstance(one, Scan)]
 
 
 def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -> None:
-    """A small frame is in force, and all that comes of it was heard."""
+    """Set a small frame, and receive all packets about it."""
     peer.until(ScopeState.FREE)
     response = peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(region, shape, ""))
     assert response.ok, response.reason
@@ -329,7 +326,7 @@ def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -
 
 
 def small(made: VendorBench[Any], **settings: object) -> Peer:
-    """A translator that has found the microscope, with a frame of few pixels in force."""
+    """Start a translator that has found the microscope, with a frame of few pixels."""
     peer = made.start(**settings)
     peer.until(ScopeState.FREE)
     assert peer.set(names.SCAN_RESOLUTION_X, 16).ok
@@ -340,27 +337,27 @@ def small(made: VendorBench[Any], **settings: object) -> Peer:
 
 
 def scanned(peer: Peer) -> dict[str, Scan]:
-    """A scan, by channel."""
+    """Scan; return the scan by channel."""
     response = peer.act(names.START_SCAN)
     assert response.ok, response.reason
-    heard = peer.until(ScopeState.FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    found = scans(heard)
-    assert heard[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
+    received = peer.until(ScopeState.FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    found = scans(received)
+    assert received[-1 - len(found) : -1] == found, "the scans come before FREE, and nothing in between"
     return {scan.channel: scan for scan in found}
 
 
 def moved(peer: Peer, x_m: float, y_m: float) -> list[Any]:
-    """The probe is there; returns all that was heard on the way."""
+    """Move the probe; return all packets received meanwhile."""
     response = peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((x_m, y_m)))
     assert response.ok, response.reason
-    heard = peer.until(ScopeState.FREE)
-    assert states(heard) == ["MOVING", "FREE"]
-    return heard
+    received = peer.until(ScopeState.FREE)
+    assert states(received) == ["MOVING", "FREE"]
+    return received
 
 
 def left_in_danger(made: VendorBench[Any], *, scanning: bool, retracts: bool) -> None:
-    """A run is stopped while the feedback is off, which one of its components has switched off."""
+    """Stop a run while the feedback is off, switched off by one of its components."""
     peer = made.start(retracts=retracts)
     ready(peer, shape=(64, 32))
     assert peer.set(names.FEEDBACK_ON, False).ok
@@ -373,7 +370,7 @@ def left_in_danger(made: VendorBench[Any], *, scanning: bool, retracts: bool) ->
 
 @contextmanager
 def answering(*replies: bytes, silent: bool = False) -> Iterator[tuple[str, int]]:
-    """The address of somebody who answers each request with the next of these bytes, and then hangs up (or not)."""
+    """Return the address of a server that answers each request with the next of some bytes, and may then disconnect."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         ended = Thread(target=_answer, args=(listener, replies, silent))
         ended.start()

@@ -1,4 +1,4 @@
-"""The Asylum translator as a real process, an emulated microscope beside it, and a peer on the translator's sockets."""
+"""Bench: the Asylum translator as a process, an emulated microscope, and a peer on the translator's sockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.plugins.asylum.emulator import AsylumEmulator
 
 
 class Emulated(AtPanel, AsylumEmulator):
-    """With somebody at its panel."""
+    """An emulated microscope with a person at its panel."""
 
 
 class Bench(VendorBench[Emulated]):

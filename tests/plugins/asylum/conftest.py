@@ -1,4 +1,4 @@
-"""Fixtures for the tests of Asylum."""
+"""Fixtures for tests of Asylum."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The functions that the reference calls of ZeroMQ-XOP are about, as Igor would have them."""
+"""Igor functions for the reference calls of ZeroMQ-XOP."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _FUNCTIONS: dict[str, IgorFunction] = {
 
 
 class WithTestFunctions(Emulated):
-    """An emulator that has them."""
+    """An emulator with these functions."""
 
     def functions(self) -> dict[str, Any]:
         return super().functions() | {name.lower(): function for name, function in _FUNCTIONS.items()}

@@ -1,4 +1,4 @@
-"""What needs no socket: requests and replies, frames, and folders."""
+"""Asylum without sockets: requests and replies, frames, folders."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ finite = st.floats(-1e300, 1e300)
 
 
 @given(st.lists(st.one_of(st.booleans(), finite, st.integers(-1000, 1000), st.text(max_size=20)), max_size=5))
-def test_what_is_asked_is_what_the_other_side_hears(parameters: list[Any]) -> None:
+def test_request_arrives_unchanged_at_the_xop(parameters: list[Any]) -> None:
     try:
         message = xop.request("F", parameters, "7")
     except InvalidValue:
         assert any(isinstance(one, str) and not _sendable(one) for one in parameters)
         return
-    heard = wire.call(message)
-    assert (heard.name, heard.message_id) == ("F", "7")
-    for sent, text in zip(parameters, heard.parameters, strict=True):
+    received = wire.call(message)
+    assert (received.name, received.message_id) == ("F", "7")
+    for sent, text in zip(parameters, received.parameters, strict=True):
         if isinstance(sent, str):
             assert text == sent
         else:
@@ -53,12 +53,12 @@ def _sendable(text: str) -> bool:
 
 
 @pytest.mark.parametrize("parameter", [math.nan, math.inf, "\ud800", "x" * 1024])
-def test_what_can_not_be_sent_is_refused_before(parameter: float | str) -> None:
+def test_unsendable_request_is_refused(parameter: float | str) -> None:
     with pytest.raises(InvalidValue, match="F"):
         xop.request("F", [parameter], "7")
 
 
-def test_the_longest_request_has_1024_bytes() -> None:
+def test_longest_request_has_1024_bytes() -> None:
     spare = 1024 - len(xop.request("F", [""], "7"))
     assert len(xop.request("F", ["x" * spare], "7")) == 1024
     with pytest.raises(InvalidValue, match="the call of F has 1025 bytes"):
@@ -66,20 +66,20 @@ def test_the_longest_request_has_1024_bytes() -> None:
 
 
 @pytest.mark.parametrize("value", [3.0, 1e-9, 0.1, -1.5e300, math.inf, -math.inf, math.nan])
-def test_numbers_come_back(value: float) -> None:
+def test_numbers_survive_a_round_trip(value: float) -> None:
     reply = xop.reply(wire.success(wire.IgorFunction(lambda: value), value, "7"))
     assert reply.message_id == "7"
     np.testing.assert_equal(reply.results, (value,))
 
 
-def test_several_results_come_back_and_waves_are_passed_over() -> None:
+def test_reply_with_several_results_skips_waves() -> None:
     several = wire.IgorFunction(lambda: None, "", "vsd")
     assert xop.reply(wire.success(several, (1.0, "", "root:"), "7")).results == (1.0, "", "root:")
     wave = wire.wave([1.0, 2.0], note="height")
     assert xop.reply(wire.success(wire.IgorFunction(lambda: None, "", "w"), wave, "7")).results == (None,)
 
 
-def test_an_error_has_its_number_its_meaning_and_what_igor_printed() -> None:
+def test_error_has_number_meaning_and_history() -> None:
     reply = xop.reply(wire.failure(wire.CallFailed(107, "index out of range"), "7"))
     assert reply.error is not None
     error = xop.XopError(*reply.error, where="F")
@@ -93,14 +93,14 @@ GOOD = wire.success(wire.IgorFunction(lambda: None, "S", "v"), (1.0, ("a",)), "7
 
 @settings(max_examples=300)
 @given(st.binary(max_size=200))
-def test_bytes_that_are_no_reply_have_a_name(message: bytes) -> None:
+def test_malformed_reply_raises_bad_reply(message: bytes) -> None:
     with pytest.raises(xop.BadReply):
         xop.reply(message)
 
 
 @settings(max_examples=300)
 @given(st.integers(0, len(GOOD) - 1), st.integers(0, 255))
-def test_a_reply_with_a_wrong_byte_is_a_reply_or_has_a_name(at: int, byte: int) -> None:
+def test_reply_with_a_wrong_byte_parses_or_raises_bad_reply(at: int, byte: int) -> None:
     message = bytearray(GOOD)
     message[at] = byte
     for damaged in (bytes(message), GOOD[:at]):
@@ -119,7 +119,7 @@ _json = st.recursive(
 @given(
     st.fixed_dictionaries({"errorCode": st.one_of(_json, st.just({"value": 0})), "result": _json, "messageID": _json})
 )
-def test_json_of_another_shape_is_a_reply_or_has_a_name(content: dict[str, Any]) -> None:
+def test_json_of_another_shape_parses_or_raises_bad_reply(content: dict[str, Any]) -> None:
     try:
         reply = xop.reply(json.dumps(content).encode())
     except xop.BadReply:
@@ -136,12 +136,12 @@ def test_json_of_another_shape_is_a_reply_or_has_a_name(content: dict[str, Any])
         {"type": "struct", "value": 1},
     ],
 )
-def test_a_result_of_another_type_is_none(value: dict[str, Any]) -> None:
+def test_result_of_another_type_raises_bad_reply(value: dict[str, Any]) -> None:
     with pytest.raises(xop.BadReply):
         xop.reply(json.dumps({"errorCode": {"value": 0}, "result": value}).encode())
 
 
-def test_json_without_end_is_none() -> None:
+def test_endless_json_raises_bad_reply() -> None:
     with pytest.raises(xop.BadReply):
         xop.reply(b"[" * 100_000)
 
@@ -153,7 +153,7 @@ places = st.floats(-1e-4, 1e-4)
 
 
 @given(places, places, lengths, lengths, st.floats(-math.pi, math.pi), st.floats(1e-9, 1e-3))
-def test_what_is_set_is_what_asylum_scans(
+def test_settings_define_the_frame_that_asylum_scans(
     x: float, y: float, fast: float, slow: float, angle: float, speed: float
 ) -> None:
     region = Region((x, y), (fast, slow), angle)
@@ -180,15 +180,15 @@ def test_what_is_set_is_what_asylum_scans(
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0])
-def test_a_frame_that_never_ends_is_refused(value: float) -> None:
+def test_frame_at_speed_zero_is_refused(value: float) -> None:
     there = {"XOffset": 0.0, "YOffset": 0.0, "FastScanSize": 1e-6, "SlowScanSize": 1e-6, "ScanAngle": 0.0}
     before = generic(there | {"ScanPoints": 8, "ScanLines": 8, "ScanRate": 1.0})
     with pytest.raises(InvalidValue):
         asylums({names.SCAN_SPEED: value}, before)
 
 
-def test_angles_are_clockwise_at_asylum() -> None:
-    """As its software reckons where a scan begins: the fast axis lies along (cos, -sin) of ScanAngle."""
+def test_asylum_angles_are_clockwise() -> None:
+    # Asylum's software calculates the start of a scan with the fast axis along (cos, -sin) of ScanAngle.
     there = {"XOffset": 0.0, "YOffset": 0.0, "FastScanSize": 2e-6, "SlowScanSize": 1e-6, "ScanAngle": 90.0}
     told = generic(there | {"ScanPoints": 8, "ScanLines": 8, "ScanRate": 1.0})
     corner = (told[names.SCAN_TOP_LEFT_X], told[names.SCAN_TOP_LEFT_Y])
@@ -225,21 +225,21 @@ def test_spots_count_from_the_lower_left_corner_along_the_axes(x: float, y: floa
         (None, False, False, ScopeState.FREE),
     ],
 )
-def test_both_sources_count(bits: int | None, scanning: bool, mapping: bool, state: ScopeState) -> None:
+def test_state_counts_both_sources(bits: int | None, scanning: bool, mapping: bool, state: ScopeState) -> None:
     assert Doing(bits, scanning, mapping).state is state
 
 
 # --- folders and settings ---
 
 
-def test_the_longest_beginning_that_fits_says_where_a_folder_is() -> None:
+def test_folder_follows_the_longest_matching_prefix() -> None:
     folders = {"C:Users:": "/mnt/users", "c:users:Asylum User:Data": "/mnt/data"}
     assert local("C:Users:Asylum User:Data:240820:", folders) == Path("/mnt/data/240820")
     assert local("C:Users:Asylum User:Database:", folders) == Path("/mnt/users/Asylum User/Database")
     assert local(":home:me:", folders) == Path("/home/me")
 
 
-def test_a_folder_that_can_not_be_seen_from_here_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreachable_folder_is_a_config_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(ConfigError, match="which is not on this computer"):
         local("C:Users:Me:", {"D:": "/mnt"})
@@ -261,10 +261,10 @@ def test_a_folder_that_can_not_be_seen_from_here_is_asked_for(monkeypatch: pytes
         {"spots": "?"},
     ],
 )
-def test_settings_that_can_not_be(setting: dict[str, str]) -> None:
+def test_invalid_settings_are_refused(setting: dict[str, str]) -> None:
     with pytest.raises(ConfigError):
         Asylum(**setting)
 
 
-def test_without_spots_the_tip_can_not_be_sent_anywhere() -> None:
+def test_without_spots_the_tip_can_not_be_moved() -> None:
     assert not {names.PROBE_POS_X, names.PROBE_POS_Y} & Asylum(spots="none").table.keys()

@@ -1,4 +1,4 @@
-"""What can go wrong at an Asylum microscope: each gives an error with a name, nothing hangs, and it is found again."""
+"""Faults of an Asylum microscope: each is a named error, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ UNDEFINED = ScopeState.UNDEFINED
 
 
 def scans_again(peer: Peer) -> list[Scan]:
-    """It works."""
+    """Scan once more, to show that the translator works."""
     response = peer.act(names.START_SCAN)
     assert response.ok, response.reason
     found = scans(peer.until(FREE))
@@ -28,7 +28,7 @@ def scans_again(peer: Peer) -> list[Scan]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no reply to"),
         ("wrong-id", "no reply to"),
@@ -41,19 +41,19 @@ def scans_again(peer: Peer) -> list[Scan]:
         ("unknown", "an error without a name (1"),
     ],
 )
-def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_igor_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     # of nan the first two are of the status, where they mean that a release has no such value
     made.strike(kind, count=6 if kind == "nan" else 1, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(logged)
     scans_again(peer)
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("dialog", "Igor does not answer while a dialog is open on its screen"),
         ("busy", "no reply to"),
@@ -61,7 +61,7 @@ def test_a_bad_reply_has_a_name_and_igor_is_found_again(bench: Make, kind: str, 
         ("restart", "nothing listens at this address"),
     ],
 )
-def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str, told: str) -> None:
+def test_lasting_fault_is_reported_until_it_ends(bench: Make, kind: str, logged: str) -> None:
     made = bench(speed=1.0)
     peer = small(made, **SOON)
     made.strike(kind, duration_s=8.0)
@@ -70,22 +70,22 @@ def test_what_lasts_is_told_to_who_asks_until_it_is_over(bench: Make, kind: str,
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(logged)
 
 
-def test_a_tip_on_its_way_is_still_on_it_when_the_connection_comes_back(bench: Make) -> None:
+def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = small(made, move_s=20.0)
     arrives_s = made.clock.now_s() + 20.0
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
     peer.until(ScopeState.MOVING)
     made.strike("unknown")
-    heard = peer.until(FREE)
-    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["UNDEFINED", "MOVING", "FREE"]
     assert made.clock.now_s() >= arrives_s
 
 
-def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path: Path) -> None:
+def test_restarted_igor_is_reconnected(bench: Make, tmp_path: Path) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike("crash")
@@ -97,15 +97,15 @@ def test_igor_that_vanishes_is_found_again_when_it_is_back(bench: Make, tmp_path
         assert peer.get("x-engaged") == "true"
 
 
-def test_procedures_that_are_not_included_are_asked_for(bench: Make) -> None:
+def test_missing_procedures_are_named(bench: Make) -> None:
     made = bench(procedures="none")
     peer = made.start()
     peer.until(UNDEFINED)
-    made.until_said("there is no such function (101")
-    made.until_said("is afspm.ipf included in Igor's procedures")
+    made.until_logged("there is no such function (101")
+    made.until_logged("is afspm.ipf included in Igor's procedures")
 
 
-def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> None:
+def test_procedures_of_the_published_afspm_suffice_to_scan(bench: Make) -> None:
     made = bench(procedures="spots")
     peer = small(made)
     scans_again(peer)
@@ -118,7 +118,7 @@ def test_the_procedures_of_an_older_afspm_are_enough_to_scan(bench: Make) -> Non
 # --- scans and curves ---
 
 
-def test_a_force_curve_that_is_refused(bench: Make) -> None:
+def test_refused_force_curve_is_an_error(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("force-refused")
@@ -129,7 +129,7 @@ def test_a_force_curve_that_is_refused(bench: Make) -> None:
     assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
 
 
-def test_a_force_curve_whose_end_could_not_be_seen_is_refused(bench: Make) -> None:
+def test_force_curve_without_status_function_is_refused(bench: Make) -> None:
     made = bench(has_status=False)
     peer = small(made)
     response = peer.act(names.START_SPEC)
@@ -138,7 +138,7 @@ def test_a_force_curve_whose_end_could_not_be_seen_is_refused(bench: Make) -> No
     scans_again(peer)
 
 
-def test_a_scan_is_one_scan_even_if_beginning_it_puts_last_scan_back(bench: Make) -> None:
+def test_scan_runs_once_even_if_its_start_resets_last_scan(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("keeps-scanning")
@@ -146,16 +146,16 @@ def test_a_scan_is_one_scan_even_if_beginning_it_puts_last_scan_back(bench: Make
     assert made.emulator.controller.values.get("LastScan") == 1
 
 
-def test_saving_is_switched_on_where_it_is_off(bench: Make) -> None:
+def test_saving_is_switched_on_if_off(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.at_panel(lambda emulator: emulator.controller.values.put("SaveImage", 0))
     scans_again(peer)
-    made.until_said("Asylum did not save its measurements (SaveImage)")
+    made.until_logged("Asylum did not save its measurements (SaveImage)")
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])
-def test_a_file_that_comes_late_or_in_parts_is_waited_for(bench: Make, kind: str) -> None:
+def test_late_or_partial_file_is_awaited(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.strike(kind, duration_s=6.0)
@@ -163,21 +163,21 @@ def test_a_file_that_comes_late_or_in_parts_is_waited_for(bench: Make, kind: str
 
 
 @pytest.mark.parametrize(("kind", "lasts_s"), [("no-file", 1.0), ("half-file", 1e6), ("drive-gone", 20.0)])
-def test_a_scan_without_a_whole_file_is_told_and_the_next_is_not_taken_for_it(
+def test_scan_without_a_complete_file_is_reported_and_not_confused_with_the_next(
     bench: Make, kind: str, lasts_s: float
 ) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=5.0)
     made.strike(kind, duration_s=lasts_s)
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    made.until_said("ended without a result")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(received)
+    made.until_logged("ended without a result")
     assert scans_again(peer)[0].values.shape == (8, 16)
 
 
-def test_a_file_of_the_same_name_is_that_of_the_new_scan(bench: Make) -> None:
+def test_file_of_the_same_name_belongs_to_the_new_scan(bench: Make) -> None:
     made = bench()
     peer = small(made)
     first = scans_again(peer)
@@ -188,28 +188,28 @@ def test_a_file_of_the_same_name_is_that_of_the_new_scan(bench: Make) -> None:
     assert (first[0].values != second[0].values).any()
 
 
-def test_a_file_of_another_name_is_found(bench: Make) -> None:
+def test_file_of_another_name_is_found(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("other-name")
-    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Somebody0000.ibw"}
+    assert {Path(scan.filename).name for scan in scans_again(peer)} == {"Panel0000.ibw"}
 
 
 @pytest.mark.parametrize("partial", [False, True])
-def test_a_scan_that_somebody_stops_is_interrupted(bench: Make, partial: bool) -> None:
+def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, partial: bool) -> None:
     made = bench(speed=4.0, saves_partial=partial)
     peer = small(made, result_timeout_s=3.0)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("stopped")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
-def test_what_one_source_says_to_be_scanning_is(bench: Make) -> None:
+def test_scan_reported_by_one_source_counts(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.emulator.faults.demand(Fault("status-stuck", 0.0, 1, 20.0), made.clock.now_s())
-    heard = peer.until(ScopeState.SCANNING)
-    assert states(heard) == ["SCANNING"]
+    received = peer.until(ScopeState.SCANNING)
+    assert states(received) == ["SCANNING"]

@@ -1,4 +1,4 @@
-"""The Asylum translator against the emulated microscope: everything that a peer may ask for, as it sees it."""
+"""The Asylum translator with the emulated microscope: every request of a peer, and its effects."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def moved_exactly(peer: Peer, x_m: float, y_m: float) -> None:
 # --- scans ---
 
 
-def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
+def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -56,22 +56,23 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
     assert scans["PhaseTrace"].unit == "deg"
 
 
-def test_a_scan_comes_with_the_frame_that_was_told_whatever_its_digits(bench: Make) -> None:
+def test_scan_has_the_set_frame_to_the_last_digit(bench: Make) -> None:
     made = bench()
     peer = made.start()
     peer.until(FREE)
     odd = Region((1e-6 / 3, -1e-7 / 7), (1e-6 / 9, 1e-6 / 7), 1 / 3)
     assert peer.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(odd, SHAPE, "")).ok
-    told = peer.until(lambda one: isinstance(one, ScanParameters) and one.shape == SHAPE)[-1]
-    assert told.region.size_m == pytest.approx(odd.size_m, rel=1e-14)
-    assert told.region.center_m == pytest.approx(odd.center_m, rel=1e-12)
+    packet = peer.until(lambda one: isinstance(one, ScanParameters) and one.shape == SHAPE)[-1]
+    assert packet.region.size_m == pytest.approx(odd.size_m, rel=1e-14)
+    assert packet.region.center_m == pytest.approx(odd.center_m, rel=1e-12)
     peer.until(FREE)
-    assert {scan.region for scan in scanned(peer).values()} == {told.region}
+    assert {scan.region for scan in scanned(peer).values()} == {packet.region}
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
-def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: str) -> None:
-    """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
+def test_rows_and_columns_match_the_sample(bench: Make, direction: str) -> None:
+    # Compared with the heights of the simulated sample at each pixel: an offset by half a frame or a mirrored axis
+    # shows.
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start()
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -91,7 +92,7 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
     assert read(scans["HeightTrace"].filename).upwards is (direction == "up")
 
 
-def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: Make) -> None:
+def test_stopped_scan_is_not_published_and_withdraws_the_tip(bench: Make) -> None:
     made = bench(speed=10.0, saves_partial=True)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -99,9 +100,9 @@ def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: M
     peer.until(ScopeState.SCANNING)
     assert peer.get("x-engaged") == "true"
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Scan) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Scan) for one in received)
     assert peer.get("x-engaged") == "false"
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
     assert peer.act(names.ENGAGE).ok
@@ -109,7 +110,7 @@ def test_a_scan_that_is_stopped_gives_none_and_leaves_the_tip_withdrawn(bench: M
     assert peer.get("x-engaged") == "true"
 
 
-def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) -> None:
+def test_images_from_the_panel_are_published(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()
     ready(peer)
@@ -119,18 +120,17 @@ def test_images_that_somebody_takes_at_the_panel_are_published_too(bench: Make) 
         made.emulator.controller.scan(made.clock.now_s(), True)
 
     made.at_panel(press)
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert {one.region for one in heard if isinstance(one, Scan)} == {TURNED}
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert {one.region for one in received if isinstance(one, Scan)} == {TURNED}
 
 
-def test_images_that_follow_each_other_at_the_panel_are_each_published_once(bench: Make) -> None:
+def test_consecutive_images_from_the_panel_are_each_published_once(bench: Make) -> None:
     made = bench(speed=8.0)
     peer = made.start()
     ready(peer)
 
     def suffix(last_scan: bool = False) -> int:
-        """Of the image that is being scanned."""
         found: list[float] = []
 
         def at_panel(emulator: Emulated) -> None:
@@ -141,19 +141,19 @@ def test_images_that_follow_each_other_at_the_panel_are_each_published_once(benc
         return round(found[0])
 
     made.at_panel(lambda emulator: emulator.controller.scan(made.clock.now_s(), True))
-    heard = peer.until(lambda one: one == ScopeStatus(ScopeState.SCANNING))
+    received = peer.until(lambda one: one == ScopeStatus(ScopeState.SCANNING))
     deadline_s = made.clock.monotonic_s() + 20.0
     while suffix() < 2:
         assert made.clock.monotonic_s() < deadline_s
     last = f"Image{suffix(last_scan=True):04d}.ibw"
-    heard += peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
-    files = [Path(one.filename).name for one in heard if isinstance(one, Scan) and one.channel == "HeightTrace"]
+    received += peer.until(lambda one: isinstance(one, Scan) and Path(one.filename).name == last)
+    files = [Path(one.filename).name for one in received if isinstance(one, Scan) and one.channel == "HeightTrace"]
     assert files == [f"Image{i:04d}.ibw" for i in range(len(files))]
     assert len(files) > 2
     assert states(peer.until(FREE)) == ["FREE"]
 
 
-def test_a_scan_that_outlives_the_translator_is_published_by_the_next(bench: Make) -> None:
+def test_scan_that_outlives_the_translator_is_published_by_the_next(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
@@ -169,7 +169,7 @@ def test_a_scan_that_outlives_the_translator_is_published_by_the_next(bench: Mak
     assert {Path(scan.filename).name for scan in scans} == {"Image0001.ibw"}
 
 
-def test_a_frame_that_asylum_makes_of_it_is_told(bench: Make) -> None:
+def test_frame_changed_by_asylum_is_logged(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -177,14 +177,13 @@ def test_a_frame_that_asylum_makes_of_it_is_told(bench: Make) -> None:
     made.at_panel(lambda emulator: emulator.controller.values.put("FastRatio", 1.0))
     scan = scanned(peer)["HeightTrace"]
     assert scan.region.size_m[1] > 2 * TURNED.size_m[1]
-    made.until_said("the scan is published as the file has it")
+    made.until_logged("has the frame 300 x 300 nm at (40, -25) nm, 30° instead of 300 x 100 nm at (40, -25) nm, 30°")
 
 
 # --- parameters ---
 
 
-def test_the_frame_as_asylum_has_it(bench: Make) -> None:
-    """Its offsets are the centre, the longer side is ScanSize, and the ratios tell the other one."""
+def test_frame_in_asylums_values(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -198,7 +197,7 @@ def test_the_frame_as_asylum_has_it(bench: Make) -> None:
     assert (values.get("ScanPoints"), values.get("ScanLines")) == (32, 12)
 
 
-def test_the_speed_is_asylums_scan_rate_and_stays_when_the_width_changes(bench: Make) -> None:
+def test_speed_sets_scan_rate_and_survives_a_change_of_width(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -216,30 +215,30 @@ def test_feedback_is_set_and_switched(bench: Make) -> None:
     peer = made.start()
     peer.until(FREE)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(False, 0.5, 20.0, 0.6)).ok
-    told = peer.until(lambda one: isinstance(one, Feedback) and one.on is False)[-1]
-    assert (told.proportional_gain, told.integral_gain) == pytest.approx((0.5, 20.0))
-    assert told.setpoint == pytest.approx(0.6)
+    packet = peer.until(lambda one: isinstance(one, Feedback) and one.on is False)[-1]
+    assert (packet.proportional_gain, packet.integral_gain) == pytest.approx((0.5, 20.0))
+    assert packet.setpoint == pytest.approx(0.6)
     assert made.emulator.controller.values.get("AmplitudeSetpointVolts") == pytest.approx(0.6)
     assert peer.set(names.FEEDBACK_ON, True).ok
     assert peer.get(names.FEEDBACK_ON) == "true"
 
 
-def test_of_a_withdrawn_tip_it_is_not_told_that_it_is_without_feedback(bench: Make) -> None:
-    """It is in no danger: a scheduler would have it retracted, and call a person."""
+def test_withdrawn_tip_is_not_reported_without_feedback(bench: Make) -> None:
+    # A withdrawn tip is in no danger: the scheduler would retract it again and notify a person.
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.act(names.STOP_SCAN).ok
-    heard = [*peer.until(lambda one: isinstance(one, Feedback)), *peer.until(FREE)]
-    assert [one.on for one in heard if isinstance(one, Feedback)] == [None]
+    received = [*peer.until(lambda one: isinstance(one, Feedback)), *peer.until(FREE)]
+    assert [one.on for one in received if isinstance(one, Feedback)] == [None]
     assert (peer.get(names.FEEDBACK_ON), peer.get(names.ENGAGED)) == ("false", "false")
     assert peer.act(names.ENGAGE).ok
     peer.until(lambda one: isinstance(one, Feedback) and one.on is True)
 
 
-def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_feedback_is_switched_on_after_its_other_settings(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench()
     peer = made.start()
     peer.until(FREE)
@@ -255,10 +254,10 @@ def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, mo
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(True, 0.5, 20.0, 0.625)).ok
     assert engaged_with == [0.625], "with the setpoint of before the tip may crash"
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=True, setpoint=0.75)).ok
-    assert engaged_with == [0.625], "it is on: nobody presses Engage again"
+    assert engaged_with == [0.625], "it is on: Engage is not pressed again"
 
 
-def test_switching_feedback_on_waits_until_the_tip_is_there(bench: Make) -> None:
+def test_switching_feedback_on_waits_for_the_tip(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = made.start(reply_timeout_s=5.0)
     peer.until(FREE)
@@ -270,15 +269,15 @@ def test_switching_feedback_on_waits_until_the_tip_is_there(bench: Make) -> None
 
 
 @pytest.mark.parametrize("scanning", [False, True])
-def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
+def test_tip_without_feedback_is_retracted_at_the_end_of_a_run(bench: Make, scanning: bool) -> None:
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
     why = "Asylum withdrew the tip" if scanning else "the run is stopping with the feedback off"
-    assert why in made.said()
+    assert why in made.log_text()
 
 
-def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:
+def test_tip_without_feedback_stays_if_the_file_allows_it(bench: Make) -> None:
     made = bench(speed=5.0)
     left_in_danger(made, scanning=False, retracts=False)
     assert made.emulator.rig.engaged
@@ -298,7 +297,7 @@ def test_a_row_of_the_table_can_name_another_value_or_a_text(bench: Make) -> Non
     assert peer.get("x-name") == "Graphite"
 
 
-def test_a_value_that_asylum_does_not_have_is_named(bench: Make) -> None:
+def test_unknown_asylum_value_is_named(bench: Make) -> None:
     made = bench()
     peer = made.start(parameters={"x-loss": {"vendor": "NoSuchValue", "unit": "V"}})
     peer.until(FREE)
@@ -318,7 +317,7 @@ def test_a_value_that_asylum_does_not_have_is_named(bench: Make) -> None:
         ("no-such", "1", None, ControlResponse.PARAM_NOT_SUPPORTED),
     ],
 )
-def test_what_can_not_be_set_is_refused(
+def test_unsettable_values_are_refused(
     bench: Make, name: str, value: str, unit: str | None, code: ControlResponse
 ) -> None:
     made = bench()
@@ -329,7 +328,7 @@ def test_what_can_not_be_set_is_refused(
     assert response.reason
 
 
-def test_while_it_scans_it_is_asked_and_not_disturbed(bench: Make) -> None:
+def test_scan_is_polled_without_disturbing_it(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -343,7 +342,7 @@ def test_while_it_scans_it_is_asked_and_not_disturbed(bench: Make) -> None:
     assert peer.get("x-engaged") == "false"
 
 
-def test_the_controller_and_a_base_name_of_ones_own(bench: Make) -> None:
+def test_controller_name_and_base_name(bench: Make) -> None:
     made = bench()
     peer = made.start(base_name="Tuesday")
     ready(peer)
@@ -355,7 +354,7 @@ def test_the_controller_and_a_base_name_of_ones_own(bench: Make) -> None:
 def test_a_base_name_of_another_night_overwrites_nothing(
     bench: Make, monkeypatch: pytest.MonkeyPatch, without: tuple[str, ...]
 ) -> None:
-    """ARCheckSuffix finds the next number that is free; a release without it would begin with 0000 again."""
+    # ARCheckSuffix finds the next free number; a release without it would start with 0000 again.
     made = bench()
     functions = made.emulator.functions()
     monkeypatch.setattr(made.emulator, "_functions", {k: f for k, f in functions.items() if k not in without})
@@ -369,7 +368,7 @@ def test_a_base_name_of_another_night_overwrites_nothing(
     assert [file.read_bytes() for file in earlier] == [b"of another night"] * 3
 
 
-def test_files_are_found_where_the_drive_is_mounted(bench: Make) -> None:
+def test_files_are_found_on_a_mounted_drive(bench: Make) -> None:
     made = bench(save_path="C:Users:Asylum User:Documents:240820:")
     peer = made.start(folders={"c:users:Asylum User:Documents": str(made.folder)})
     ready(peer)
@@ -394,7 +393,7 @@ def test_commands_of_the_experiment_file(bench: Make) -> None:
 # --- the probe, and force curves ---
 
 
-def test_the_probe_goes_where_it_is_sent_also_on_a_turned_image(bench: Make) -> None:
+def test_probe_reaches_its_place_on_a_rotated_image(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -403,7 +402,7 @@ def test_the_probe_goes_where_it_is_sent_also_on_a_turned_image(bench: Make) -> 
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
 
 
-def test_the_probe_goes_where_it_is_sent_whatever_spot_is_chosen_at_the_panel(bench: Make) -> None:
+def test_probe_reaches_its_place_despite_another_spot_on_the_panel(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -412,7 +411,7 @@ def test_the_probe_goes_where_it_is_sent_whatever_spot_is_chosen_at_the_panel(be
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
 
 
-def test_before_the_first_scan_spots_count_on_the_image_that_is_open(bench: Make) -> None:
+def test_before_the_first_scan_spots_count_on_the_open_image(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -421,7 +420,7 @@ def test_before_the_first_scan_spots_count_on_the_image_that_is_open(bench: Make
 
 
 @pytest.mark.parametrize("kind", ["scan-refused", "aborted"])
-def test_after_a_scan_that_did_not_begin_spots_count_on_the_image_of_before(bench: Make, kind: str) -> None:
+def test_after_a_failed_start_spots_count_on_the_previous_image(bench: Make, kind: str) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -449,7 +448,7 @@ def test_after_a_scan_that_did_not_begin_spots_count_on_the_image_of_before(benc
     assert made.emulator.rig.probe_m == pytest.approx((800e-9, 20e-9), abs=1e-16)
 
 
-def test_the_probe_stays_where_it_is_when_the_image_changes(bench: Make) -> None:
+def test_probe_keeps_its_place_when_the_image_changes(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -459,16 +458,16 @@ def test_the_probe_stays_where_it_is_when_the_image_changes(bench: Make) -> None
     assert float(peer.get(names.PROBE_POS_Y)) == pytest.approx(10e-9)
 
 
-def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> None:
+def test_force_curve_has_its_position(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
     moved_exactly(peer, 70e-9, 10e-9)
     response = peer.act(names.START_SPEC)
     assert response.ok, response.reason
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert curve.position_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
     assert (curve.kind, curve.names) == ("force", ("Raw", "Defl", "ZSnsr", "Time"))
     assert curve.units == ("m", "m", "m", "s")
@@ -488,8 +487,8 @@ def test_a_force_curve_comes_with_the_place_where_it_was_taken(bench: Make) -> N
         assert float(noted[name]) > 0.0
 
 
-def test_a_force_curve_after_a_scan_is_taken_where_the_tip_was_sent_before_it(bench: Make) -> None:
-    """A scan leads the tip away from there."""
+def test_force_curve_after_a_scan_is_taken_at_the_probe_position(bench: Make) -> None:
+    # A scan moves the tip away.
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
@@ -497,14 +496,14 @@ def test_a_force_curve_after_a_scan_is_taken_where_the_tip_was_sent_before_it(be
     scanned(peer)
     made.at_panel(lambda emulator: setattr(emulator.rig, "_probe_m", (120e-9, 5e-9)))
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert curve.position_m == pytest.approx((70e-9, 10e-9))
     assert made.emulator.rig.probe_m == pytest.approx((70e-9, 10e-9), abs=1e-16)
 
 
-def test_a_force_curve_can_be_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) -> None:
+def test_force_curve_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
     made = bench(speed=2.0)
     peer = made.start(move_s=10.0)
     ready(peer)
@@ -513,24 +512,24 @@ def test_a_force_curve_can_be_stopped_while_the_tip_is_on_its_way_to_it(bench: M
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert "SPEC" not in states(heard)
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert "SPEC" not in states(received)
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
-def test_a_force_curve_that_is_stopped_gives_none(bench: Make) -> None:
+def test_stopped_force_curve_is_not_published(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = made.start()
     peer.until(FREE)
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
-def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_file(bench: Make) -> None:
+def test_force_curve_from_the_panel_has_the_position_in_its_file(bench: Make) -> None:
     made = bench(speed=2.0)
     peer = made.start()
     peer.until(FREE)
@@ -543,10 +542,10 @@ def test_a_force_curve_that_somebody_takes_is_published_with_the_place_of_its_fi
     assert curve.position_m == pytest.approx((x, y), rel=1e-4, abs=1e-12)
 
 
-# --- what is done to the tip ---
+# --- the tip ---
 
 
-def test_a_pulse_is_a_bias_that_is_put_back(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pulse_restores_the_bias(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench(speed=1.0)
     peer = made.start()
     ready(peer)
@@ -566,8 +565,7 @@ def test_a_pulse_is_a_bias_that_is_put_back(bench: Make, monkeypatch: pytest.Mon
     assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
 
 
-def test_a_crash_is_an_indentation_that_is_not_saved(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As the README has it."""
+def test_crash_is_an_unsaved_indentation(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench(speed=5.0)
     peer = made.start(
         parameters={
@@ -583,8 +581,8 @@ def test_a_crash_is_an_indentation_that_is_not_saved(bench: Make, monkeypatch: p
     assert peer.set(names.CRASH_DEPTH, 2, "um").ok
     assert peer.set(names.CRASH_SPEED, 5, "um/s").ok
     assert peer.act(names.CRASH).ok
-    told = peer.until(FREE)
+    packets = peer.until(FREE)
     assert crashes == [pytest.approx((2e-6, 5e-6))]
-    assert not [one for one in told if isinstance(one, Spectrum)]
+    assert not [one for one in packets if isinstance(one, Spectrum)]
     assert peer.get("x-save-force") == "2"
     assert not list(made.data.glob("*.ibw"))

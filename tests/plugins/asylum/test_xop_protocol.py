@@ -1,4 +1,4 @@
-"""The emulated ZeroMQ-XOP against its reference calls, by plain ZeroMQ clients that know nothing of the translator."""
+"""The emulated ZeroMQ-XOP against its reference calls, with plain ZeroMQ clients."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def client(address: str) -> Iterator[Client]:
 
 
 def values(reply: dict[str, Any]) -> list[Any]:
-    """All that is told in a reply."""
+    """Return all values in a reply."""
     result = reply.get("result", [])
     told = [*(result if isinstance(result, list) else [result]), *reply.get("passByReference", [])]
     return [reply.get("messageID"), *(str(one["value"]) for one in told)]
@@ -103,17 +103,17 @@ def test_reference_calls(client: Client, case: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("top", [b"[1]", b"4711", b"null", b'"text"', b"[]"])
-def test_what_is_json_and_no_object_has_no_version(client: Client, top: bytes) -> None:
+def test_json_without_an_object_has_no_version(client: Client, top: bytes) -> None:
     assert client.ask(top)["errorCode"]["value"] == 4
 
 
 @pytest.mark.parametrize("number", ["1e400", "-1e400", "9" * 400])
-def test_numbers_out_of_range_are_no_json(client: Client, number: str) -> None:
+def test_numbers_out_of_range_are_malformed_json(client: Client, number: str) -> None:
     message = json.dumps(called("GV", 7)).replace("7]", f"{number}]").encode()
     assert client.ask(message)["errorCode"]["value"] == 3
 
 
-def test_half_a_surrogate_pair_is_no_json(client: Client) -> None:
+def test_lone_surrogate_is_malformed_json(client: Client) -> None:
     for where in ("messageID", "name", "params"):
         message = {
             "messageID": called("GV", "a", message_id="\ud800"),
@@ -125,7 +125,7 @@ def test_half_a_surrogate_pair_is_no_json(client: Client) -> None:
         }
 
 
-def test_a_byte_order_mark_and_what_follows_a_nul_are_passed_over(client: Client) -> None:
+def test_byte_order_mark_and_text_after_nul_are_ignored(client: Client) -> None:
     message = json.dumps(called("TestFunction1Arg", 1)).encode()
     for payload in (b"\xef\xbb\xbf" + message, message + b"\0", message + b"\0 {"):
         assert client.ask(payload)["result"]["value"] == 1
@@ -144,8 +144,8 @@ def test_numbers_are_read_as_strtod_reads_them(client: Client, text: str, value:
     assert value is None or reply["result"]["value"] == value
 
 
-def test_the_order_of_checks(client: Client) -> None:
-    """How many, then numbers, then what is given back, then what can't be passed."""
+def test_errors_are_checked_in_the_xops_order(client: Client) -> None:
+    # Number of parameters, then numbers, then result types, then parameter types.
     for name, parameters, error in (
         ("TestFunctionVariableAndWave", ("1.a",), 102),
         ("TestFunctionVariableAndWave", ("1.a", 1), 106),
@@ -158,11 +158,11 @@ def test_the_order_of_checks(client: Client) -> None:
     assert "messageID" not in nameless
 
 
-def test_a_list_of_results_is_one_also_of_a_single_one(client: Client) -> None:
+def test_single_result_of_a_multi_return_function_is_a_list(client: Client) -> None:
     assert client.call("TestFunctionOneResultListed")["result"] == [{"type": "variable", "value": 123}]
 
 
-def test_a_function_that_breaks_is_aborted_and_igor_stays(client: Client) -> None:
+def test_failing_function_is_aborted_and_igor_stays(client: Client) -> None:
     reply = client.call("TestFunctionBreaks")
     assert reply["errorCode"]["value"] == 107
     assert "division by zero" in reply["history"]
@@ -178,9 +178,7 @@ def test_a_function_that_breaks_is_aborted_and_igor_stays(client: Client) -> Non
     ],
     ids=str,
 )  # fmt: skip
-def test_a_scan_that_can_not_be_taken_is_interrupted(
-    igor: WithTestFunctions, client: Client, put: tuple[str, Any]
-) -> None:
+def test_impossible_scan_is_interrupted(igor: WithTestFunctions, client: Client, put: tuple[str, Any]) -> None:
     client.call("PV", *put)
     assert client.call("DoScanFunc", "DoScan")["errorCode"]["value"] == 0
     while client.call("GV", "ScanStatus")["result"]["value"]:
@@ -188,7 +186,7 @@ def test_a_scan_that_can_not_be_taken_is_interrupted(
     assert igor.rig.scan is None
 
 
-def test_what_is_put_does_not_break_names_and_numbers(client: Client, tmp_path: Path) -> None:
+def test_any_put_value_leaves_names_and_numbers_intact(client: Client, tmp_path: Path) -> None:
     client.call("PV", "BaseSuffix", "nan")
     client.call("PS", "BaseName", "../nul\0\\out")
     assert client.call("ARCheckSuffix")["errorCode"]["value"] == 0
@@ -197,23 +195,23 @@ def test_what_is_put_does_not_break_names_and_numbers(client: Client, tmp_path: 
     assert client.call("GV", "ScanSize")["errorCode"]["value"] == 0
 
 
-def test_the_translators_requests_are_what_the_xop_takes(client: Client) -> None:
+def test_translators_requests_are_valid_for_the_xop(client: Client) -> None:
     reply = client.ask(xop.request("TestFunctionStrVarStr", ["1", 2.0, "é"], "é7"))
     assert reply == {"errorCode": {"value": 0}, "messageID": "é7", "result": {"type": "string", "value": "1_2_é"}}
 
 
-def test_who_is_wrong_before_igor_is_asked_is_told_without_an_id(client: Client) -> None:
+def test_early_errors_are_replied_without_an_id(client: Client) -> None:
     message = called("TestFunctionNoArgs") | {"version": 2}
     assert "messageID" not in client.ask(message)
     assert client.call("NoSuchFunction")["messageID"] == "1"
 
 
-def test_igor_does_not_tell_upper_from_lower_case(client: Client) -> None:
+def test_igor_ignores_case(client: Client) -> None:
     assert client.call("gv", "SCANSIZE")["result"]["value"] == 1e-06
     assert client.call("GV", "NoSuchValue")["result"]["value"] == "nan"
 
 
-def test_a_request_of_1024_bytes_is_answered_and_a_longer_one_is_lost(client: Client) -> None:
+def test_request_of_1024_bytes_is_answered_and_a_longer_one_lost(client: Client) -> None:
     spare = 1024 - len(json.dumps(called("TestFunctionStrVarStr", "", 1, "")))
     assert client.call("TestFunctionStrVarStr", "x" * spare, 1, "")["errorCode"]["value"] == 0
     client.send(called("TestFunctionStrVarStr", "x" * (spare + 1), 1, ""))
@@ -221,7 +219,7 @@ def test_a_request_of_1024_bytes_is_answered_and_a_longer_one_is_lost(client: Cl
     assert client.call("TestFunction1Arg", 4)["result"]["value"] == 4, "connected again by itself"
 
 
-def test_a_req_socket_works_until_a_reply_is_lost(address: str) -> None:
+def test_req_socket_works_until_a_reply_is_lost(address: str) -> None:
     client = Client(address, zmq.REQ)
     assert client.call("TestFunction1Arg", 4)["result"]["value"] == 4
     client.send(called("TestNotUtf8"))
@@ -232,7 +230,7 @@ def test_a_req_socket_works_until_a_reply_is_lost(address: str) -> None:
 
 
 @pytest.mark.parametrize("correlated", [True, False])
-def test_a_request_of_other_frames_has_no_reply(address: str, correlated: bool) -> None:
+def test_request_with_wrong_frames_has_no_reply(address: str, correlated: bool) -> None:
     client = Client(address, zmq.REQ if correlated else zmq.DEALER)
     if correlated:
         client.socket.setsockopt(zmq.REQ_CORRELATE, 1)
@@ -243,7 +241,7 @@ def test_a_request_of_other_frames_has_no_reply(address: str, correlated: bool) 
     client.close()
 
 
-def test_while_igor_is_busy_what_is_wrong_is_told_at_once_and_what_is_right_waits(tmp_path: Path) -> None:
+def test_busy_igor_rejects_malformed_requests_at_once_and_queues_others(tmp_path: Path) -> None:
     igor = WithTestFunctions(port=0, faults=[Fault("busy", 0.0, 1, 1.0)])
     with igor.running(tmp_path, ExperimentClock.starting_now()) as address:
         client = Client(address)
@@ -254,7 +252,7 @@ def test_while_igor_is_busy_what_is_wrong_is_told_at_once_and_what_is_right_wait
         client.close()
 
 
-def test_a_dialog_that_a_function_opened_blocks_everybody(client: Client) -> None:
+def test_dialog_opened_by_a_function_blocks_all_clients(client: Client) -> None:
     client.send(called("DoScanFunc", "NoSuchButton"))
     assert client.silent()
     client.send(called("TestFunction1Arg", 4))
@@ -262,7 +260,7 @@ def test_a_dialog_that_a_function_opened_blocks_everybody(client: Client) -> Non
     assert client.silent()
 
 
-def test_dialog_that_a_function_opened_is_closed_from_outside(client: Client, tmp_path: Path) -> None:
+def test_dialog_opened_by_a_function_can_be_closed(client: Client, tmp_path: Path) -> None:
     client.send(called("DoScanFunc", "Blah"))
     assert client.silent()
     client.send(called("TestFunction1Arg", 4, message_id="2"))
@@ -291,7 +289,7 @@ def test_dialog_that_lasts_for_a_while_can_be_closed_before(tmp_path: Path) -> N
         client.close()
 
 
-def test_a_name_is_cut_as_asylum_cuts_the_names_of_its_buttons(client: Client, igor: WithTestFunctions) -> None:
+def test_command_is_cut_from_a_buttons_name(client: Client, igor: WithTestFunctions) -> None:
     assert client.call("DoScanFunc", "DownScanButton_3")["result"]["value"] == 0
     assert client.call("GV", "ScanStatus")["result"]["value"] == 1, "at once, though it begins later"
     assert client.call("GV", "ScanDown")["result"]["value"] == 1
@@ -300,13 +298,13 @@ def test_a_name_is_cut_as_asylum_cuts_the_names_of_its_buttons(client: Client, i
     assert client.call("DoForceFunc", "NoSuchForce")["result"]["value"] == 1
 
 
-def test_a_force_curve_that_starts_gives_nan_and_one_that_does_not_gives_zero(client: Client) -> None:
+def test_do_force_func_returns_nan_for_a_start_and_zero_for_a_refusal(client: Client) -> None:
     assert client.call("DoForceFunc", "SingleForce")["result"]["value"] == "nan"
     assert client.call("ARGetStatus")["result"]["value"] & 0x10
     assert client.call("DoForceFunc", "SingleForce")["result"]["value"] == 0
 
 
-def test_spots_are_there_once_they_were_made(client: Client) -> None:
+def test_spots_exist_after_their_initialisation(client: Client) -> None:
     failed = client.call("SetProbePosX", 1e-7)
     assert failed["errorCode"]["value"] == 107
     assert "Index out of range" in failed["history"]
@@ -316,7 +314,7 @@ def test_spots_are_there_once_they_were_made(client: Client) -> None:
 
 
 @pytest.mark.parametrize(("procedures", "missing"), [("none", "GetBaseName"), ("spots", "AfspmLook")])
-def test_procedures_that_are_not_included_are_missing(tmp_path: Path, procedures: str, missing: str) -> None:
+def test_procedures_not_included_are_missing(tmp_path: Path, procedures: str, missing: str) -> None:
     igor = WithTestFunctions(port=0, procedures=procedures)
     with igor.running(tmp_path) as address:
         client = Client(address)
@@ -324,7 +322,7 @@ def test_procedures_that_are_not_included_are_missing(tmp_path: Path, procedures
         client.close()
 
 
-def test_files_are_read_by_someone_elses_reader_too(tmp_path: Path) -> None:
+def test_files_are_read_by_igor2(tmp_path: Path) -> None:
     binarywave = pytest.importorskip("igor2.binarywave")
     igor = WithTestFunctions(port=0, noise={"white_m": 0.0})
     clock = ExperimentClock.starting_now(speed=200.0)

@@ -1,4 +1,4 @@
-"""Fixtures for the tests of GXSM."""
+"""Fixtures for tests of GXSM."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
 
 @pytest.fixture(autouse=True)
 def own_home(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where the bridge puts its secret."""
+    """Give the bridge a secret in the test's own home folder."""
     home = tmp_path_factory.mktemp("home")
     for name in ("HOME", "USERPROFILE"):
         monkeypatch.setenv(name, str(home))
@@ -26,6 +26,6 @@ def own_home(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monke
 
 @pytest.fixture(autouse=True)
 def own_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All who speak to GXSMs on one computer share a lock file: those of another test, or test run, are not of ours."""
+    """Give each test its own lock file: callers of all GXSMs on one computer share one."""
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)

@@ -1,21 +1,23 @@
-"""The GXSM translator as a real process, an emulated GXSM beside it, and a peer on the translator's sockets."""
+"""Bench: the GXSM translator as a process, an emulated GXSM, and a peer on the translator's sockets."""
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
-from tests.plugins.vendor_bench import PATIENT, AtPanel, VendorBench
+from tests.plugins.vendor_bench import DEADLINE_S, PATIENT, AtPanel, VendorBench
 
 from afspm.plugins.gxsm.emulator import GxsmEmulator
 
 
 class Emulated(AtPanel, GxsmEmulator):
-    """With somebody at its panel."""
+    """An emulated GXSM with a person at its panel."""
 
 
 class Bench(VendorBench[Emulated]):
@@ -29,3 +31,12 @@ class Bench(VendorBench[Emulated]):
         self.settings = {**PATIENT, "result_timeout_s": 8.0 * speed}
         block = f"afspm_test_{os.getpid()}_{id(self)}"
         super().__init__(folder, stack, speed, {"block": block, **emulator})
+
+
+def until(made: Bench, what: Callable[[], bool]) -> None:
+    """Wait for a condition, polled as often as other programs do, so that the emulator gets processor time."""
+    until_s = made.clock.monotonic_s() + DEADLINE_S
+    pace = Event()
+    while not what():
+        assert made.clock.monotonic_s() < until_s
+        pace.wait(0.005)

@@ -1,4 +1,4 @@
-"""Programs of others that call GXSM, without anything of ours: by a plain socket, and plain shared memory."""
+"""Clients of GXSM without afspm's code: by a plain socket, and by plain shared memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ import numpy as np
 
 
 class SocketClient:
-    """Two proofs as the README describes them, and then a line of JSON out, a line in."""
+    """A client of the bridge as the README describes it: two proofs, then lines of JSON."""
 
     def __init__(self, address: str) -> None:
         host, _, port = address.rpartition(":")
@@ -56,7 +56,7 @@ class SocketClient:
         self._socket.sendall(lines)
 
     def sent_away(self, lines: bytes) -> bool:
-        """Send these; whether the other end then closes without an answer."""
+        """Send lines; return True if the bridge disconnects without an answer."""
         self.send(lines)
         try:
             return not self._lines.readline()
@@ -69,10 +69,10 @@ class SocketClient:
 
 
 class MemoryClient:
-    """As the page on Gxsm4's shared memory says.
+    """A client of Gxsm4's shared memory.
 
     Args:
-        locked: take the lock of all callers.
+        locked: True takes the lock of all callers.
     """
 
     def __init__(self, address: str, *, locked: bool = True) -> None:
@@ -106,7 +106,7 @@ class MemoryClient:
         for _ in range(10_000):
             if self.status() != 1:
                 break
-            select.select([], [], [], 0.001)  # the memory wakes nobody
+            select.select([], [], [], 0.001)  # shared memory wakes no thread
         if self.status() != 0:
             raise RuntimeError(f"status {self.status()}")
         length = struct.unpack("<Q", self.memory[128:136])[0]

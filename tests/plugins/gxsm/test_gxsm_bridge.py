@@ -1,4 +1,4 @@
-"""The script in GXSM's console, attacked from outside: by programs that do not know its secret, and by slow ones."""
+"""Attacks on the bridge from outside: by programs without its secret, and by slow ones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROVES_S = 0.3
 
 
 class Gxsm:
-    """The module `gxsm`, as far as the bridge needs it here."""
+    """The part of the module `gxsm` that the bridge needs."""
 
     wanted = 1.0
 
@@ -38,7 +38,7 @@ class Gxsm:
 
 @pytest.fixture
 def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[], str]]:
-    """Runs bridges, which end with the test; a client has less time than at a real one."""
+    """Run bridges until the end of the test; deadlines of clients are shorter than in reality."""
     gxsm = Gxsm()
     for name, value in {"gxsm": gxsm, "PROVES_S": PROVES_S, "LOOK_S": 0.02}.items():
         monkeypatch.setattr(bridge, name, value)
@@ -74,7 +74,7 @@ def link(address: str) -> BridgeLink:
 
 @contextmanager
 def listening_in_its_place(answer: Callable[[bytes], bytes]) -> Iterator[tuple[str, bytearray]]:
-    """A program of another user, which listens where the bridge should; all that was sent to it."""
+    """Another user's program in place of the bridge; collects all received bytes."""
     received = bytearray()
 
     def listen(listener: socket.socket) -> None:
@@ -91,8 +91,8 @@ def listening_in_its_place(answer: Callable[[bytes], bytes]) -> Iterator[tuple[s
         thread.join()
 
 
-def test_a_listener_in_place_of_the_bridge_learns_nothing_it_can_use(serving: Callable[[], str]) -> None:
-    """Neither the secret, nor a line that the bridge takes for the proof of a client."""
+def test_listener_in_place_of_the_bridge_learns_nothing_useful(serving: Callable[[], str]) -> None:
+    # Neither the secret, nor a line that the bridge would accept as a client's proof.
     address = serving()
     secret = bridge.secret()
     reply = json.dumps({"value": ["0" * 64, "1" * 64]}).encode() + b"\n"
@@ -111,7 +111,7 @@ def test_a_listener_in_place_of_the_bridge_learns_nothing_it_can_use(serving: Ca
 
 
 def test_a_program_between_client_and_bridge_is_refused(serving: Callable[[], str]) -> None:
-    """It passes on every line, and would then call GXSM itself."""
+    # A relay passes on every line, in order to call GXSM itself afterwards.
     with connected(serving()) as real, real.makefile("rb") as replies:
 
         def pass_on(line: bytes) -> bytes:
@@ -142,7 +142,7 @@ def test_a_proof_holds_for_one_connection_only(serving: Callable[[], str]) -> No
         assert replies.readline() == b""
 
 
-def test_a_client_that_dribbles_its_first_line_blocks_nobody_and_is_dropped(serving: Callable[[], str]) -> None:
+def test_client_that_dribbles_its_first_line_is_dropped_without_blocking_others(serving: Callable[[], str]) -> None:
     address = serving()
     pace = Event()
     with connected(address) as slow:
@@ -159,7 +159,7 @@ def test_a_client_that_dribbles_its_first_line_blocks_nobody_and_is_dropped(serv
         client.close()
 
 
-def test_a_client_that_takes_no_answer_does_not_block_another(serving: Callable[[], str]) -> None:
+def test_client_that_reads_no_answer_does_not_block_another(serving: Callable[[], str]) -> None:
     address = serving()
     one, other = SocketClient(address), SocketClient(address)
     one.send(b'["get_slice", 0, 0, 0, 0, 8192]\n')
@@ -188,9 +188,7 @@ def test_one_client_too_many_is_refused_with_a_reason(serving: Callable[[], str]
         client.close()
 
 
-def test_a_client_that_is_silent_for_long_makes_room(
-    serving: Callable[[], str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_client_is_replaced_by_a_new_one(serving: Callable[[], str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridge, "TAKES_S", 0.0)
     address = serving()
     clients = [SocketClient(address) for _ in range(bridge.MOST_CLIENTS + 1)]
@@ -206,8 +204,8 @@ def test_the_readme_describes_the_proofs_of_the_bridge() -> None:
         assert words in readme
 
 
-def test_the_script_needs_nothing_but_the_python_within_gxsm() -> None:
-    """Neither another package, nor a newer Python than systems with Gxsm3 have."""
+def test_script_runs_with_the_standard_library_only() -> None:
+    # Neither another package, nor a newer Python than on systems with Gxsm3.
     tree = ast.parse(Path(bridge.__file__).read_text(encoding="utf-8"), feature_version=(3, 8))
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     imported |= {one.name for node in ast.walk(tree) if isinstance(node, ast.Import) for one in node.names}

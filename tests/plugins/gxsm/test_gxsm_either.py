@@ -1,6 +1,6 @@
-"""What holds for the emulated GXSM and for a real one: set AFSPM_GXSM to its address ("shm", "127.0.0.1:65431").
+"""Tests for the emulated and a real GXSM: set AFSPM_GXSM to its address ("shm", "127.0.0.1:65431").
 
-Its tip is moved, and it scans some nanometres about where it is: use its own simulator (`-h SPM-SIM:SPM`), or withdraw.
+The tip moves and scans some nanometres at its place: use GXSM's own simulator (`-h SPM-SIM:SPM`), or withdraw.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SHAPE = (24, 32)
 
 @pytest.fixture(params=[*EMULATED, "real"])
 def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
-    """A translator's, with a small frame in force; what was in force is put back."""
+    """A peer of a translator with a small frame; the previous settings are restored."""
     with ExitStack() as stack:
         if request.param != "real":
             found = Bench(tmp_path, stack, 5.0, EMULATED[request.param]).start()
@@ -44,8 +44,8 @@ def peer(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Peer]:
                 pytest.skip(f"{REAL} is not set: no real GXSM to ask")
             clock = ExperimentClock.real()
             found = TranslatorProcess(Bench.translator, {"address": address}, tmp_path, stack, clock).peer
-        heard = found.until(FREE)
-        before = next(one for one in heard if isinstance(one, ScanParameters))
+        received = found.until(FREE)
+        before = next(one for one in received if isinstance(one, ScanParameters))
         rate = found.get_response("x-pixel-rate")
         if rate.ok:  # GXSM's own simulator
             kept = found.get("x-pixel-rate")
@@ -64,11 +64,11 @@ def in_force(peer: Peer, wanted: ScanParameters) -> None:
     peer.until(FREE)
 
 
-def test_a_scan_of_a_turned_frame_that_is_no_square(peer: Peer) -> None:
+def test_scan_of_a_rotated_oblong_frame(peer: Peer) -> None:
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    found = scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    found = scans(received)
     assert found
     for scan in found:
         assert scan.region == Region.from_top_left(FRAME.top_left_m, FRAME.size_m, FRAME.angle_rad)
@@ -79,14 +79,14 @@ def test_a_scan_of_a_turned_frame_that_is_no_square(peer: Peer) -> None:
     assert 0.0 < np.ptp(topography.values) < 1e-6
 
 
-def test_a_scan_that_is_stopped(peer: Peer) -> None:
+def test_stopped_scan(peer: Peer) -> None:
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.set(names.SCAN_SIZE_X, 60e-9).code == ControlResponse.NOT_FREE
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
 def test_parameters_are_as_they_were_set(peer: Peer) -> None:
@@ -106,7 +106,7 @@ def test_parameters_are_as_they_were_set(peer: Peer) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, before).ok
 
 
-def test_what_can_not_be_is_refused(peer: Peer) -> None:
+def test_invalid_values_are_refused(peer: Peer) -> None:
     assert peer.set(names.SCAN_SIZE_X, "nan").code == ControlResponse.PARAM_ERROR
     assert peer.set(names.SCAN_SIZE_X, 1, "V").code == ControlResponse.PARAM_ERROR
     assert peer.set(names.SCAN_SIZE_X, -1e-9).code == ControlResponse.PARAM_ERROR

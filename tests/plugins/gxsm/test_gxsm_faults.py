@@ -1,4 +1,4 @@
-"""What can go wrong at GXSM: each gives an error with a name, nothing hangs, and it is found again."""
+"""Faults of GXSM: each is a named error, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.gxsm.gxsm_bench import Bench, until
 from tests.plugins.vendor_bench import SHAPE, SOON, Peer, ready, scans, states
 
 from afspm.model import (
@@ -32,7 +32,7 @@ BRIDGE: dict[str, Any] = {}
 
 
 def small(made: Bench, **settings: object) -> Peer:
-    """A translator that has found GXSM, with a frame of few pixels in force."""
+    """Start a translator with a small frame."""
     peer = made.start(**settings)
     ready(peer, Region((0.0, 0.0), (100e-9, 1e-6)), (8, 16))
     return peer
@@ -49,10 +49,10 @@ def scanned(peer: Peer) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    ("kind", "settings", "told"),
+    ("kind", "settings", "logged"),
     [
         ("garbage", BRIDGE, "reports its state as"),
-        ("nan", BRIDGE, "GXSM says nan for"),
+        ("nan", BRIDGE, "GXSM returned nan for"),
         ("wrong-type", BRIDGE, "GXSM replied '\\x04' to"),
         ("error", BRIDGE, "SystemError: an emulated error"),
         ("error", SHM, "GXSM can't pass on the result"),
@@ -63,21 +63,21 @@ def scanned(peer: Peer) -> list[str]:
         ("huge", SHM, "GXSM replied 2147483648 bytes"),
     ],
 )
-def test_a_bad_answer_has_a_name_and_gxsm_is_found_again(
-    bench: Make, kind: str, settings: dict[str, Any], told: str
+def test_bad_answer_is_logged_and_gxsm_reconnected(
+    bench: Make, kind: str, settings: dict[str, Any], logged: str
 ) -> None:
     made = bench(**settings)
     peer = small(made)
     made.strike(kind)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(logged)
     assert scanned(peer)
     assert not Path("evil").exists()
 
 
-def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -> None:
-    """A RedPitaya does not tell that the tip moves."""
+def test_moving_tip_is_still_moving_after_a_reconnection(bench: Make) -> None:
+    # RPSPMC does not report that the tip moves.
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
     ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
@@ -85,13 +85,13 @@ def test_a_tip_on_its_way_is_still_on_it_when_the_link_comes_back(bench: Make) -
     assert peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((400e-9, 0.0))).ok
     peer.until(ScopeState.MOVING)
     made.strike("error")
-    heard = peer.until(FREE)
-    assert states(heard) == ["UNDEFINED", "MOVING", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["UNDEFINED", "MOVING", "FREE"]
     assert made.emulator.rig.probe_at(made.clock.now_s()) == pytest.approx((400e-9, 0.0))
 
 
-def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None:
-    """A RedPitaya does not tell that either; and where it goes next, it goes from there."""
+def test_tip_moved_with_its_frame_counts_as_moving(bench: Make) -> None:
+    # RPSPMC does not report this move either, and the next one starts after it.
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
     ready(peer, Region((0.0, 0.0), (1e-6, 1e-6)))
@@ -104,7 +104,7 @@ def test_a_tip_that_its_frame_takes_along_is_on_its_way_too(bench: Make) -> None
 
 
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
-def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, Any]) -> None:
+def test_hanging_gxsm_is_lost_and_reconnected(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(speed=1.0, **settings)
     peer = small(made, **SOON)
     made.strike("wedge", duration_s=8.0)
@@ -113,12 +113,12 @@ def test_a_gxsm_that_hangs_is_lost_and_found(bench: Make, settings: dict[str, An
     assert response.code == ControlResponse.NO_RESPONSE
     assert "the controller can't be reached" in response.reason
     peer.until(FREE)
-    made.until_said("no answer to")
+    made.until_logged("no answer to")
     assert peer.get(names.SCAN_RESOLUTION_X) == "16"
 
 
 @pytest.mark.parametrize("settings", [BRIDGE, SHM], ids=["bridge", "shm"])
-def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings: dict[str, Any]) -> None:
+def test_restarted_gxsm_is_reconnected(bench: Make, settings: dict[str, Any]) -> None:
     made = bench(**settings)
     address = made.address.partition("@")[0]
     if settings:
@@ -136,7 +136,7 @@ def test_a_gxsm_that_crashes_and_is_started_again_is_found(bench: Make, settings
     assert scanned(peer)
 
 
-def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_behind: Path) -> None:
+def test_memory_of_an_ended_gxsm_is_not_trusted(bench: Make, left_behind: Path) -> None:
     made = bench(block=left_behind.name, **SHM)
     peer = small(made)
     made.strike("crash")
@@ -144,7 +144,7 @@ def test_the_memory_of_a_gxsm_that_has_ended_is_not_believed(bench: Make, left_b
     assert left_behind.exists()
     response = peer.act(names.START_SCAN)
     assert response.code == ControlResponse.NO_RESPONSE
-    made.until_said("no process is called", "has ended")
+    made.until_logged("no process is called", "has ended")
 
 
 @pytest.fixture
@@ -154,24 +154,27 @@ def left_behind() -> Iterator[Path]:
     path.unlink(missing_ok=True)
 
 
-def test_a_script_that_was_stopped_is_missed_until_it_runs_again(bench: Make) -> None:
+def test_stopped_script_is_reported_until_it_runs_again(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("script-stopped")
     peer.until(UNDEFINED)
     assert peer.act(names.START_SCAN).code == ControlResponse.NO_RESPONSE
-    made.until_said("is bridge.py running in GXSM's console?")
+    made.until_logged("is bridge.py running in GXSM's console?")
     made.at_panel(lambda emulator: emulator.run_script())
     peer.until(FREE)
     assert scanned(peer)
 
 
-def test_script_that_has_ended_is_run_again_from_outside(bench: Make) -> None:
+def test_ended_script_can_be_run_again(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("script-stopped")
     peer.until(UNDEFINED)
-    (made.data / "delete-to-run-the-script-again.txt").unlink()
+    # the connection ends before the script does, and the button appears after both
+    button = made.data / "delete-to-run-the-script-again.txt"
+    until(made, button.exists)
+    button.unlink()
     peer.until(FREE)
     assert scanned(peer)
 
@@ -181,11 +184,11 @@ def test_a_decimal_comma_is_refused_before_anything_is_set(bench: Make) -> None:
     peer = made.start()
     peer.until(UNDEFINED)
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.25).code == ControlResponse.NO_RESPONSE
-    made.until_said("start GXSM with LC_NUMERIC=C")
+    made.until_logged("start GXSM with LC_NUMERIC=C")
     assert made.emulator.program.entries["dsp-fbs-bias"] == made.emulator.rig.setup.bias_v == 0.1
 
 
-def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> None:
+def test_silently_rejected_value_is_refused(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("refused")
@@ -198,42 +201,42 @@ def test_what_gxsm_does_not_take_is_refused_though_it_says_0(bench: Make) -> Non
 # --- scans ---
 
 
-def test_a_scan_that_did_not_begin_is_told_and_an_old_one_not_taken_for_it(bench: Make) -> None:
+def test_scan_that_did_not_start_is_reported_and_an_old_one_not_published(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     assert scanned(peer)
     made.at_panel(lambda emulator: emulator.woken.post())
     made.strike("no-start")
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    made.until_said("it was stopped or never began")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    assert not scans(received)
+    made.until_logged("it was stopped or never began")
 
 
-def test_a_scan_without_channels_is_told(bench: Make) -> None:
+def test_scan_without_channels_is_reported(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.at_panel(lambda emulator: emulator.program.channels.clear())
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("a channel is set")
+    made.until_logged("a channel is set")
     assert made.emulator.program.dialogs == ["no channel is set"]
 
 
 def stopped_at_panel(made: Bench, peer: Peer) -> None:
-    """A scan is begun, and somebody stops it after a few lines; nothing comes of it."""
+    """Start a scan and stop it at the panel after a few lines; check that it is not published."""
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 2)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"], made.log_text()
+    assert not scans(received)
 
 
 def until_line(made: Bench, peer: Peer, line: int) -> None:
-    """Until so many lines of the running scan are complete."""
+    """Wait until some lines of the running scan are complete."""
     until_s = made.clock.now_s() + 60.0
     last = made.emulator.program.scan.activity
     assert last is not None
@@ -246,15 +249,15 @@ KINDS: list[dict[str, Any]] = [{"version": 3}, {}, SHM, {"card": "RPSPMC"}, {"ca
 
 @pytest.mark.parametrize("saving", ["afspm", "gxsm"])
 @pytest.mark.parametrize("kind", KINDS, ids=["gxsm3", "gxsm4", "shm", "rpspmc", "simulator"])
-def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: dict[str, Any], saving: str) -> None:
-    """GXSM keeps, and saves, the scan before in the rows that it did not come to, and nothing says so."""
+def test_scan_stopped_at_the_panel_is_interrupted(bench: Make, kind: dict[str, Any], saving: str) -> None:
+    # GXSM keeps, and saves, the previous scan in rows not yet scanned, without marking them.
     made = bench(speed=1.0, **kind)
     peer = small(made, saving=saving)
     if kind.get("card") == "simulator":
         assert peer.set("x-pixel-rate", 1000).ok
     scanned(peer)
     stopped_at_panel(made, peer)
-    made.until_said("still holds the previous scan")
+    made.until_logged("still holds the previous scan")
     assert scanned(peer), "the next one is whole, and published"
 
 
@@ -269,7 +272,7 @@ def test_a_scan_stopped_at_the_panel_is_told_as_broken_off(bench: Make, kind: di
     ],
     ids=["frame", "fewer-rows", "fewer-columns", "more-columns", "more-rows"],
 )
-def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Region, shape: tuple[int, int]) -> None:
+def test_rows_of_another_frame_count_as_old(bench: Make, region: Region, shape: tuple[int, int]) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
@@ -278,7 +281,7 @@ def test_the_rows_of_another_frame_are_known_as_old_too(bench: Make, region: Reg
     stopped_at_panel(made, peer)
 
 
-def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> None:
+def test_scan_stopped_in_its_first_line_is_interrupted(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     assert peer.set(names.SCAN_SPEED, "10", "um/s").ok
@@ -290,17 +293,17 @@ def test_a_scan_stopped_in_its_first_line_is_told_as_broken_off(bench: Make) -> 
     assert states(peer.until(FREE)) == ["INTERRUPTED", "FREE"]
 
 
-def test_a_first_scan_that_is_stopped_is_told_as_broken_off(bench: Make) -> None:
-    """There was none before: its file has zeros."""
+def test_stopped_first_scan_is_interrupted(bench: Make) -> None:
+    # There is no previous scan: its file has zeros.
     made = bench(speed=1.0)
     peer = small(made)
     stopped_at_panel(made, peer)
-    made.until_said("lacks lines")
+    made.until_logged("lacks lines")
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make, seen: bool) -> None:
-    """Also if the translator has not seen the scan before."""
+def test_scan_started_and_stopped_at_the_panel_is_interrupted(bench: Make, seen: bool) -> None:
+    # Also if the translator has not seen the previous scan.
     made = bench(speed=1.0)
     peer = small(made)
     scanned(peer)
@@ -312,9 +315,9 @@ def test_a_scan_begun_and_stopped_at_the_panel_is_told_as_broken_off(bench: Make
     peer.until(ScopeState.SCANNING)
     until_line(made, peer, 4)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"], made.said()
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"], made.log_text()
+    assert not scans(received)
 
 
 def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Make) -> None:
@@ -327,9 +330,9 @@ def test_a_scan_stopped_while_the_translator_is_down_is_not_published(bench: Mak
     made.kill()
     made.at_panel(lambda emulator: emulator.rig.stop_scan(emulator.clock.now_s()))
     peer = made.start()
-    heard = peer.until(FREE)
-    assert "INTERRUPTED" in states(heard)
-    assert {Path(scan.filename).name[:7] for scan in scans(heard)} == {"scan001"}, "the one before, once more"
+    received = peer.until(FREE)
+    assert "INTERRUPTED" in states(received)
+    assert {Path(scan.filename).name[:7] for scan in scans(received)} == {"scan001"}, "the one before, once more"
 
 
 def test_slow_lines_of_gxsms_simulator_are_scanned_to_their_end(bench: Make) -> None:
@@ -342,7 +345,7 @@ def test_slow_lines_of_gxsms_simulator_are_scanned_to_their_end(bench: Make) -> 
     assert last.line_s > 0.2
 
 
-def test_a_scan_is_saved_when_gxsm_is_done_with_it(bench: Make) -> None:
+def test_scan_is_saved_after_gxsms_own_work(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = small(made)
     for name in scanned(peer):
@@ -350,7 +353,7 @@ def test_a_scan_is_saved_when_gxsm_is_done_with_it(bench: Make) -> None:
 
 
 def test_a_folder_chosen_at_the_panel_between_two_scans_is_found(bench: Make, tmp_path: Path) -> None:
-    """Until it scans GXSM tells of the folder before."""
+    # GXSM reports the previous folder until it scans.
     made = bench(speed=20.0)
     peer = small(made)
     assert scanned(peer)
@@ -365,7 +368,7 @@ def test_a_folder_chosen_at_the_panel_between_two_scans_is_found(bench: Make, tm
     ("kind", "version", "saving"),
     [("file-late", 3, "afspm"), ("half-file", 3, "gxsm"), ("file-late", 4, "gxsm"), ("half-file", 4, "afspm")],
 )
-def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, version: int, saving: str) -> None:
+def test_slow_files_are_awaited(bench: Make, kind: str, version: int, saving: str) -> None:
     made = bench(speed=20.0, version=version)
     peer = small(made, saving=saving)
     expected = scanned(peer)
@@ -374,29 +377,29 @@ def test_files_that_take_their_time_are_waited_for(bench: Make, kind: str, versi
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file", "file-missing"])
-def test_a_channel_that_does_not_come_is_named_and_the_others_are_published(bench: Make, kind: str) -> None:
+def test_missing_channel_is_named_and_the_others_published(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=20.0)
     made.strike(kind, duration_s=1e6)
     found = scanned(peer)  # the last channel is written first
     assert found == ["scan001-M-Xp-ZSmTopo.nc", "scan001-Xm-ZSmTopo.nc", "scan001-Xp-ImTunnel.nc"]
-    made.until_said("GXSM did not save Xp-Phase.nc")
+    made.until_logged("GXSM did not save Xp-Phase.nc")
     assert len(scanned(peer)) == 4, "it is not given up for ever"
 
 
-def test_a_scan_none_of_whose_files_comes_is_broken_off(bench: Make) -> None:
+def test_scan_without_files_is_interrupted(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=20.0)
     made.strike("file-missing", count=4)
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("no new file in")
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "INTERRUPTED", "FREE"]
+    made.until_logged("no new file in")
     assert scanned(peer)
 
 
-def test_a_gxsm_that_names_its_channels_only_once_it_scans(bench: Make) -> None:
-    """Files of before are in its folder, too, and not taken for the new ones."""
+def test_channels_named_only_during_a_scan_are_found(bench: Make) -> None:
+    # Old files in the folder are not taken for the new ones.
     made = bench(speed=20.0)
     peer = small(made)
     assert scanned(peer)
@@ -413,39 +416,39 @@ def _named_late(program: GxsmProgram) -> Callable[[float], list[Path]]:
     return late
 
 
-def test_a_folder_that_can_not_be_seen_from_here_is_named(bench: Make, tmp_path: Path) -> None:
+def test_unreachable_folder_is_named(bench: Make, tmp_path: Path) -> None:
     made = bench(speed=20.0)
     peer = small(made, scan_dir=str(tmp_path / "not there"), result_timeout_s=20.0)
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(FREE)) == ["SCANNING", "INTERRUPTED", "FREE"]
-    made.until_said("does not exist on this computer")
+    made.until_logged("does not exist on this computer")
 
 
-def test_a_scan_that_ended_while_gxsm_hung_is_not_lost(bench: Make) -> None:
+def test_scan_that_ended_while_gxsm_hung_is_published(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made, **SOON)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike("wedge", duration_s=160.0)
-    heard = peer.until(FREE)
-    assert "UNDEFINED" in states(heard)
-    assert scans(heard)
+    received = peer.until(FREE)
+    assert "UNDEFINED" in states(received)
+    assert scans(received)
 
 
 # --- spectra ---
 
 
-def test_a_spectrum_that_is_not_saved_is_told(bench: Make) -> None:
+def test_unsaved_spectrum_is_reported(bench: Make) -> None:
     made = bench(speed=20.0, probe_auto_save=False)
     peer = small(made, result_timeout_s=20.0)
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
-    made.until_said("switch on Auto Save of probes")
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "INTERRUPTED", "FREE"]
+    made.until_logged("switch on Auto Save of probes")
 
 
 @pytest.mark.parametrize("kind", ["file-late", "half-file"])
-def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) -> None:
+def test_slow_spectrum_is_awaited(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.strike(kind, duration_s=3.0)
@@ -453,8 +456,8 @@ def test_a_spectrum_that_takes_its_time_is_waited_for(bench: Make, kind: str) ->
     assert any(isinstance(one, Spectrum) for one in peer.until(FREE))
 
 
-def test_a_spectrum_whose_name_was_there_already_is_the_new_one(bench: Make) -> None:
-    """GXSM overwrites it."""
+def test_spectrum_with_an_existing_name_is_the_new_one(bench: Make) -> None:
+    # GXSM overwrites the file.
     made = bench(speed=20.0)
     (made.data / "scan001-VP001-VP.vpdata").write_text("of last year")
     peer = small(made)

@@ -1,4 +1,4 @@
-"""The files that the emulated GXSM writes against those that real ones wrote: alike, and read alike."""
+"""Files of the emulated GXSM, compared with real ones: same content, read the same way."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from afspm.plugins.gxsm.emulator import files
-from afspm.plugins.gxsm.emulator.channels import CHANNELS
 from afspm.plugins.gxsm.emulator.file_writer import FAULT_KINDS, GxsmFileWriter
+from afspm.plugins.gxsm.emulator.files import CHANNELS
 from afspm.simulation.faults import Faults
 from afspm.storage.formats import netcdf, read
 
@@ -47,7 +47,7 @@ def test_files_appear_after_the_end_one_by_one_the_last_first_and_in_parts(tmp_p
     assert seen == [{}, {"b": 100}, {"b": 200}, {"b": 200, "a": 50}, {"b": 200, "a": 100}]
 
 
-def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
+def test_next_number_is_the_first_free_one(tmp_path: Path) -> None:
     saving = GxsmFileWriter(tmp_path, Faults([], FAULT_KINDS, START_S))
     (tmp_path / "scan001-Xp-a.nc").touch()
     number = saving.next_number()
@@ -58,7 +58,7 @@ def test_the_next_number_is_the_first_that_no_file_has(tmp_path: Path) -> None:
 
 
 def written(folder: Path, version: int, label: str, real: Path) -> Path:
-    """The same scan as in a real file, written by the emulator."""
+    """Write the scan of a real file with the emulator."""
     content = read(real)
     (scan,) = content.scans
     channel = next(one for one in CHANNELS[version] if one.label == label and one.direction == "Xp")
@@ -93,7 +93,7 @@ def written(folder: Path, version: int, label: str, real: Path) -> Path:
     ],
 )
 def test_the_dash_in_the_name_of_a_channel_is_restored(tmp_path: Path, label: str, name: str, channel: str) -> None:
-    """Gxsm3 has the name in that of the file only, with an "m" for each dash."""
+    # Gxsm3 has a channel's name only in the file's name, with an "m" for each dash.
     path = tmp_path / f"scan001-{name}.nc"
     image, frame = np.ones((3, 4), np.float32), (0.0, 0.0, 100.0, 100.0, 0.0)
     saved = files.GxsmScanFile(
@@ -116,8 +116,8 @@ def test_a_scan_written_by_the_emulator_reads_as_the_real_one(tmp_path: Path, ve
 
 @needs_data
 @pytest.mark.parametrize(("version", "label"), BOTH)
-def test_what_is_in_a_file_is_in_the_real_one_too(tmp_path: Path, version: int, label: str) -> None:
-    """Every variable, with the same type, dimensions and order of its values."""
+def test_file_has_the_variables_of_a_real_one(tmp_path: Path, version: int, label: str) -> None:
+    # Every variable, with the same type, dimensions and byte order.
     real = DATA / REAL[version][label]
     ours = written(tmp_path, version, label, real)
     if version == 3:

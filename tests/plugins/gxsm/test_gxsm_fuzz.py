@@ -1,4 +1,4 @@
-"""Random calls do not end the emulated GXSM, nor leave it unfit, nor write outside its folder."""
+"""Random calls neither end the emulated GXSM, nor spoil it, nor write outside its folder."""
 
 from __future__ import annotations
 

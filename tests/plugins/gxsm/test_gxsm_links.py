@@ -1,4 +1,4 @@
-"""Both ways to GXSM, when the other end says anything at all, or nothing."""
+"""Both links to GXSM, with arbitrary or no answers."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_arrays_are_read_alone_and_in_a_tuple(protocol: int, array: np.ndarray) 
 
 
 def test_arrays_of_the_numpy_that_gxsm_has_are_read() -> None:
-    """numpy 1 calls its modules otherwise; the lengths of the names are in the bytes."""
+    # numpy 1 has other module names; their lengths are in the bytes.
     newer = pickle.dumps(np.arange(3.0), 4)
     name = b"numpy._core.multiarray"
     assert name in newer
@@ -102,14 +102,14 @@ class _Evil:
         b"\x80\x04(\x8c\x05numpy\x8c\x05dtype\x93)R.",
     ],
 )
-def test_what_is_no_value_is_refused_and_not_run(content: bytes, tmp_path: Path, monkeypatch: Any) -> None:
+def test_pickle_of_no_value_is_refused_and_not_executed(content: bytes, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(BadReply):
         pickles.loads(content)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_list_that_holds_itself_many_times_over_ends() -> None:
+def test_self_containing_list_is_refused() -> None:
     ten_of = (b"(" + (b"h" + bytes([i])) * 10 + b"t\x94" for i in range(30))
     laughs = b"\x80\x04]\x94" + b"".join(ten_of)
     with pytest.raises(BadReply):
@@ -144,7 +144,7 @@ def test_damaged_pickles_are_a_value_or_refused(content: bytes, at: int, damage:
 
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[BridgeLink]:
-    """A link to a bridge that answers each call with the next of these bytes, and then hangs up (or not)."""
+    """Open a link to a bridge that answers each call with the next of some bytes, and may then disconnect."""
     secret = Path("~/secret").expanduser()
     secret.write_text("s" * 64)
     secret.chmod(0o600)
@@ -196,7 +196,7 @@ def test_an_error_in_gxsm_leaves_the_connection_as_it_is() -> None:
         b"[" * 100_000 + b"\n",
     ],
 )
-def test_what_is_no_answer_ends_the_link(reply: bytes) -> None:
+def test_malformed_answer_ends_the_link(reply: bytes) -> None:
     with talking(reply, b'{"value": 1}\n') as link:
         with pytest.raises(BadReply):
             link.call("y_current")
@@ -227,7 +227,7 @@ def test_a_missing_secret_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions as Unix has them")
-def test_a_secret_that_others_can_read_is_none(tmp_path: Path) -> None:
+def test_readable_secret_is_refused(tmp_path: Path) -> None:
     secret = tmp_path / "secret"
     secret.write_text("x" * 64)
     secret.chmod(0o644)
@@ -237,7 +237,7 @@ def test_a_secret_that_others_can_read_is_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part", [0, 1, 5, 11])
 @pytest.mark.parametrize("silent", [False, True])
-def test_an_answer_that_stops_is_noticed_in_time(part: int, silent: bool) -> None:
+def test_truncated_answer_is_noticed_in_time(part: int, silent: bool) -> None:
     with (
         talking(b'{"value": 1}\n'[:part], silent=silent) as link,
         pytest.raises(ControllerLost, match="no answer to get within" if silent else "closed after"),
@@ -247,7 +247,7 @@ def test_an_answer_that_stops_is_noticed_in_time(part: int, silent: bool) -> Non
 
 @given(st.binary(max_size=120), st.booleans())
 @settings(max_examples=60)
-def test_any_bytes_are_an_answer_or_an_error_with_a_name(content: bytes, as_value: bool) -> None:
+def test_any_bytes_are_an_answer_or_a_named_error(content: bytes, as_value: bool) -> None:
     reply = b'{"value": ' + content + b"}\n" if as_value else content + b"\n"
     with talking(reply) as link, suppress(ControllerLost, GxsmError):
         link.call("get", "RangeX")
@@ -255,7 +255,7 @@ def test_any_bytes_are_an_answer_or_an_error_with_a_name(content: bytes, as_valu
 
 @given(st.recursive(st.none() | st.booleans() | st.floats(allow_nan=False) | st.text(), st.lists, max_leaves=8))
 @settings(max_examples=40)
-def test_any_value_comes_through(value: Any) -> None:
+def test_any_value_survives_the_bridge(value: Any) -> None:
     with talking(json.dumps({"value": value}).encode() + b"\n") as link:
         assert link.call("get", "RangeX") == value
 
@@ -264,7 +264,7 @@ def test_any_value_comes_through(value: Any) -> None:
 
 
 @pytest.mark.parametrize("text", ["", "nonsense", "host:", ":65431", "127.0.0.1:port", "shm:a/b"])
-def test_what_is_no_address_is_a_wrong_setting(text: str) -> None:
+def test_malformed_address_is_a_config_error(text: str) -> None:
     with pytest.raises(ConfigError):
         Address.parse(text)
 
@@ -276,7 +276,7 @@ def test_addresses() -> None:
     assert Address.parse("shm:mine@other") == Address(block="mine", process="other")
 
 
-def test_nobody_there_is_said() -> None:
+def test_refused_connection_is_reported() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(ControllerLost, match=r"is bridge.py running in GXSM's console\?"):
@@ -284,14 +284,14 @@ def test_nobody_there_is_said() -> None:
 
 
 @on_linux
-def test_no_process_of_that_name_is_said() -> None:
+def test_unknown_process_is_reported() -> None:
     with pytest.raises(ControllerLost, match="no process is called 'no-such-gxsm'"):
         open_link(Address.parse("shm:nothing@no-such-gxsm"), 1.0, time.monotonic)
 
 
 @on_linux
 def test_a_process_that_the_signal_would_end_is_never_signalled() -> None:
-    """As a GXSM that was started with -s, or anything else of the same name."""
+    # A GXSM started with -s, or another program of the same name.
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         with pytest.raises(ControllerLost, match="does not serve its shared memory"):
             open_link(Address.parse(f"shm:nothing@{process.pid}"), 1.0, time.monotonic)
@@ -317,7 +317,7 @@ def block() -> Iterator[Path]:
 LISTENS = "import signal; signal.signal(signal.SIGUSR1, lambda *_: None); print(flush=True); input()"
 
 
-def test_a_memory_that_answers_nothing_is_given_up(block: Path) -> None:
+def test_silent_memory_is_given_up(block: Path) -> None:
     command = [sys.executable, "-c", LISTENS]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -339,8 +339,8 @@ def status(block: Path) -> int:
     return int.from_bytes(block.read_bytes()[100:108], "little", signed=True)
 
 
-def test_a_request_that_a_dead_gxsm_did_not_answer_is_taken_back(block: Path) -> None:
-    """The next one does not clear the memory, and every call would wait for the answer."""
+def test_request_left_to_an_ended_gxsm_is_withdrawn(block: Path) -> None:
+    # The next GXSM does not clear the memory: every call would wait for that answer.
     command = [sys.executable, "-c", LISTENS]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -358,7 +358,7 @@ def test_a_request_that_a_dead_gxsm_did_not_answer_is_taken_back(block: Path) ->
         file.write((1).to_bytes(8, "little"))
     with pytest.raises(ControllerLost, match="no process is called"):
         open_link(address, 0.2, time.monotonic)
-    assert status(block) == 0, "a request of somebody before"
+    assert status(block) == 0, "a request of an earlier caller"
 
 
 def test_a_gxsm_that_ends_during_a_call_is_noticed_at_once(block: Path) -> None:
@@ -372,7 +372,7 @@ def test_a_gxsm_that_ends_during_a_call_is_noticed_at_once(block: Path) -> None:
         assert status(block) == 0
 
 
-def test_a_memory_that_is_too_small_is_none(block: Path) -> None:
+def test_too_small_memory_is_refused(block: Path) -> None:
     block.write_bytes(bytes(1000))
     command = [sys.executable, "-c", LISTENS]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
@@ -394,7 +394,7 @@ def test_hardware_is_known_by_its_names() -> None:
     assert recognised({"RangeX", "sim-stm-bias"}, set()) is Hardware.SIMULATOR
 
 
-def test_bits_are_read_as_the_hardware_means_them() -> None:
+def test_status_bits_depend_on_the_hardware() -> None:
     free = Doing(True, scanning=False, probing=False, paused=False, moving=False, approaching=False)
     assert decoded(Hardware.SRANGER, [1.0, 6.9e-310]) == free
     assert decoded(Hardware.RPSPMC, [17.0]) == free, "16: a program has ended"
@@ -407,7 +407,7 @@ def test_bits_are_read_as_the_hardware_means_them() -> None:
 
 
 @pytest.mark.parametrize("slots", [[], [math.nan], [-1.0], [6.9e-310], [1.5], [math.inf], [1e300]])
-def test_memory_that_nobody_has_written_is_no_set_of_bits(slots: list[float]) -> None:
+def test_uninitialised_memory_is_no_set_of_bits(slots: list[float]) -> None:
     with pytest.raises(BadReply):
         decoded(Hardware.SRANGER, slots)
 

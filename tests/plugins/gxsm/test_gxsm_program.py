@@ -1,4 +1,4 @@
-"""The emulated GXSM as programs of others see it: all that the real one was seen to do."""
+"""The emulated GXSM as other programs see it, compared with observations of the real one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from threading import Event, Thread
+from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
-from tests.plugins.gxsm.gxsm_bench import Bench
+from tests.plugins.gxsm.gxsm_bench import Bench, until
 from tests.plugins.gxsm.raw_clients import MemoryClient, SocketClient, client
 from tests.plugins.vendor_bench import DEADLINE_S
 
@@ -44,15 +44,6 @@ def calling(made: Bench) -> Iterator[SocketClient | MemoryClient]:
         caller.close()
 
 
-def until(made: Bench, what: Callable[[], bool]) -> None:
-    """Until it is so; asked as often as a program of others would, which leaves the processor to the emulator."""
-    until_s = made.clock.monotonic_s() + DEADLINE_S
-    pace = Event()
-    while not what():
-        assert made.clock.monotonic_s() < until_s
-        pace.wait(0.005)
-
-
 def small(gxsm: SocketClient | MemoryClient) -> None:
     for ref, value in {"PointsX": "16", "PointsY": "8", "RangeX": "1000", "RangeY": "500"}.items():
         assert gxsm.call("set", ref, value) == 0
@@ -63,7 +54,7 @@ def bits(gxsm: SocketClient | MemoryClient) -> int:
 
 
 def not_converted(gxsm: SocketClient | MemoryClient, method: str, *arguments: Any) -> bool:
-    """Whether GXSM does not take these arguments: an error in its console, the value -1 through shared memory."""
+    """Return True if GXSM rejects arguments: an error in its console, -1 through shared memory."""
     if isinstance(gxsm, MemoryClient):
         return bool(gxsm.call(method, *arguments) == -1)
     with pytest.raises(RuntimeError, match="SystemError"):
@@ -108,12 +99,21 @@ def test_a_scan_from_first_to_last(bench: Make, kind: dict[str, Any]) -> None:
 def _readable(path: Path) -> bool:
     try:
         return bool(read(path).scans)
-    except Exception:
+    except Exception:  # an incomplete file can make its reader raise any error
         return False
 
 
+@pytest.mark.parametrize("fault", ["nan", "error", "wrong-type"])
+def test_faults_of_answers_spare_the_scripts_own_look(bench: Make, fault: str) -> None:
+    made = bench()
+    made.strike(fault)
+    found: list[object] = []
+    made.at_panel(lambda emulator: found.append(emulator._calls.answer("get", ("script-control",))))
+    assert found == [1.0], "the script would end"
+
+
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]) -> None:
+def test_set_never_reports_a_refusal(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(user_unit="nm", **kind)
     with calling(made) as gxsm:
         assert gxsm.call("set", "RangeX", "30.5") == 0
@@ -139,14 +139,14 @@ def test_what_is_set_is_never_refused_in_words(bench: Make, kind: dict[str, Any]
         assert gxsm.call("set", "nonsense", "1") == 0
         assert gxsm.call("gets", "nonsense") == "ERROR"
         assert not_converted(gxsm, "set", "RangeX", 12.5)
-        assert gxsm.call("moveto_scan_xy", 10.0, 0.0) == -1, "in ångström, whatever the unit: 15 from side to side"
+        assert gxsm.call("moveto_scan_xy", 10.0, 0.0) == -1, "in ångström in any unit: 15 from side to side"
         assert gxsm.call("moveto_scan_xy", 7.0, 0.0) == 0
         assert not_converted(gxsm, "moveto_scan_xy", "7", "0")
         assert not_converted(gxsm, "set")
 
 
-def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
-    """And in the first moments of a scan those of the scan before."""
+def test_reported_names_may_be_existing_files_until_saving(bench: Make) -> None:
+    # In the first moments of a scan, the names of the previous scan are reported.
     made = bench(speed=SEEN)
     for name in ("scan001-M-Xp-ZSmTopo.nc", "scan002-M-Xp-ZSmTopo.nc"):
         (made.data / name).write_bytes(b"of last year")
@@ -172,7 +172,7 @@ def test_names_are_those_of_old_files_until_it_has_saved(bench: Make) -> None:
         assert gxsm.call("chfname", 4) == "EE: invalid channel"
 
 
-def test_a_scan_that_is_stopped_is_saved_with_the_rows_of_the_one_before(bench: Make) -> None:
+def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> None:
     made = bench(speed=SEEN)
     with calling(made) as gxsm:
         small(gxsm)
@@ -221,7 +221,7 @@ def test_a_decimal_comma_cuts_numbers(bench: Make) -> None:
         assert gxsm.call("get", "RangeX") == 12.75
 
 
-def test_the_bits_of_the_redpitaya_mean_other_things(bench: Make) -> None:
+def test_status_bits_of_the_redpitaya_differ(bench: Make) -> None:
     made = bench(speed=SEEN, card="RPSPMC")
     with calling(made) as gxsm:
         small(gxsm)
@@ -284,13 +284,13 @@ def test_gxsms_own_simulator_has_its_own_names(bench: Make, version: int) -> Non
             assert gxsm.call("rtquery", code)[0] == 0.0 or abs(gxsm.call("rtquery", code)[0]) > 1e-300
 
 
-def test_what_action_returns_in_3_is_not_looked_at(bench: Make) -> None:
+def test_result_of_action_in_gxsm3_is_not_touched(bench: Make) -> None:
     with calling(bench(version=3)) as gxsm:
         assert gxsm.call("action", "CHECK-MainAutoSave") is None
         assert gxsm.call("action", "nonsense") is None
 
 
-def test_the_bridge_passes_on_what_it_was_made_for_and_nothing_else(bench: Make) -> None:
+def test_bridge_passes_on_allowed_methods_only(bench: Make) -> None:
     made = bench()
     with calling(made) as gxsm:
         for method in ("waitscan", "load", "__class__", "signal"):
@@ -311,7 +311,7 @@ PAGE = (
     [PAGE, b'["set", "RangeX", "12"]\n', b"0" * 64 + b'\n["set", "RangeX", "12"]\n', b'\n["set", "RangeX", "12"]\n'],
     ids=["a page", "no secret", "another", "nothing"],
 )
-def test_the_bridge_does_nothing_for_who_does_not_know_the_secret(bench: Make, sent: bytes) -> None:
+def test_bridge_refuses_clients_without_the_secret(bench: Make, sent: bytes) -> None:
     made = bench()
     host, _, port = made.address.rpartition(":")
     with socket.create_connection((host, int(port)), 10.0) as stranger:
@@ -324,7 +324,7 @@ def test_the_bridge_does_nothing_for_who_does_not_know_the_secret(bench: Make, s
 
 
 @pytest.mark.parametrize("line", [b"Host: x", b"{}", b"[]", b"[1]", b'["get", {}]', b"[" * 9000, b"\xff"])
-def test_the_bridge_hangs_up_at_the_first_line_that_is_no_call(bench: Make, line: bytes) -> None:
+def test_bridge_disconnects_at_the_first_malformed_line(bench: Make, line: bytes) -> None:
     made = bench()
     with calling(made) as gxsm:
         assert isinstance(gxsm, SocketClient)
@@ -334,7 +334,7 @@ def test_the_bridge_hangs_up_at_the_first_line_that_is_no_call(bench: Make, line
 
 
 @pytest.mark.skipif(os.name == "nt", reason="permissions as Unix has them")
-def test_nobody_else_can_read_the_secret(bench: Make) -> None:
+def test_other_users_can_not_read_the_secret(bench: Make) -> None:
     bench()
     file = Path("~/.afspm/gxsm-bridge-secret").expanduser()
     assert file.stat().st_mode & 0o777 == 0o600
@@ -351,7 +351,7 @@ def test_shared_memory_without_the_lock_mixes_answers_up(bench: Make) -> None:
     other.ask("gets", "RangeX")
     one.answer()
     until(made, lambda: one.status() != 1)
-    assert one.answer() == other.answer(), "who asked for what is not known any more"
+    assert one.answer() == other.answer(), "the caller of each request is unknown"
     one.close()
     other.close()
 
@@ -395,7 +395,7 @@ def test_a_spectrum_and_its_event(bench: Make) -> None:
         np.testing.assert_allclose(content.spectra[0].values[:, 0], true.values[:, 0], rtol=1e-9)
 
 
-def test_the_frequency_shift_is_that_of_the_picture_and_of_the_setpoint(bench: Make) -> None:
+def test_frequency_shift_matches_picture_and_setpoint(bench: Make) -> None:
     made = bench(speed=20.0, surface="steps", **NON_CONTACT)
 
     def told(code: str) -> float:
@@ -449,7 +449,7 @@ def test_arguments_that_c_does_not_convert_are_refused(bench: Make, kind: dict[s
         assert gxsm.call("get", "PointsX") == 64.0
 
 
-def test_a_scan_that_can_not_be_simulated_does_not_begin(bench: Make) -> None:
+def test_impossible_scan_does_not_start(bench: Make) -> None:
     made = bench(speed=SEEN)
     with calling(made) as gxsm:
         small(gxsm)
@@ -469,7 +469,7 @@ def test_files_are_counted_beyond_three_digits(tmp_path: Path) -> None:
 
 @contextmanager
 def answering(folder: Path, value: object) -> Iterator[tuple[SharedMemoryBlock, MemoryClient]]:
-    """Shared memory, every call of which is answered with a value, once it is taken."""
+    """Serve shared memory that answers every call with a value."""
     if not sys.platform.startswith("linux"):
         pytest.skip("Gxsm4's shared memory is there on Linux alone")
     name = f"afspm_test_{os.getpid()}_{id(value)}"

@@ -1,4 +1,4 @@
-"""Recordings of the real programs, played back to the driver in this process, with a clock that goes as theirs."""
+"""Recordings of the real programs, replayed to the driver in this process with their own clock."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ pytestmark = pytest.mark.skipif(not TRACES.is_dir(), reason="the recordings of t
 
 
 class RecordedGxsm:
-    """A link to a GXSM that answers each question as the real one did: at this time, or next.
+    """A link that answers each call as the recorded GXSM did at this time, or next.
 
-    Answers that the recording lacks are functions of the time (`made_up`).
+    Answers missing in the recording are functions of time (`made_up`).
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class RecordedGxsm:
         return value_of(answers[index][1])
 
     def _scan_at(self, at_s: float) -> int:
-        """Count the scans that have begun: an answer belongs to the last of them."""
+        # An answer belongs to the last started scan.
         return bisect.bisect(self._begins_s, at_s)
 
     def working_folder(self) -> Path:
@@ -83,7 +83,7 @@ class RecordedGxsm:
 
 
 def played(trace: str, folder: Path, **made_up: Callable[[float], Any]) -> tuple[Gxsm, RecordedGxsm, FakeClock]:
-    """A driver that has connected to a recorded GXSM."""
+    """Connect a driver to a recorded GXSM."""
     clock = FakeClock(BEGAN_S)
     link = RecordedGxsm(read_trace(TRACES / f"{trace}.trace.jsonl"), clock, folder, made_up)
     driver = Gxsm()
@@ -96,7 +96,7 @@ def played(trace: str, folder: Path, **made_up: Callable[[float], Any]) -> tuple
 def looked_at(
     driver: Gxsm, link: RecordedGxsm, clock: FakeClock, until_s: float
 ) -> tuple[list[ScopeState], list[Scan]]:
-    """The states that follow from what the driver reports, look by look, and the scans."""
+    """Return the driver's states, poll by poll, and the scans."""
     states: list[ScopeState] = []
     scans: list[Scan] = []
     known: set[str] = set()
@@ -117,7 +117,7 @@ def looked_at(
 
 _CALL = re.compile(r"(\w+)\((.*)\)")
 OTHERWISE = (
-    "gets('',)", "gets('R',)",  # the first name is that of another entry
+    "gets('',)", "gets('R',)",  # the first name belongs to another entry
     "get('RangeX',) after abc",  # a step of its converter, which is another one
     "y_current()",  # of a session with scans before
     "list_",  # those of its hardware
@@ -130,7 +130,7 @@ OTHERWISE = (
 def test_the_emulated_gxsm_answers_as_the_real_one(
     bench: Callable[..., Bench], file: str, kind: dict[str, Any]
 ) -> None:
-    """Up to the first scan: values, refusals, and what stands for a value that there is not."""
+    # Up to the first scan: values, refusals, and placeholders for missing values.
     gxsm = client(bench(card="simulator", reach_m=2e-7, **kind).address)
     for ref, value in (("RangeX", "400"), ("RangeY", "200"), ("PointsX", "16"), ("PointsY", "8")):
         gxsm.call("set", ref, value)
@@ -152,14 +152,14 @@ def test_the_emulated_gxsm_answers_as_the_real_one(
 
 
 def _compared(value: Any) -> Any:
-    """Of errors not the text, and of numbers that were never written only that."""
+    # The texts of errors and uninitialised numbers may differ.
     if isinstance(value, str) and value.startswith("!"):
         return "!"
     return [0.0 if abs(one) < 1e-300 else one for one in value] if isinstance(value, list | tuple) else value
 
 
 def test_a_scan_stopped_while_the_panel_repeats_is_not_published(tmp_path: Path) -> None:
-    """In the recording it is stopped at row 28 of 60; the one before is lost, as Auto Save was off."""
+    # In the recording it is stopped at row 28 of 60; the scan before it is lost, as Auto Save was off.
     driver, link, clock = played("gxsm4-shm-repeat-at-panel-stopped", tmp_path)
     states, scans = looked_at(driver, link, clock, 13.0)
     assert not scans
@@ -173,11 +173,11 @@ def test_a_scan_stopped_while_the_panel_repeats_is_not_published(tmp_path: Path)
         ScopeState.FREE,
     ]
     assert ("autosave",) not in link.called
-    assert ("action", "CHECK-MainAutoSave") in link.called, "GXSM saves what is begun at its panel"
+    assert ("action", "CHECK-MainAutoSave") in link.called, "GXSM saves measurements from its panel"
 
 
 def test_repeated_scans_are_separated_by_their_lines_alone(tmp_path: Path) -> None:
-    """As where no look falls between two scans, and the name stays the same."""
+    # The worst case: no poll falls between two scans, and the file name stays the same.
     scan_s = 0.66
 
     def line(at_s: float) -> int:

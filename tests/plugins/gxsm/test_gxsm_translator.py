@@ -1,4 +1,4 @@
-"""The GXSM translator against the emulated program: everything that a peer may ask for, as it sees it."""
+"""The GXSM translator with the emulated program: every request of a peer, and its effects."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ KIND_IDS = ["gxsm3", "gxsm4", "gxsm4-shm", "rpspmc-nm"]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dict[str, Any]) -> None:
+def test_scan_has_exactly_the_frame_that_was_set(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(**kind)
     peer = made.start()
     ready(peer)
@@ -62,8 +62,9 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make, kind: dic
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, kind: dict[str, Any]) -> None:
-    """Against the heights of the simulated sample at each pixel: half a frame off, or a mirrored axis, would show."""
+def test_rows_and_columns_match_the_sample(bench: Make, kind: dict[str, Any]) -> None:
+    # Compared with the heights of the simulated sample at each pixel: an offset by half a frame or a mirrored axis
+    # shows.
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT, **kind)
     peer = made.start()
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -86,21 +87,21 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, kind: dict[
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=KIND_IDS)
-def test_a_scan_that_is_stopped_gives_none(bench: Make, kind: dict[str, Any]) -> None:
+def test_stopped_scan_is_not_published(bench: Make, kind: dict[str, Any]) -> None:
     made = bench(speed=20.0, **kind)
     peer = made.start()
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
     assert states(peer.until(ScopeState.SCANNING)) == ["SCANNING"]
     assert peer.act(names.STOP_SCAN).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
     assert peer.act(names.STOP_SCAN).ok, "nothing to stop is no error"
 
 
-def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
-    """GXSM begins at 001 with each start: it names what is there already, and then counts each channel by itself."""
+def test_existing_file_numbers_are_skipped(bench: Make) -> None:
+    # GXSM starts with 001: it reports names of existing files, then counts each channel by itself.
     made = bench()
     (made.data / "scan001-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
     (made.data / "scan002-M-Xp-ZSmTopo.nc").write_bytes(b"of last year")
@@ -113,14 +114,14 @@ def test_numbers_that_are_taken_already_are_no_trap(bench: Make) -> None:
     assert found["I-Tunnel"].filename.endswith("scan001-Xp-ImTunnel.nc")
 
 
-def test_a_scan_that_is_saved_twice_is_published_once(bench: Make) -> None:
+def test_scan_saved_twice_is_published_once(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
     made.at_panel(lambda emulator: setattr(emulator.program, "auto_save", True))
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert len({scan.channel for scan in scans(heard)}) == len(scans(heard)) == 4
+    received = peer.until(FREE)
+    assert len({scan.channel for scan in scans(received)}) == len(scans(received)) == 4
     assert len(scanned(peer)) == 4
 
 
@@ -137,18 +138,20 @@ def test_gxsm_may_be_left_to_save_by_itself(bench: Make) -> None:
 @pytest.mark.parametrize(
     ("version", "live_lines_s", "speed", "rows"), [(3, 1.0, 5.0, 40), (4, 1.0, 5.0, 40), (4, 0.05, 1.0, 8)]
 )
-def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: float, speed: float, rows: int) -> None:
-    """Of the second scan on: only files tell what channels are called. Before its first line is in, GXSM tells of the
-    scan before."""
+def test_lines_are_published_during_a_scan(
+    bench: Make, version: int, live_lines_s: float, speed: float, rows: int
+) -> None:
+    # From the second scan on, since only files have the names of channels. GXSM reports the previous scan before the
+    # first line.
     made = bench(speed=speed, version=version)
     peer = made.start(live_lines_s=live_lines_s)
     ready(peer, shape=(rows, 32))
     assert peer.act(names.START_SCAN).ok
     assert not any(isinstance(one, ScanLines) for one in peer.until(FREE))
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    for whole in scans(heard):
-        lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == whole.channel]
+    received = peer.until(FREE)
+    for whole in scans(received):
+        lines = [one for one in received if isinstance(one, ScanLines) and one.channel == whole.channel]
         assert len(lines) >= 2
         assert lines[0].first_row + len(lines[0].values) == rows, "the highest first"
         picture = None
@@ -165,7 +168,7 @@ def test_lines_come_while_it_scans(bench: Make, version: int, live_lines_s: floa
 
 
 @pytest.mark.parametrize("user_unit", ["Å", "nm", "µm"])
-def test_lengths_are_right_whatever_unit_the_panel_has(bench: Make, user_unit: str) -> None:
+def test_lengths_are_right_in_any_panel_unit(bench: Make, user_unit: str) -> None:
     made = bench(user_unit=user_unit)
     peer = made.start()
     ready(peer)
@@ -176,8 +179,8 @@ def test_lengths_are_right_whatever_unit_the_panel_has(bench: Make, user_unit: s
     assert made.emulator.rig.probe_m == pytest.approx((50e-9, -20e-9), rel=1e-9)
 
 
-def test_the_size_in_x_alone_leaves_that_in_y_as_it_is(bench: Make) -> None:
-    """Setting RangeX, GXSM changes RangeY, too."""
+def test_setting_the_size_in_x_keeps_the_size_in_y(bench: Make) -> None:
+    # GXSM changes RangeY with RangeX.
     made = bench()
     peer = made.start()
     ready(peer)
@@ -188,7 +191,7 @@ def test_the_size_in_x_alone_leaves_that_in_y_as_it_is(bench: Make) -> None:
     assert float(peer.get(names.SCAN_TOP_LEFT_X)) == pytest.approx(TURNED.top_left_m[0], abs=1e-15)
 
 
-def test_what_is_set_is_told_to_the_last_digit(bench: Make) -> None:
+def test_settings_are_reported_to_the_last_digit(bench: Make) -> None:
     peer = bench(user_unit="nm").start()
     ready(peer)
     for name, value in {
@@ -215,8 +218,12 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     peer = made.start()
     ready(peer)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(proportional_gain=0.25, setpoint=0.5e-9)).ok
-    heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (True, 0.25, pytest.approx(0.5e-9))
+    received = peer.until(lambda one: isinstance(one, Feedback))
+    assert (received[-1].on, received[-1].proportional_gain, received[-1].setpoint) == (
+        True,
+        0.25,
+        pytest.approx(0.5e-9),
+    )
     assert made.emulator.rig.setup.feedback.proportional_gain == 0.25
     assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "as it was"
     assert peer.get("x-feedback-on") == "true"
@@ -224,7 +231,7 @@ def test_feedback_is_set_and_its_switch_can_only_be_read(bench: Make) -> None:
     assert response.code == ControlResponse.PARAM_ERROR
     assert "is read-only" in response.reason
     # peers send back the whole message that was published, with one part changed
-    again = replace(heard[-1], proportional_gain=0.5)
+    again = replace(received[-1], proportional_gain=0.5)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, again).ok
     assert made.emulator.rig.setup.feedback.proportional_gain == 0.5
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, replace(again, on=False)).code == ControlResponse.PARAM_ERROR
@@ -236,8 +243,8 @@ def test_the_feedback_is_switched_where_gxsm_has_actions_for_it(bench: Make) -> 
     peer = made.start(feedback_actions=["FB-ON", "FB-OFF"])
     ready(peer)
     assert peer.set("x-feedback-on", False).ok
-    heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert heard[-1].on is False
+    received = peer.until(lambda one: isinstance(one, Feedback))
+    assert received[-1].on is False
     assert made.emulator.rig.setup.feedback.on is False
     assert peer.set("x-feedback-on", True).ok
     assert made.emulator.rig.setup.feedback.on
@@ -250,9 +257,7 @@ def test_the_feedback_is_not_switched_by_actions_that_this_gxsm_lacks(bench: Mak
 
 
 @pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}, {"card": "simulator"}], ids=["sranger", "rpspmc", "sim"])
-def test_a_pulse_is_a_bias_that_is_put_back(
-    bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pulse_restores_the_bias(bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench(speed=1.0, **settings)
     peer = made.start()
     ready(peer)
@@ -271,7 +276,7 @@ def test_a_pulse_is_a_bias_that_is_put_back(
     assert peer.set(names.PULSE_VOLTAGE, 11).code == ControlResponse.PARAM_ERROR
 
 
-def test_a_pulse_of_a_translator_that_was_killed_is_ended_by_the_next(bench: Make) -> None:
+def test_pulse_of_a_killed_translator_is_ended_by_the_next(bench: Make) -> None:
     made = bench(speed=1.0)
     peer = made.start()
     ready(peer)
@@ -283,7 +288,7 @@ def test_a_pulse_of_a_translator_that_was_killed_is_ended_by_the_next(bench: Mak
     assert made.emulator.rig.setup.bias_v == 0.1
 
 
-def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_is_defined_in_the_experiment_file(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench(speed=5.0)
     peer = made.start(
         parameters={
@@ -302,8 +307,8 @@ def test_a_crash_is_what_the_experiment_file_says(bench: Make, monkeypatch: pyte
     assert crashes == [pytest.approx((2e-9, 50e-9))]
 
 
-def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
-    """GXSM answers -inf, or worse, for parameters that it does not have: it is not asked for them."""
+def test_missing_hardware_features_are_not_supported(bench: Make) -> None:
+    # GXSM answers -inf, or worse, for unknown parameters: they are not requested.
     made = bench(card="simulator")
     peer = made.start()
     peer.until(FREE)
@@ -313,7 +318,7 @@ def test_what_this_hardware_lacks_is_not_supported(bench: Make) -> None:
     assert peer.set(names.TIP_BIAS_VOLTAGE, 0.5).ok
     assert peer.set("x-pixel-rate", 4000).ok
     assert peer.act(names.START_SPEC).code == ControlResponse.ACTION_NOT_SUPPORTED
-    made.until_said("unsupported: move-speed, sample-slope-x")
+    made.until_logged("unsupported: move-speed, sample-slope-x")
     assert peer.get("x-controller") == "GXSM (simulator)"
 
 
@@ -371,7 +376,7 @@ def test_other_parameters_and_actions_of_the_experiment_file(bench: Make) -> Non
 # --- the probe, and spectra ---
 
 
-def test_the_probe_is_sent_into_the_frame_and_nowhere_else(bench: Make) -> None:
+def test_probe_moves_only_within_the_frame(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -393,8 +398,8 @@ def test_the_probe_is_sent_into_the_frame_and_nowhere_else(bench: Make) -> None:
         ("VP", "Bias-mon", {"card": "RPSPMC"}),
     ],
 )
-def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first: str, settings: dict[str, Any]) -> None:
-    """A scan in between moves the tip: it is sent back first."""
+def test_spectrum_has_its_position(bench: Make, kind: str, first: str, settings: dict[str, Any]) -> None:
+    # A scan in between moves the tip: it is sent back first.
     made = bench(speed=20.0, **settings)
     peer = made.start()
     ready(peer)
@@ -402,9 +407,9 @@ def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first:
     scanned(peer)
     assert peer.set(names.SPEC_KIND, kind).ok
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (spectrum,) = (one for one in heard if isinstance(one, Spectrum))
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (spectrum,) = (one for one in received if isinstance(one, Spectrum))
     assert spectrum.position_m == (52.3456789e-9, -20e-9)
     assert spectrum.kind == kind
     assert spectrum.names[0] == first
@@ -456,25 +461,25 @@ def test_a_spectrum_is_stopped_where_the_hardware_can(bench: Make, settings: dic
         assert "RPSPMC" in response.reason
         return
     assert response.ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
-def test_a_spectrum_is_stopped_while_the_tip_is_on_its_way_to_it(bench: Make) -> None:
+def test_spectrum_can_be_stopped_during_the_move_to_it(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()
     ready(peer)
     assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
     assert peer.act(names.START_SPEC).ok
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "INTERRUPTED", "FREE"]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "INTERRUPTED", "FREE"]
     assert made.emulator.rig.spectrum is None
 
 
 @pytest.mark.parametrize("settings", [{}, {"card": "RPSPMC"}], ids=["sranger", "rpspmc"])
-def test_a_spectrum_is_not_taken_into_a_scan_that_somebody_began_meanwhile(
+def test_spectrum_is_not_taken_during_a_scan_from_the_panel(
     bench: Make, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = bench(speed=4.0, **settings)
@@ -486,11 +491,11 @@ def test_a_spectrum_is_not_taken_into_a_scan_that_somebody_began_meanwhile(
     assert peer.set(names.MOVE_SPEED, "50", "nm/s").ok
     assert peer.act(names.START_SPEC).ok
     made.at_panel(lambda emulator: emulator.program.start_scan())
-    heard = peer.until(ScopeState.SCANNING) + peer.until(FREE)
-    assert "INTERRUPTED" in states(heard)
-    assert {scan.region for scan in scans(heard)} == {TURNED}, "the scan is published"
+    received = peer.until(ScopeState.SCANNING) + peer.until(FREE)
+    assert "INTERRUPTED" in states(received)
+    assert {scan.region for scan in scans(received)} == {TURNED}, "the scan is published"
     assert began == []
-    made.until_said("another measurement began")
+    made.until_logged("another measurement began")
 
 
 def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
@@ -511,7 +516,7 @@ def test_the_approach_is_a_coarse_motor(bench: Make) -> None:
 def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_is_not(
     bench: Make, kind: dict[str, Any], saving: str
 ) -> None:
-    """GXSM never stops scanning: the next one runs already."""
+    # GXSM never stops scanning: the next scan runs already.
     made = bench(speed=10.0, **kind)
     peer = made.start(saving=saving)
     ready(peer, shape=(24, 32))
@@ -523,29 +528,29 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
     made.at_panel(begin)
     found: list[str] = []
     for number in (1, 2, 3):
-        heard = peer.until(FREE)
-        assert states(heard) == ["SCANNING", "FREE"]
-        assert {Path(scan.filename).name[4:7] for scan in scans(heard)} == {f"00{number}"}
-        found += [scan.channel for scan in scans(heard)]
+        received = peer.until(FREE)
+        assert states(received) == ["SCANNING", "FREE"]
+        assert {Path(scan.filename).name[4:7] for scan in scans(received)} == {f"00{number}"}
+        found += [scan.channel for scan in scans(received)]
     assert len(found) == 3 * len(set(found)), "each channel of each scan, once"
     peer.until(ScopeState.SCANNING)
     until_line(made, 8)
     made.strike("panel-stop")
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
 
 
 def until_line(made: Bench, line: int) -> None:
-    """Until so many lines of the running scan are complete."""
+    """Wait until some lines of the running scan are complete."""
     last, pace = made.emulator.program.scan.activity, Event()
     assert last is not None
     while last.lines_done(made.clock.now_s()) < line:
         pace.wait(0.005)
 
 
-def test_a_scan_that_a_person_begins_again_at_once_is_published_as_two(bench: Make) -> None:
-    """Stopped, and begun again before the translator has looked: the first is broken off, the second is whole."""
+def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
+    # Stopped and restarted between two polls: the first scan is interrupted, the second complete.
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(24, 32))
@@ -564,20 +569,20 @@ def test_a_scan_that_a_person_begins_again_at_once_is_published_as_two(bench: Ma
         program.scan.shows_s = 0.0
 
     made.at_panel(again)
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not scans(heard)
-    heard = peer.until(FREE)
-    assert states(heard) == ["SCANNING", "FREE"]
-    assert len(scans(heard)) == 4
-    made.until_said("its last row still holds the previous scan", "whether this one came to its end is unknown")
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not scans(received)
+    received = peer.until(FREE)
+    assert states(received) == ["SCANNING", "FREE"]
+    assert len(scans(received)) == 4
+    made.until_logged("its last row still holds the previous scan", "whether this one came to its end is unknown")
 
 
 def test_autosave_is_off_only_while_a_scan_of_the_translator_runs(bench: Make) -> None:
     made = bench(speed=10.0, auto_save=False)
     peer = made.start()
     ready(peer, shape=(24, 32))
-    assert made.emulator.program.panel.auto_save, "GXSM saves what is begun at its panel"
+    assert made.emulator.program.panel.auto_save, "GXSM saves measurements from its panel"
     assert peer.act(names.START_SCAN).ok
     assert not made.emulator.program.panel.auto_save, "one that is stopped is not to be saved"
     assert peer.act(names.STOP_SCAN).ok
@@ -597,8 +602,8 @@ def test_a_scan_ends_though_repeat_is_on_at_the_panel(bench: Make) -> None:
     assert len(scanned(peer)) == 4
 
 
-def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Make) -> None:
-    """An hour back is more than a scan lasts: each of them seems to have begun before the one before it."""
+def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
+    # An hour back is more than a scan: each scan seems to have started before its predecessor.
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
@@ -607,8 +612,8 @@ def test_the_clock_of_its_computer_may_be_another_and_be_set_meanwhile(bench: Ma
         assert len(scanned(peer)) == 4
 
 
-def test_a_scan_that_begins_sooner_after_it_was_asked_for_than_the_one_before_is_new(bench: Make) -> None:
-    """At a hundred times the speed a busy computer takes half a minute to begin one."""
+def test_scan_with_a_shorter_start_delay_counts_as_new(bench: Make) -> None:
+    # At a hundred times the speed, a busy computer takes half a minute to start one.
     made = bench()
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -622,19 +627,19 @@ def test_a_scan_that_begins_sooner_after_it_was_asked_for_than_the_one_before_is
     assert len(scanned(peer)) == 4
 
 
-def test_what_a_redpitaya_measures_at_its_panel_does_not_publish_the_scan_before_again(bench: Make) -> None:
-    """It does not tell a spectrum from a scan, and what is in its memory is saved again when it is over."""
+def test_redpitaya_measurement_at_the_panel_does_not_republish_the_previous_scan(bench: Make) -> None:
+    # RPSPMC does not distinguish spectra from scans, and GXSM saves its memory again after a spectrum.
     made = bench(speed=5.0, card="RPSPMC")
     peer = made.start()
     ready(peer)
     assert len(scanned(peer)) == 4
     made.at_panel(lambda emulator: emulator.program.take_curve("IV"))
-    heard = peer.until(FREE)
-    assert states(heard)[0] == "SCANNING", "it is taken for one"
-    assert not scans(heard)
+    received = peer.until(FREE)
+    assert states(received)[0] == "SCANNING", "it is taken for one"
+    assert not scans(received)
 
 
-def test_busy_is_said(bench: Make) -> None:
+def test_busy_microscope_is_reported(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -647,7 +652,7 @@ def test_busy_is_said(bench: Make) -> None:
 # --- over a restart ---
 
 
-def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(bench: Make) -> None:
+def test_scan_ended_without_a_translator_is_published_by_the_next(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -658,17 +663,17 @@ def test_a_scan_that_ends_while_the_translator_is_down_is_published_by_the_next(
     while made.emulator.rig.busy(made.clock.now_s()) and made.clock.now_s() < until_s:
         pass
     peer = made.start()
-    heard = peer.until(FREE)
-    assert {scan.region for scan in scans(heard)} == {TURNED}
+    received = peer.until(FREE)
+    assert {scan.region for scan in scans(received)} == {TURNED}
     assert len(list(made.data.glob("*.nc"))) == 4
 
 
-@pytest.mark.parametrize(("version", "told"), [(3, "gxsm3 3.54.0"), (4, "gxsm4 4.4.1")])
-def test_its_version_is_told_once_there_is_a_file_of_it(bench: Make, version: int, told: str) -> None:
+@pytest.mark.parametrize(("version", "shown"), [(3, "gxsm3 3.54.0"), (4, "gxsm4 4.4.1")])
+def test_version_is_reported_after_the_first_file(bench: Make, version: int, shown: str) -> None:
     made = bench(version=version)
     peer = made.start()
     ready(peer)
     hardware = peer.get(names.CONTROLLER).removeprefix("GXSM ")
     assert hardware.startswith("(")
     scanned(peer)
-    assert peer.get(names.CONTROLLER) == f"{told} {hardware}"
+    assert peer.get(names.CONTROLLER) == f"{shown} {hardware}"

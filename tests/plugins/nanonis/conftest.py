@@ -1,4 +1,4 @@
-"""Fixtures for the tests of Nanonis."""
+"""Fixtures for tests of Nanonis."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Nanonis translator as a real process, an emulated controller beside it, and a peer on its sockets."""
+"""Bench: the Nanonis translator as a process, an emulated controller, and a peer on the translator's sockets."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from afspm.plugins.nanonis.emulator import NanonisEmulator, PendingReply
 
 
 class Emulated(AtPanel, NanonisEmulator):
-    """With somebody at its panel, who sees when a scan has ended.
+    """An emulated controller with a person at its panel, who can see the end of a scan.
 
     Attributes:
-        ends_as_awaited: a scan is over as soon as a client waits for that, and so never between two of its questions.
+        ends_as_awaited: True ends a scan once a client waits for the end, never between two waits.
     """
 
     def __init__(self, **settings: Any) -> None:
@@ -33,7 +33,6 @@ class Emulated(AtPanel, NanonisEmulator):
         return next_s
 
     def _waits_for(self, function: str) -> bool:
-        """Whether a client does."""
         waiting = [connection.waits_for for connection in self._server.connections]
         return any(isinstance(one, PendingReply) and one.name == function for one in waiting)
 

@@ -1,4 +1,4 @@
-"""The files of the emulated controller, beside what real ones look like."""
+"""Files of the emulated controller, compared with the format of real ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calls that nobody means well by; `make soak` makes more of them."""
+"""Malicious requests; `make soak` makes more of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from benchmarks.fuzz.nanonis import NanonisFuzzer
 from afspm.plugins.nanonis.emulator import NanonisEmulator
 
 
-def test_nothing_that_a_client_sends_ends_the_emulator_or_is_written_elsewhere(tmp_path: Path) -> None:
+def test_random_requests_neither_end_the_emulator_nor_write_elsewhere(tmp_path: Path) -> None:
     outcome = fuzz(NanonisFuzzer, NanonisEmulator(port=0), tmp_path, 2000, seed=7)
     assert outcome.answered > 500
     assert outcome.refused > 500

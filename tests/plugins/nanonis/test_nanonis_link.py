@@ -1,4 +1,4 @@
-"""One connection to a controller that says anything at all, or nothing."""
+"""One connection to a controller with arbitrary or no answers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from tests.plugins.vendor_bench import answering
 
 from afspm.plugins.nanonis.emulator import wire
-from afspm.plugins.nanonis.link import Link
 from afspm.plugins.nanonis.protocol import NanonisError
+from afspm.plugins.nanonis.session import Link
 from afspm.translator.driver_base import ControllerLost
 
 GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
@@ -23,7 +23,7 @@ GOOD = wire.reply("Bias.Get", wire.body("Bias.Get", [0.5], 0))
 
 @contextmanager
 def talking(*replies: bytes, silent: bool = False) -> Iterator[Link]:
-    """A link to somebody who answers each request with the next of these bytes, and then hangs up (or not)."""
+    """Open a link to a server that answers each request with the next of some bytes, and may then disconnect."""
     with answering(*replies, silent=silent) as address:
         link = Link(address, 0.3 if silent else 10.0, time.monotonic)
         try:
@@ -46,8 +46,8 @@ def test_an_error_of_the_controller_leaves_the_connection_as_it_is() -> None:
         assert link.ask("Bias.Get") == (0.5,)
 
 
-def test_the_answer_to_another_question_is_never_taken_for_one() -> None:
-    """After it nothing on this connection is believed any more."""
+def test_answer_to_another_request_is_refused() -> None:
+    # After it the connection is not trusted any more.
     late = wire.reply("Current.Get", wire.body("Current.Get", [0.5], 0))
     with talking(late, GOOD) as link:
         with pytest.raises(ControllerLost, match=r"replied to 'Current.Get' instead of Bias.Get"):
@@ -58,7 +58,7 @@ def test_the_answer_to_another_question_is_never_taken_for_one() -> None:
 
 @pytest.mark.parametrize("part", [0, 20, 40, 42, len(GOOD) - 1])
 @pytest.mark.parametrize("silent", [False, True])
-def test_a_reply_that_stops_is_noticed_in_time(part: int, silent: bool) -> None:
+def test_truncated_reply_is_noticed_in_time(part: int, silent: bool) -> None:
     begun_s = time.perf_counter()
     with (
         talking(GOOD[:part], silent=silent) as link,
@@ -68,7 +68,7 @@ def test_a_reply_that_stops_is_noticed_in_time(part: int, silent: bool) -> None:
     assert time.perf_counter() - begun_s < 5.0
 
 
-def test_who_waits_is_woken_by_closing() -> None:
+def test_closing_wakes_a_waiting_thread() -> None:
     errors: list[Exception] = []
     with talking(b"", silent=True) as link:
 
@@ -87,7 +87,7 @@ def test_who_waits_is_woken_by_closing() -> None:
 
 @given(st.binary(max_size=120), st.booleans())
 @settings(max_examples=60)
-def test_any_bytes_are_an_answer_or_an_error_with_a_name(content: bytes, headed: bool) -> None:
+def test_any_bytes_are_an_answer_or_a_named_error(content: bytes, headed: bool) -> None:
     reply = b"Bias.Get".ljust(32, b"\0") + struct.pack(">i", len(content)) + bytes(4) + content if headed else content
     with talking(reply) as link, suppress(ControllerLost, NanonisError):
         assert isinstance(link.ask("Bias.Get")[0], float)

@@ -1,4 +1,4 @@
-"""The bytes of the protocol: against reference bytes, for every release, and against any bytes at all."""
+"""The bytes of the protocol: reference bytes, every release, and arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def references() -> list[Any]:
 
 
 @pytest.mark.parametrize(("name", "expected", "arguments"), references())
-def test_requests_are_those_of_the_vendors_own_client(name: str, expected: str, arguments: str) -> None:
+def test_requests_equal_those_from_the_vendors_client(name: str, expected: str, arguments: str) -> None:
     assert protocol.request(name, json.loads(arguments)).hex() == expected
 
 
@@ -89,13 +89,13 @@ def test_errors_are_read_with_results_and_without(text: str, bare: bool) -> None
     ("name", "written", "read"),
     [("Scan.PropsGet", 14573, 14429), ("Scan.PropsGet", 13742, 14573), ("Piezo.DriftCompGet", 10862, 11798)],
 )
-def test_a_reply_of_another_release_is_named(name: str, written: int, read: int) -> None:
+def test_reply_of_another_release_is_reported(name: str, written: int, read: int) -> None:
     sent = [EXAMPLES[code] for code, _ in protocol.functions()[name].results]
     with pytest.raises(BadReply, match=f"it was read as release {read}"):
         protocol.results(name, wire.body(name, sent, written), read)
 
 
-def test_a_text_that_is_not_utf8_is_read_as_windows_writes_it() -> None:
+def test_text_in_windows_encoding_is_read() -> None:
     body = wire.body("Util.SessionPathGet", ["C:\\Müller"], 0, "latin-1")
     assert protocol.results("Util.SessionPathGet", body) == ("C:\\Müller",)
 
@@ -111,13 +111,13 @@ def test_a_text_that_is_not_utf8_is_read_as_windows_writes_it() -> None:
         ("Bias.Wrong", []),
     ],
 )
-def test_what_can_not_be_sent_is_an_error_before_it_is(name: str, arguments: list[Any]) -> None:
+def test_unsendable_arguments_are_refused(name: str, arguments: list[Any]) -> None:
     with pytest.raises(InvalidValue):
         protocol.request(name, arguments)
 
 
 @pytest.mark.parametrize(
-    ("header", "told"),
+    ("header", "problem"),
     [
         (b"Bias.Set".ljust(32, b"\0") + struct.pack(">i", 8) + bytes(4), "replied to 'Bias.Set'"),
         (b"Bias.Get".ljust(32, b"\0") + struct.pack(">i", -1) + bytes(4), "announced -1 bytes"),
@@ -125,8 +125,8 @@ def test_what_can_not_be_sent_is_an_error_before_it_is(name: str, arguments: lis
         (b"\xff" * 40, "replied to 'ÿ"),
     ],
 )
-def test_a_header_that_is_no_answer(header: bytes, told: str) -> None:
-    with pytest.raises(BadReply, match=told):
+def test_malformed_header_is_refused(header: bytes, problem: str) -> None:
+    with pytest.raises(BadReply, match=problem):
         protocol.body_bytes(header, "Bias.Get")
 
 
@@ -134,13 +134,13 @@ def test_a_header_that_is_no_answer(header: bytes, told: str) -> None:
 
 
 @given(st.sampled_from(NAMES), st.binary(max_size=200), st.sampled_from(RELEASE_NUMBERS))
-def test_any_body_is_results_or_an_error_with_a_name(name: str, body: bytes, release: int) -> None:
+def test_any_body_is_results_or_a_named_error(name: str, body: bytes, release: int) -> None:
     _read(name, body, release)
 
 
 @given(st.sampled_from(NAMES), st.data())
-def test_a_broken_reply_is_results_or_an_error_with_a_name(name: str, data: st.DataObject) -> None:
-    """What is nearly right gets further than what is not at all."""
+def test_damaged_reply_is_results_or_a_named_error(name: str, data: st.DataObject) -> None:
+    # Nearly right replies get further than random bytes.
     release = data.draw(st.sampled_from(RELEASE_NUMBERS))
     sent = [EXAMPLES[code] for code, _ in protocol.functions()[name].results]
     body = bytearray(wire.body(name, sent, release))
@@ -152,13 +152,12 @@ def test_a_broken_reply_is_results_or_an_error_with_a_name(name: str, data: st.D
 
 
 def _read(name: str, body: bytes, release: int) -> None:
-    # what is traced is the whole process: a thread of another test may want memory too, but not each time
+    # tracing covers the whole process: a thread of another test may need memory too, but not each time
     peaks = (_peak_bytes(name, body, release) for _ in range(3))
     assert any(peak < 200_000 for peak in peaks), "no more memory than what came can fill"
 
 
 def _peak_bytes(name: str, body: bytes, release: int) -> int:
-    """The memory that reading it takes."""
     tracemalloc.start()
     try:
         with suppress(BadReply, NanonisError):
@@ -170,13 +169,13 @@ def _peak_bytes(name: str, body: bytes, release: int) -> int:
 
 
 @given(st.binary(min_size=40, max_size=40), st.sampled_from(NAMES))
-def test_any_header_is_a_size_or_an_error_with_a_name(header: bytes, name: str) -> None:
+def test_any_header_is_a_size_or_a_named_error(header: bytes, name: str) -> None:
     with suppress(BadReply):
         assert 0 <= protocol.body_bytes(header, name) <= protocol.LARGEST_BODY
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_requests_to_the_emulated_controller_or_are_none(received: bytes) -> None:
+def test_any_bytes_are_requests_or_malformed(received: bytes) -> None:
     left = bytearray(received)
     with suppress(wire.MalformedRequest):
         while (request := wire.split(left)) is not None:
@@ -186,7 +185,7 @@ def test_any_bytes_are_requests_to_the_emulated_controller_or_are_none(received:
 
 
 @given(st.sampled_from(sorted(wire.functions())), st.binary(max_size=100))
-def test_any_arguments_are_read_by_the_emulated_controller_or_unreadable(name: str, body: bytes) -> None:
+def test_any_arguments_are_read_or_malformed(name: str, body: bytes) -> None:
     with suppress(wire.MalformedRequest):
         found = wire.arguments(name, body, max(RELEASE_NUMBERS))
         assert len(found) == len(wire.functions()[name].argument_codes(max(RELEASE_NUMBERS)))
@@ -207,12 +206,12 @@ def test_any_arguments_are_read_by_the_emulated_controller_or_unreadable(name: s
         ("ZSpectr.ChsGet", 14429, "[i] A"),
     ],
 )
-def test_fields_of_a_reply_are_those_of_the_release(name: str, release: int, codes: str) -> None:
+def test_reply_has_the_fields_of_the_release(name: str, release: int, codes: str) -> None:
     assert wire.functions()[name].result_codes(release) == codes.split()
 
 
 @pytest.mark.parametrize("release", RELEASE_NUMBERS)
-def test_properties_of_spectra_are_told_in_the_order_of_each_release(tmp_path: Path, release: int) -> None:
+def test_spectrum_properties_have_the_order_of_each_release(tmp_path: Path, release: int) -> None:
     asked = ["BiasSpectr.Open", "ZSpectr.Open", "BiasSpectr.PropsGet", "ZSpectr.PropsGet"]
     with NanonisEmulator(port=0, release=release).running(tmp_path) as address:
         *_, bias, z = (_asked(address, name) for name in asked)
@@ -223,28 +222,28 @@ def test_properties_of_spectra_are_told_in_the_order_of_each_release(tmp_path: P
     assert (b"Current (A)" in bias) == (release < 11798)
 
 
-def test_names_are_those_of_the_protocol_in_either_case_and_echoed(tmp_path: Path) -> None:
+def test_function_names_ignore_case_and_are_echoed(tmp_path: Path) -> None:
     with NanonisEmulator(port=0).running(tmp_path) as address:
         assert _asked(address, "util.versionget").endswith(bytes(8))
         assert b"Error in command: bias.nonsense: " in _asked(address, "Bias.Nonsense")
         assert b"Error in command: laser.powerget: Module not available" in _asked(address, "Laser.PowerGet")
 
 
-def test_the_end_of_each_line_is_waited_for(tmp_path: Path) -> None:
+def test_wait_end_of_line_returns_at_each_line(tmp_path: Path) -> None:
     with NanonisEmulator(port=0).running(tmp_path, ExperimentClock.starting_now(speed=20.0)) as address:
         buffer = struct.pack(">iiii", 1, 14, 16, 16)
         assert _asked(address, "Scan.BufferSet", buffer).endswith(bytes(8))
         timed_out = _asked(address, "Scan.WaitEndOfLine", struct.pack(">i", 50))
         assert (len(timed_out), struct.unpack(">IiHi", timed_out[:-8])[0]) == (22, 1)
         _asked(address, "Scan.Action", struct.pack(">HI", 0, 1))
-        told = [struct.unpack(">IiHi", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:-8]) for _ in range(6)]
-    assert all(timed_out == 0 and 1 <= line <= 16 for timed_out, line, _, _ in told)
-    passes = [2 * line + backward for _, line, backward, _ in told]
+        replies = [struct.unpack(">IiHi", _asked(address, "Scan.WaitEndOfLine", b"\xff" * 4)[:-8]) for _ in range(6)]
+    assert all(timed_out == 0 and 1 <= line <= 16 for timed_out, line, _, _ in replies)
+    passes = [2 * line + backward for _, line, backward, _ in replies]
     assert passes == sorted(set(passes))
 
 
 def test_functions_that_the_makers_client_lacks_are_as_documented(tmp_path: Path) -> None:
-    """By the document of April 2025 (release 14718)."""
+    # After the document of April 2025 (release 14718).
     nan = float("nan")
     with NanonisEmulator(port=0).running(tmp_path) as address:
         for name, set_, got in (
@@ -272,7 +271,7 @@ def test_functions_that_the_makers_client_lacks_are_as_documented(tmp_path: Path
         assert b"not part of this emulator" in _asked(address, "PLL.PerfectPLLApply", struct.pack(">i", 1))
 
 
-def test_a_spectrum_that_was_saved_is_loaded_again(tmp_path: Path) -> None:
+def test_saved_spectrum_can_be_loaded(tmp_path: Path) -> None:
     session = tmp_path / "session"
     secret = tmp_path / "secret.dat"
     secret.write_text("[DATA]\nx\n1\n")
@@ -300,7 +299,7 @@ def test_a_spectrum_that_was_saved_is_loaded_again(tmp_path: Path) -> None:
     assert b"bias spectroscopy" in header
 
 
-def test_a_session_goes_on_in_a_folder_within_its_own(tmp_path: Path) -> None:
+def test_session_path_changes_within_its_folder(tmp_path: Path) -> None:
     session = tmp_path / "session"
     with NanonisEmulator(port=0).running(session) as address:
         for path, said in (
@@ -315,8 +314,8 @@ def test_a_session_goes_on_in_a_folder_within_its_own(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["session"]
 
 
-def test_the_frequency_shift_is_that_of_the_setpoint_and_of_the_picture(tmp_path: Path) -> None:
-    """All clients read the same sensor: signals, PLL, the picture, and the file's header."""
+def test_frequency_shift_matches_setpoint_and_picture(tmp_path: Path) -> None:
+    # All clients read the same sensor: signals, PLL, the picture and the file's header.
     emulator = NanonisEmulator(feedback={"mode": "frequency-shift", "setpoint": -20.0})
     with emulator.running(tmp_path, ExperimentClock.starting_now(speed=2.0)) as address:  # its end is awaited
 
@@ -343,7 +342,6 @@ def test_the_frequency_shift_is_that_of_the_setpoint_and_of_the_picture(tmp_path
 
 
 def _texts(reply: bytes) -> list[str]:
-    """The texts of a list that a reply begins with."""
     found, at = [], 8
     for _ in range(struct.unpack_from(">i", reply, 4)[0]):
         length = struct.unpack_from(">i", reply, at)[0]
@@ -353,7 +351,6 @@ def _texts(reply: bytes) -> list[str]:
 
 
 def _asked(address: str, name: str, body: bytes = b"") -> bytes:
-    """The body of the reply to a request, which must be under the name that it was asked by."""
     host, port = address.split(":")
     with socket.create_connection((host, int(port)), timeout=20.0) as connection:
         connection.sendall(name.encode().ljust(32, b"\0") + struct.pack(">iHH", len(body), 1, 0) + body)

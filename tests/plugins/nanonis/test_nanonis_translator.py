@@ -1,4 +1,4 @@
-"""The Nanonis translator against the emulated controller: everything that a peer may ask for, as it sees it."""
+"""The Nanonis translator with the emulated controller: every request of a peer, and its effects."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FREE = ScopeState.FREE
 # --- scans ---
 
 
-def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
+def test_scan_has_exactly_the_frame_that_was_set(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -50,9 +50,10 @@ def test_a_scan_comes_with_the_frame_that_was_set_exactly(bench: Make) -> None:
 
 @pytest.mark.parametrize("direction", ["up", "down"])
 @pytest.mark.parametrize("fetch", [False, True])
-def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: str, fetch: bool) -> None:
-    """Against the heights of the simulated sample at each pixel: half a pixel off, or a mirrored axis, would show."""
-    seen = 20.0 if fetch else 100.0  # what is in no file must be seen running
+def test_rows_and_columns_match_the_sample(bench: Make, direction: str, fetch: bool) -> None:
+    # Compared with the heights of the simulated sample at each pixel: an offset by half a pixel or a mirrored axis
+    # shows.
+    seen = 20.0 if fetch else 100.0  # a scan without a file must be seen running
     made = bench(seen, surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -76,15 +77,15 @@ def test_rows_and_columns_are_where_the_sample_has_them(bench: Make, direction: 
         assert read(file).upwards is (direction == "up")
 
 
-def test_lines_come_while_it_scans(bench: Make) -> None:
+def test_lines_are_published_during_a_scan(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start(live_lines_s=1.0)
     ready(peer, shape=(40, 32))
     assert peer.set(names.SCAN_DIRECTION, "down").ok
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Z Forward"]
-    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Z Forward")
+    received = peer.until(FREE)
+    lines = [one for one in received if isinstance(one, ScanLines) and one.channel == "Z Forward"]
+    whole = next(one for one in received if isinstance(one, Scan) and one.channel == "Z Forward")
     assert len(lines) >= 2
     assert lines[0].first_row + len(lines[0].values) == 40, "the highest first"
     picture = None
@@ -126,7 +127,7 @@ def test_a_size_beyond_the_scanner_is_refused_and_the_frame_stays_where_it_is(be
     assert made.emulator.software.scans.frame == pytest.approx(before, rel=1e-6)
 
 
-def test_what_is_set_is_told_to_the_last_digit_though_nanonis_keeps_a_float32(bench: Make) -> None:
+def test_settings_are_reported_to_the_last_digit_despite_float32(bench: Make) -> None:
     peer = bench().start()
     peer.until(FREE)
     for name, value in {
@@ -148,8 +149,8 @@ def test_what_is_set_is_told_to_the_last_digit_though_nanonis_keeps_a_float32(be
         assert float(peer.get(name)) == pytest.approx(value, rel=1e-13), name
 
 
-def test_the_resolution_alone_leaves_the_frame_as_it_is(bench: Make) -> None:
-    """Nanonis' range is that of whole pixels: with more of them it is another for the same pixel centres."""
+def test_setting_the_resolution_keeps_the_frame(bench: Make) -> None:
+    # Nanonis' range goes from edge to edge of its pixels: for the same pixel centres it depends on their number.
     made = bench()
     peer = made.start()
     ready(peer)
@@ -167,8 +168,8 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     peer = made.start()
     ready(peer)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False, proportional_gain=0.25, setpoint=0.5)).ok
-    heard = peer.until(lambda one: isinstance(one, Feedback))
-    assert (heard[-1].on, heard[-1].proportional_gain, heard[-1].setpoint) == (False, 0.25, 0.5)
+    received = peer.until(lambda one: isinstance(one, Feedback))
+    assert (received[-1].on, received[-1].proportional_gain, received[-1].setpoint) == (False, 0.25, 0.5)
     assert made.emulator.rig.setup.feedback.on is False
     assert made.emulator.rig.setup.feedback.integral_gain == pytest.approx(1500.0), "P alone changes T, and I stays"
     assert peer.set("x-feedback-on", True).ok
@@ -178,7 +179,7 @@ def test_feedback_is_set_switched_off_and_on(bench: Make) -> None:
     assert "T = P / I" in response.reason
 
 
-def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_feedback_is_switched_on_after_its_other_settings(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -196,7 +197,7 @@ def test_feedback_is_switched_on_only_once_the_rest_of_it_is_set(bench: Make, mo
     assert switched_with == [(False, 0.25), (True, 0.75)]
 
 
-def test_the_probe_moves_at_its_speed_and_a_scan_does_not_tell_where_it_leads_it(bench: Make) -> None:
+def test_probe_moves_at_its_speed_and_keeps_its_position_during_a_scan(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
@@ -210,16 +211,16 @@ def test_the_probe_moves_at_its_speed_and_a_scan_does_not_tell_where_it_leads_it
 
 @pytest.mark.parametrize(("kind", "first"), [("IV", "Bias calc"), ("force", "Z rel")])
 @pytest.mark.parametrize("fetch", [False, True])
-def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first: str, fetch: bool) -> None:
+def test_spectrum_has_its_position(bench: Make, kind: str, first: str, fetch: bool) -> None:
     made = bench(speed=20.0)
     peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
     ready(peer)
     moved(peer, 12.3456789e-9, -50e-9)
     assert peer.set(names.SPEC_KIND, kind).ok
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (spectrum,) = (one for one in heard if isinstance(one, Spectrum))
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (spectrum,) = (one for one in received if isinstance(one, Spectrum))
     assert spectrum.position_m == (12.3456789e-9, -50e-9)
     assert spectrum.kind == kind
     assert spectrum.names[0] == first
@@ -230,16 +231,16 @@ def test_a_spectrum_comes_with_where_it_was_taken(bench: Make, kind: str, first:
     np.testing.assert_allclose(spectrum.values, true.values, rtol=1e-4, atol=1e-18)
 
 
-def test_a_spectrum_that_is_stopped_gives_none(bench: Make) -> None:
+def test_stopped_spectrum_is_not_published(bench: Make) -> None:
     made = bench(speed=2.0)
     peer = made.start()
     ready(peer)
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["INTERRUPTED", "FREE"]
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert states(received) == ["INTERRUPTED", "FREE"]
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
 # --- what a tip needs besides ---
@@ -262,15 +263,15 @@ def test_pulse_crash_retract_and_engage(bench: Make) -> None:
     assert made.emulator.rig.engaged
 
 
-def test_retracting_breaks_a_scan_off(bench: Make) -> None:
+def test_retracting_stops_a_scan(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
     assert peer.act(names.START_SCAN).ok
     assert peer.act(names.RETRACT).ok
-    heard = peer.until(FREE)
-    assert states(heard)[:2] == ["SCANNING", "INTERRUPTED"]
-    assert not any(isinstance(one, Scan) for one in heard)
+    received = peer.until(FREE)
+    assert states(received)[:2] == ["SCANNING", "INTERRUPTED"]
+    assert not any(isinstance(one, Scan) for one in received)
     assert not made.emulator.rig.engaged
 
 
@@ -286,17 +287,15 @@ def test_retracting_ends_an_auto_approach_which_would_bring_the_tip_back(bench: 
 
 
 @pytest.mark.parametrize("scanning", [False, True])
-def test_a_tip_without_feedback_is_retracted_when_the_run_is_stopped(bench: Make, scanning: bool) -> None:
+def test_tip_without_feedback_is_retracted_at_the_end_of_a_run(bench: Make, scanning: bool) -> None:
     made = bench(speed=5.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
-    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.log_text()
 
 
 @pytest.mark.parametrize("kind", ["slow", "dialog", "refused", "cut"])
-def test_it_is_retracted_also_by_a_nanonis_that_is_slow_or_refuses_or_is_not_there_just_then(
-    bench: Make, kind: str
-) -> None:
+def test_tip_is_retracted_despite_slow_refusing_or_lost_nanonis(bench: Make, kind: str) -> None:
     made = bench(speed=5.0)
     peer = made.start(retracts=True)
     ready(peer)
@@ -304,10 +303,10 @@ def test_it_is_retracted_also_by_a_nanonis_that_is_slow_or_refuses_or_is_not_the
     made.strike(kind, count=2, duration_s=10.0)  # two seconds, real time
     assert made.let_go() == ExitCode.ORPHAN
     assert not made.emulator.rig.engaged
-    assert "the run is stopping with the feedback off: the tip was retracted" in made.said()
+    assert "the run is stopping with the feedback off: the tip was retracted" in made.log_text()
 
 
-def test_a_tip_without_feedback_stays_where_the_file_says_so(bench: Make) -> None:
+def test_tip_without_feedback_stays_if_the_file_allows_it(bench: Make) -> None:
     made = bench(speed=5.0)
     left_in_danger(made, scanning=False, retracts=False)
     assert made.emulator.rig.engaged
@@ -342,7 +341,7 @@ def test_parameters_and_actions_of_the_experiment_file(bench: Make) -> None:
 # --- at the panel ---
 
 
-def test_the_panel_may_have_been_left_scanning_on_and_on_and_not_saving(bench: Make) -> None:
+def test_continuous_scan_without_saving_is_switched_off(bench: Make) -> None:
     made = bench()
     made.at_panel(
         lambda emulator: emulator.software.scans.properties.__dict__.update(
@@ -356,8 +355,8 @@ def test_the_panel_may_have_been_left_scanning_on_and_on_and_not_saving(bench: M
     assert (left_behind.continuous, left_behind.bouncy, left_behind.autosave) == (False, False, "all")
 
 
-def test_it_can_be_told_to_leave_saving_alone(bench: Make) -> None:
-    made = bench(speed=5.0)  # what is not saved must be seen running
+def test_saving_can_be_left_alone(bench: Make) -> None:
+    made = bench(speed=5.0)  # an unsaved scan must be seen running
     made.at_panel(lambda emulator: emulator.software.scans.properties.__dict__.update(autosave="off"))
     peer = made.start(autosave=False)
     ready(peer)
@@ -377,7 +376,7 @@ def test_every_release(bench: Make, release: str) -> None:
     assert made.emulator.software.core.registers.get("Piezo.DriftComp")[2] == pytest.approx(1e-12)
 
 
-def test_a_session_folder_that_has_another_name_over_there(bench: Make) -> None:
+def test_session_folder_may_have_another_path_on_the_controller(bench: Make) -> None:
     made = bench(session_path="D:\\Data\\2026")
     peer = made.start(session_dir=str(made.data))
     ready(peer)

@@ -1,6 +1,6 @@
-"""The vendor's own client drives the emulated controller: it knows nothing of us.
+"""The vendor's own client drives the emulated controller.
 
-Of nanonis-spm 1.0.9 some functions can't read any reply (`MISREAD`): those are not called here.
+Some functions of nanonis-spm 1.0.9 can't read any reply (`MISREAD`): they are not called here.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SEEN = pytest.mark.parametrize("client", [2.0], indirect=True)
 
 @pytest.fixture
 def client(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Any]:
-    """Of an emulator at speed 100, or as marked."""
+    """Connect the client to an emulator, at speed 100 or as marked."""
     with connected(tmp_path, getattr(request, "param", 100.0)) as client:
         yield client
 
@@ -48,14 +48,14 @@ def connected(folder: Path, speed: float, **settings: Any) -> Iterator[Any]:
 
 
 def ask(client: Any, function: str, *arguments: Any) -> list[Any]:
-    """The results of a function; its errors are failures."""
+    """Call a function; its errors are failures of the test."""
     error, _, results = getattr(client, function)(*arguments)
     assert error == ""
     return list(results)
 
 
 def flat(values: Any) -> list[float]:
-    """Its lists are of tuples of one."""
+    """Return the items of the client's lists, which are tuples of one."""
     return [value[0] for value in values]
 
 
@@ -85,10 +85,10 @@ def flat(values: Any) -> list[float]:
         ("ZSpectr_RetractDelaySet", "ZSpectr_RetractDelayGet", [0.25]),
     ],
 )
-def test_what_it_sets_it_gets(client: Any, setter: str, getter: str, values: list[float]) -> None:
+def test_client_reads_the_values_that_it_sets(client: Any, setter: str, getter: str, values: list[float]) -> None:
     ask(client, setter, *values)
     got = ask(client, getter)
-    if setter == "Scan_SpeedSet":  # what is kept counts from 0 here, and the times follow from the frame
+    if setter == "Scan_SpeedSet":  # SpeedGet counts `keep` from 0, and the times follow from the frame
         values = [1e-6, 2e-6, 1.0, 0.5, 0, 2.0]
     assert got[: len(values)] == pytest.approx(values, rel=1e-6)
 
@@ -126,8 +126,8 @@ ALIVE = (
 )  # fmt: skip
 
 
-def test_it_reads_the_error_of_every_function_that_it_has(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    """Behind the results of its own list of fields: so ours has the same."""
+def test_client_reads_the_error_of_every_function(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    # After the results of the client's own list of fields: the emulator has the same list.
     send, misread = client.send, set()
     for name in FUNCTIONS:
         client.send = lambda command, _body, _codes: send(command, [[1]], ["*B"])  # a byte fits nothing
@@ -142,7 +142,7 @@ def test_it_reads_the_error_of_every_function_that_it_has(client: Any, capsys: p
     assert "The following error appeared" in capsys.readouterr().out
 
 
-def test_it_reads_the_reply_of_every_getter(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_client_reads_the_reply_of_every_getter(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
     for module in ("BiasSpectr", "ZSpectr", "AutoApproach"):
         ask(client, f"{module}_Open")
     for getter in (name for name in FUNCTIONS if name.endswith("Get") and name not in MISREAD):
@@ -155,7 +155,7 @@ def test_it_reads_the_reply_of_every_getter(client: Any, capsys: pytest.CaptureF
 
 
 @SEEN
-def test_it_takes_a_scan_and_the_file_of_it_is_one_of_nanonis(client: Any) -> None:
+def test_client_takes_a_scan_with_a_nanonis_file(client: Any) -> None:
     ask(client, "Scan_PropsSet", 2, 2, 1, "series_", "comment", ["Z-Ctrl"], 0)
     ask(client, "Scan_FrameSet", 0.0, 0.0, 10e-9, 5e-9, -90.0)
     ask(client, "Scan_SpeedSet", 2e-7, 2e-7, 0.05, 0.05, 1, 1.0)  # else it may have ended before it is waited for
@@ -180,7 +180,7 @@ def test_it_takes_a_scan_and_the_file_of_it_is_one_of_nanonis(client: Any) -> No
     np.testing.assert_allclose(values[::-1], content.scans[2].values)
 
 
-def test_it_stops_a_scan_and_the_wait_for_its_end_is_over(client: Any) -> None:
+def test_client_stops_a_scan_which_ends_the_wait(client: Any) -> None:
     ask(client, "Scan_BufferSet", [0], 512, 512)
     ask(client, "Scan_Action", 0, 1)
     assert ask(client, "Scan_StatusGet") == [1]
@@ -190,8 +190,8 @@ def test_it_stops_a_scan_and_the_wait_for_its_end_is_over(client: Any) -> None:
 
 
 @pytest.mark.parametrize(("module", "first"), [("BiasSpectr", "Bias calc (V)"), ("ZSpectr", "Z rel (m)")])
-def test_it_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: str, first: str) -> None:
-    """As in the examples that come with it."""
+def test_client_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: str, first: str) -> None:
+    # As in the client's examples.
     ask(client, f"{module}_Open")
     _, count, names, rows, _, values, *_ = ask(client, f"{module}_Start", 1, "curve")
     assert (names[0], rows) == (first, count)
@@ -201,7 +201,7 @@ def test_it_takes_a_spectrum_with_a_row_for_each_channel(client: Any, module: st
 
 @SEEN
 @pytest.mark.parametrize("module", ["BiasSpectr", "ZSpectr"])
-def test_it_stops_a_spectrum_and_there_is_no_file_of_it(client: Any, module: str) -> None:
+def test_client_stops_a_spectrum_which_has_no_file(client: Any, module: str) -> None:
     ask(client, f"{module}_Open")
     ask(client, f"{module}_Start", 0, "curve")
     ask(client, f"{module}_Stop")
@@ -210,7 +210,7 @@ def test_it_stops_a_spectrum_and_there_is_no_file_of_it(client: Any, module: str
         assert ask(client, "ZSpectr_StatusGet") == [0]
 
 
-def test_a_spectrum_has_the_sweep_and_the_points_that_it_sets(client: Any) -> None:
+def test_spectrum_has_the_set_sweep_and_points(client: Any) -> None:
     for module in ("BiasSpectr", "ZSpectr"):
         ask(client, f"{module}_Open")
     all_of_it = ask(client, "BiasSpectr_Start", 1, "curve")[5]
@@ -230,7 +230,7 @@ def test_a_spectrum_has_the_sweep_and_the_points_that_it_sets(client: Any) -> No
     assert len(saved.values) == 31
 
 
-def test_it_stops_the_tip_on_its_way(client: Any) -> None:
+def test_client_stops_a_moving_tip(client: Any) -> None:
     ask(client, "FolMe_SpeedSet", 1e-9, 1)
     ask(client, "FolMe_XYPosSet", 500e-9, 0.0, 0)
     ask(client, "FolMe_Stop")
@@ -240,7 +240,7 @@ def test_it_stops_the_tip_on_its_way(client: Any) -> None:
     assert ask(client, "Scan_XYPosGet", 1) == pytest.approx(stopped, rel=1e-6)
 
 
-def test_it_switches_the_z_controller_which_follows_with_a_delay(client: Any) -> None:
+def test_client_switches_the_z_controller_with_a_delay(client: Any) -> None:
     for on in (0, 1):
         ask(client, "ZCtrl_OnOffSet", on)
         until_s = time.monotonic() + 20.0
@@ -249,7 +249,7 @@ def test_it_switches_the_z_controller_which_follows_with_a_delay(client: Any) ->
         assert ask(client, "ZCtrl_StatusGet") == [2 if on else 1]
 
 
-def test_it_sets_z_with_the_controller_off_alone(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_client_sets_z_only_with_the_controller_off(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
     assert client.ZCtrl_ZPosSet(1e-9)[0]
     assert "The following error appeared" in capsys.readouterr().out
     ask(client, "ZCtrl_OnOffSet", 0)
@@ -260,7 +260,7 @@ def test_it_sets_z_with_the_controller_off_alone(client: Any, capsys: pytest.Cap
     assert ask(client, "ZCtrl_ZPosGet") == pytest.approx([1e-9], abs=NOISE_M)
 
 
-def test_it_has_the_drift_compensated(client: Any) -> None:
+def test_client_compensates_drift(client: Any) -> None:
     on, off = 1, 2
     ask(client, "Piezo_DriftCompSet", on, 1e-11, -2e-11, 0.0, 10.0)
     assert ask(client, "Piezo_DriftCompGet") == pytest.approx([1, 1e-11, -2e-11, 0.0, 0, 0, 0, 10.0], rel=1e-6)
@@ -268,8 +268,8 @@ def test_it_has_the_drift_compensated(client: Any) -> None:
     assert ask(client, "Piezo_DriftCompGet")[0] == 0
 
 
-def test_a_tracked_atom_tells_how_fast_the_sample_drifts_and_turns_under_the_tip(tmp_path: Path) -> None:
-    """A minute of it is over at once: a millimetre from where it turns, that moves it by 10 pm/s."""
+def test_tracked_atom_measures_drift_and_rotation(tmp_path: Path) -> None:
+    # A minute of tracking is skipped: a millimetre from the centre of rotation, the sample moves by 10 pm/s.
     turns = {"rotation_rad_per_s": 1e-8, "about_m": [-1e-3, 0.0], "velocity_m_per_s": [3e-12, 0.0, 1e-12]}
     with connected(tmp_path, 1e5, drift=turns) as client:
         ask(client, "AtomTrack_QuickCompStart", 1)
@@ -278,7 +278,7 @@ def test_a_tracked_atom_tells_how_fast_the_sample_drifts_and_turns_under_the_tip
     assert velocity_m_s == pytest.approx([3e-12, 10e-12, 1e-12], abs=0.2e-12)
 
 
-def test_it_has_a_scan_saved_that_was_stopped(client: Any) -> None:
+def test_client_saves_a_stopped_scan(client: Any) -> None:
     ask(client, "Scan_PropsSet", 2, 2, 3, "part_", "", [], 0)
     ask(client, "Scan_BufferSet", [0, 14], 64, 64)
     ask(client, "Scan_Action", 0, 1)
@@ -289,12 +289,12 @@ def test_it_has_a_scan_saved_that_was_stopped(client: Any) -> None:
     assert [path.name for path in client.folder.glob("*.sxm")] == ["part_001.sxm"]
 
 
-def test_it_moves_the_tip_and_waits_until_it_is_there(client: Any) -> None:
+def test_client_moves_the_tip_and_waits_for_arrival(client: Any) -> None:
     ask(client, "FolMe_XYPosSet", 50e-9, -30e-9, 1)
     assert ask(client, "FolMe_XYPosGet", 1) == [50e-9, -30e-9]
 
 
-def test_it_reads_lists_of_names_and_values(client: Any) -> None:
+def test_client_reads_lists_of_names_and_values(client: Any) -> None:
     *_, names = ask(client, "Signals_NamesGet")
     assert len(names) == 128
     assert (names[0], names[14]) == ("Current (A)", "Z (m)")
@@ -308,7 +308,7 @@ def test_it_reads_lists_of_names_and_values(client: Any) -> None:
 
 
 @SEEN
-def test_it_withdraws_pulses_shapes_and_walks(client: Any) -> None:
+def test_client_withdraws_pulses_shapes_and_walks(client: Any) -> None:
     ask(client, "Bias_Pulse", 1, 0.1, 4.0, 1, 2)
     ask(client, "TipShaper_Start", 1, -1)
     ask(client, "Motor_StartMove", 4, 10, 0, 1)
@@ -321,7 +321,7 @@ def test_it_withdraws_pulses_shapes_and_walks(client: Any) -> None:
     assert ask(client, "AutoApproach_OnOffGet") == [1]
 
 
-def test_it_is_told_in_words_what_can_not_be(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_client_receives_a_text_for_each_refusal(client: Any, capsys: pytest.CaptureFixture[str]) -> None:
     for function, arguments in (
         ("Bias_Set", (99.0,)),
         ("Scan_FrameDataGrab", (99, 1)),
@@ -337,7 +337,7 @@ def test_it_is_told_in_words_what_can_not_be(client: Any, capsys: pytest.Capture
 
 
 def measured(client: Any) -> tuple[float, float, float]:
-    """Mean and standard deviation of the current, and the mean frequency shift."""
+    """Return mean and standard deviation of the current, and the mean frequency shift."""
     current, noise_a = mean_and_noise(client, "Current_Get")
     names = ask(client, "Signals_NamesGet")[-1]
     return current, noise_a, mean_and_noise(client, "Signals_ValGet", names.index("OC M1 Freq. Shift (Hz)"), 1)[0]
@@ -348,7 +348,7 @@ def mean_and_noise(client: Any, getter: str, *arguments: Any, count: int = 30) -
     return float(np.mean(values)), float(np.std(values))
 
 
-def test_current_and_z_are_those_of_a_tip_at_the_sample_and_gone_without_it(client: Any) -> None:
+def test_current_and_z_depend_on_contact(client: Any) -> None:
     for getter, arguments in (("Current_Get", ()), ("Signals_ValGet", (0, 1))):
         at_sample, noise = mean_and_noise(client, getter, *arguments)
         assert noise > 0.0
@@ -362,7 +362,7 @@ def test_current_and_z_are_those_of_a_tip_at_the_sample_and_gone_without_it(clie
     assert mean_and_noise(client, "ZCtrl_ZPosGet")[0] == pytest.approx(upper_end_m, abs=NOISE_M)
 
 
-def test_the_tip_shows_the_place_where_a_scan_has_shown_it(client: Any) -> None:
+def test_tip_finds_features_where_a_scan_shows_them(client: Any) -> None:
     ask(client, "Scan_FrameSet", 0.0, 0.0, 10e-9, 10e-9, 0.0)
     ask(client, "Scan_BufferSet", [14], 32, 32)
     ask(client, "Scan_Action", 0, 1)
@@ -382,7 +382,7 @@ def test_the_current_falls_when_the_tip_is_lifted_with_the_controller_off(client
 
 @pytest.mark.parametrize("bias_v", [0.1, 0.25, 1.0, -1.0])
 def test_the_current_is_the_setpoint_at_any_bias(tmp_path: Path, bias_v: float) -> None:
-    """Of the emulator as it is by default."""
+    # With the emulator's default settings.
     with connected(tmp_path, 100.0, surface="steps") as client:
         ask(client, "Bias_Set", bias_v)
         for setpoint_a in (ask(client, "ZCtrl_SetpntGet")[0], 50e-12, 1e-9):
@@ -392,8 +392,8 @@ def test_the_current_is_the_setpoint_at_any_bias(tmp_path: Path, bias_v: float) 
             assert 10e-12 < setpoint_a < 10e-9
 
 
-def test_frequency_shift_current_and_z_tell_the_state_of_the_tip(tmp_path: Path) -> None:
-    """A check of the tip must find the difference, and a withdrawn tip must not pass it."""
+def test_frequency_shift_current_and_z_show_the_state_of_the_tip(tmp_path: Path) -> None:
+    # A tip check must find the difference, and a withdrawn tip must not pass it.
     found = {}
     for condition in ("sharp", "blunt", "double", "contaminated"):
         with connected(tmp_path / condition, 100.0, surface="steps", tip={"condition": condition}) as client:
@@ -411,7 +411,7 @@ def test_frequency_shift_current_and_z_tell_the_state_of_the_tip(tmp_path: Path)
     assert all(abs(found[worse][3] - sharp_m) > 3e-11 for worse in ("blunt", "double"))
 
 
-# --- what is set and what it does ---
+# --- settings and their effects ---
 
 
 @pytest.mark.parametrize(
@@ -438,7 +438,7 @@ def test_frequency_shift_current_and_z_tell_the_state_of_the_tip(tmp_path: Path)
         ("AtomTrack_CtrlSet", "AtomTrack_StatusGet", [1], [1], [1]),
     ],
 )  # fmt: skip
-def test_what_is_set_in_one_way_is_got_in_another(
+def test_getters_return_values_in_their_own_form(
     client: Any, setter: str, getter: str, belongs_to: list[Any], sent: list[Any], got: list[Any]
 ) -> None:
     ask(client, setter, *belongs_to, *sent)
@@ -448,7 +448,7 @@ def test_what_is_set_in_one_way_is_got_in_another(
 
 
 @SEEN
-def test_a_motor_stops_where_it_is_told_to(client: Any) -> None:
+def test_stopped_motor_stays_at_its_place(client: Any) -> None:
     ask(client, "Motor_StartMove", 4, 60_000, 0, 0)
     ask(client, "Motor_StopMove")
     stopped = ask(client, "Motor_PosGet", 0, 500)
@@ -457,7 +457,7 @@ def test_a_motor_stops_where_it_is_told_to(client: Any) -> None:
     ask(client, "Motor_StartMove", 4, 1, 0, 1)  # it is free again
 
 
-def test_a_spectrum_has_the_channels_and_the_mean_of_the_sweeps_that_were_chosen(client: Any) -> None:
+def test_spectrum_has_the_chosen_channels_and_mean_of_sweeps(client: Any) -> None:
     ask(client, "BiasSpectr_Open")
     no_change, off = 0, 2
     ask(client, "BiasSpectr_ChsSet", [0, 14])
@@ -476,7 +476,7 @@ def test_a_spectrum_has_the_channels_and_the_mean_of_the_sweeps_that_were_chosen
     assert client.BiasSpectr_ChsSet([500])[0]
 
 
-def test_each_name_has_numbers_of_its_own_and_is_one_that_a_file_can_have(client: Any) -> None:
+def test_each_base_name_is_numbered_and_a_valid_file_name(client: Any) -> None:
     ask(client, "BiasSpectr_Open")
     for name in ("one", "one", "other", ""):
         ask(client, "BiasSpectr_Start", 1, name)
@@ -506,8 +506,8 @@ def test_a_grid_of_spectra_takes_its_time_and_can_be_stopped(client: Any) -> Non
     assert ask(client, "Pattern_ExpStatusGet") == [0]
 
 
-def test_who_asks_again_and_again_for_the_end_of_a_scan_hears_it_however_fast_the_clock_goes(client: Any) -> None:
-    """A scan has ended before it is waited for, or between two questions: a hundred times too often."""
+def test_repeated_waits_find_the_end_of_a_scan_at_any_clock_speed(client: Any) -> None:
+    # A scan may end before the wait, or between two waits: a hundred times as often as in real time.
     ask(client, "Scan_BufferSet", [0], 16, 16)
     ask(client, "Scan_SpeedSet", 1e-6, 1e-6, 0.05, 0.05, 2, 1.0)
     for _ in range(3):
@@ -515,7 +515,7 @@ def test_who_asks_again_and_again_for_the_end_of_a_scan_hears_it_however_fast_th
         while ask(client, "Scan_StatusGet") == [1]:
             pass
         assert ask(client, "Scan_WaitEndOfScan", 5000)[0] == 0
-    assert ask(client, "Scan_WaitEndOfScan", 1)[0] == 1, "an end is told once"
+    assert ask(client, "Scan_WaitEndOfScan", 1)[0] == 1, "an end is reported once"
     started_s = time.monotonic()
     assert ask(client, "Scan_WaitEndOfScan", 500)[0] == 1
     assert time.monotonic() - started_s >= 0.5, "a client's patience is in real time"
@@ -555,7 +555,7 @@ def test_signals_are_logged_on_a_port_of_their_own(tmp_path: Path) -> None:
 def test_the_makers_own_examples_run_as_they_are(
     example: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """But for the port that they connect to."""
+    # Only the port is changed.
     spec = importlib.util.find_spec("nanonis_spm_examples")
     assert spec is not None
     assert spec.submodule_search_locations is not None

@@ -1,4 +1,4 @@
-"""Fixtures for the tests of Nanosurf."""
+"""Fixtures for tests of Nanosurf."""
 
 from __future__ import annotations
 

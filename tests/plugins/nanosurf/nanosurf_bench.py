@@ -1,4 +1,4 @@
-"""The Nanosurf translator as a real process, an emulated Studio beside it, and a peer on the translator's sockets."""
+"""Bench: the Nanosurf translator as a process, an emulated Studio, and a peer on the translator's sockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 
 
 class Emulated(AtPanel, NanosurfEmulator):
-    """With somebody at its panel."""
+    """An emulated Studio with a person at its panel."""
 
 
 class Bench(VendorBench[Emulated]):

@@ -1,4 +1,4 @@
-"""What can go wrong at Nanosurf Studio: each has a name in the log, nothing hangs, and Studio is found again."""
+"""Faults of Nanosurf Studio: each is named in the log, nothing hangs, and the translator reconnects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def scans_again(peer: Peer) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no answer to"),
         ("late-reply", "no answer to"),
@@ -31,48 +31,48 @@ def scans_again(peer: Peer) -> None:
         ("error", "Studio's session is not what it was: an emulated error"),
     ],
 )
-def test_a_bad_reply_has_a_name_and_studio_is_found_again(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_studio_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(logged)
     scans_again(peer)
 
 
-@pytest.mark.parametrize(("kind", "told"), [("dialog", "a dialog may wait on its screen"), ("restart", "connection")])
-def test_studio_is_found_again_when_it_answers(bench: Make, kind: str, told: str) -> None:
+@pytest.mark.parametrize(("kind", "logged"), [("dialog", "a dialog may wait on its screen"), ("restart", "connection")])
+def test_studio_is_reconnected_when_it_answers(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=600.0)
     peer.until(UNDEFINED)
-    made.until_said(told)
+    made.until_logged(logged)
     peer.until(FREE)
     scans_again(peer)
 
 
 @pytest.mark.parametrize("kind", ["stopped", "withdrawn"])
-def test_a_scan_that_ends_at_the_panel_gives_none(bench: Make, kind: str) -> None:
+def test_scan_stopped_at_the_panel_is_not_published(bench: Make, kind: str) -> None:
     made = bench(speed=20.0)
     peer = small(made, result_timeout_s=2.0)
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     made.strike(kind)
-    heard = peer.until(FREE)
-    assert not scans(heard)
-    assert states(heard)[-1] == "FREE"
+    received = peer.until(FREE)
+    assert not scans(received)
+    assert states(received)[-1] == "FREE"
 
 
 @pytest.mark.parametrize("kind", ["late-file", "half-file"])
-def test_a_file_that_comes_late_is_waited_for(bench: Make, kind: str) -> None:
+def test_late_file_is_awaited(bench: Make, kind: str) -> None:
     made = bench()
     peer = small(made, result_timeout_s=100.0)
     made.strike(kind, duration_s=20.0)
     scanned(peer)
 
 
-def test_a_scan_without_a_file_ends_all_the_same(bench: Make) -> None:
+def test_scan_without_a_file_ends(bench: Make) -> None:
     made = bench()
     peer = small(made, result_timeout_s=20.0)
     made.strike("no-file")
@@ -81,7 +81,7 @@ def test_a_scan_without_a_file_ends_all_the_same(bench: Make) -> None:
     scans_again(peer)
 
 
-def test_the_lines_that_a_broken_scan_has_are_no_scan(bench: Make) -> None:
+def test_lines_of_a_stopped_scan_are_not_published_as_a_scan(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = small(made)
     made.at_panel(lambda emulator: emulator.program.put("data.storage.save_partial_measurements", True))  # type: ignore[attr-defined]
@@ -91,7 +91,7 @@ def test_the_lines_that_a_broken_scan_has_are_no_scan(bench: Make) -> None:
     assert not scans(peer.until(FREE))
 
 
-def test_studio_that_crashes_is_lost_and_found(bench: Make) -> None:
+def test_restarted_studio_is_reconnected(bench: Make) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike("crash")
@@ -101,7 +101,7 @@ def test_studio_that_crashes_is_lost_and_found(bench: Make) -> None:
     scans_again(peer)
 
 
-def test_a_force_curve_that_fails_is_told(bench: Make) -> None:
+def test_failed_force_curve_is_reported(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.strike("spectrum-refused")

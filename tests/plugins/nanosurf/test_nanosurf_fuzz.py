@@ -1,4 +1,4 @@
-"""Random scripts do not end the emulated Studio, nor leave it unfit, nor write outside its folder."""
+"""Random scripts neither end the emulated Studio, nor spoil it, nor write outside its folder."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ ENDS = ('{1,{"not enough memory"}}', '{1,{"the script runs too long"}}')
 
 @pytest.fixture
 def clients(tmp_path: Path) -> Iterator[list[socket.socket]]:
-    """Two clients of an emulator."""
+    """Connect two clients to an emulator."""
     with NanosurfEmulator(port=0).running(tmp_path, ExperimentClock.starting_now(speed=1e4)) as address:
         host, _, port = address.rpartition(":")
         with ExitStack() as stack:
@@ -36,7 +36,7 @@ def clients(tmp_path: Path) -> Iterator[list[socket.socket]]:
 
 
 @pytest.mark.parametrize("kept", ["local t = {}", "t = {}", "local t = {} root.kept = t"])
-def test_a_script_that_uses_up_the_memory_fails_and_all_others_run(kept: str, clients: list[socket.socket]) -> None:
+def test_script_that_exhausts_the_memory_fails_and_others_run(kept: str, clients: list[socket.socket]) -> None:
     greedy, other = clients
     ask(greedy, "return root.session.select('91-01-000', 2)")
     for more in ('("x"):rep(1e6)', "{}", "function() end"):
@@ -61,7 +61,7 @@ def test_a_script_that_does_not_end_leaves_the_others_alone(script: str, clients
     assert ask(other, "return root.session.list()[1], 1.5") == '{0,{"91-01-000",1.5}}'
 
 
-def test_a_client_that_reads_no_replies_is_cut_off(clients: list[socket.socket]) -> None:
+def test_client_that_reads_no_replies_is_disconnected(clients: list[socket.socket]) -> None:
     deaf, other = clients
     script = b'return ("x"):rep(5e6)'
 

@@ -1,4 +1,4 @@
-"""What Studio replies is read as Lua reads it."""
+"""Lua values in Studio's replies are parsed as Lua does."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_not_a_number() -> None:
 
 
 @pytest.mark.parametrize("text", ["", "{", "{1,", "1 2", "function() end", "{[1}", "x", "\xff\xfe", "{" * 100])
-def test_what_is_no_value_is_refused(text: str) -> None:
+def test_malformed_value_is_refused(text: str) -> None:
     with pytest.raises(BadLua):
         parse(text)
 
@@ -48,10 +48,10 @@ def test_any_text_is_a_value_or_refused(text: str) -> None:
 
 
 @given(st.one_of(st.booleans(), st.integers(-(2**53), 2**53), st.floats(allow_nan=False, allow_infinity=False)))
-def test_lua_reads_what_is_written(value: float) -> None:
+def test_lua_reads_written_values(value: float) -> None:
     assert LUA.eval(written(value)) == value
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"])))
-def test_lua_reads_the_texts_that_are_written(text: str) -> None:
+def test_lua_reads_written_texts(text: str) -> None:
     assert LUA.eval(written(text)) == text

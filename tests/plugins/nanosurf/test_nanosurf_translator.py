@@ -1,4 +1,4 @@
-"""The Nanosurf translator against an emulated Studio: what is asked happens, where it should, and is published."""
+"""The Nanosurf translator with an emulated Studio: requests, their effects, and publications."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FREE = ScopeState.FREE
 
 @pytest.mark.parametrize("release", [17, 19])
 @pytest.mark.parametrize("direction", ["up", "down"])
-def test_a_scan_shows_the_sample_as_it_lies(bench: Make, release: int, direction: str) -> None:
+def test_scan_shows_the_sample_in_place(bench: Make, release: int, direction: str) -> None:
     made = bench(release=release, tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start(release=release)
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -64,15 +64,15 @@ def test_the_setpoint_of_a_frequency_shift_is_in_hertz(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("direction", ["up", "down"])
-def test_lines_come_while_it_scans(bench: Make, direction: str) -> None:
+def test_lines_are_published_during_a_scan(bench: Make, direction: str) -> None:
     made = bench(speed=5.0)
     peer = made.start(live_lines_s=1.0, image_buffer=4410)
     ready(peer, shape=(40, 32))
     assert peer.set(names.SCAN_DIRECTION, direction).ok
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    lines = [one for one in heard if isinstance(one, ScanLines) and one.channel == "Height Forward"]
-    whole = next(one for one in heard if isinstance(one, Scan) and one.channel == "Height Forward")
+    received = peer.until(FREE)
+    lines = [one for one in received if isinstance(one, ScanLines) and one.channel == "Height Forward"]
+    whole = next(one for one in received if isinstance(one, Scan) and one.channel == "Height Forward")
     assert len(lines) >= 2
     for part in lines:
         rows = whole.values[part.first_row : part.first_row + len(part.values)]
@@ -87,9 +87,9 @@ def test_a_force_curve_is_taken_where_the_tip_was_sent(bench: Make) -> None:
     moved(peer, 120e-9, -40e-9)
     scanned(peer)
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert curve.position_m == (120e-9, -40e-9)
     assert curve.kind == "force"
     taken = made.emulator.rig.spectrum
@@ -120,14 +120,12 @@ def test_a_force_curve_can_be_stopped(bench: Make) -> None:
     peer.until(ScopeState.SPEC)
     made.at_panel(lambda emulator: None)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
-def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(
-    bench: Make, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """They go by two connections."""
+def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Start and stop use two connections.
     stops: list[StudioProgram] = []
     stop_curve = StudioProgram.stop_curve
 
@@ -168,12 +166,12 @@ def test_the_tip_is_withdrawn_where_a_second_connection_waits(bench: Make) -> No
     assert peer.act(names.START_SCAN).ok
     peer.until(ScopeState.SCANNING)
     assert peer.act(names.RETRACT).ok
-    made.until_said("the tip is withdrawn by the first")
+    made.until_logged("the tip is withdrawn by the first")
     peer.until(FREE)
     assert not made.emulator.rig.engaged
 
 
-def test_a_run_that_is_stopped_stops_the_scan(bench: Make) -> None:
+def test_stopped_run_stops_the_scan(bench: Make) -> None:
     made = bench(speed=10.0)
     peer = made.start(retracts=True)
     ready(peer, shape=(64, 32))
@@ -198,7 +196,7 @@ def test_settings_reach_the_instrument(bench: Make) -> None:
     assert math.isclose(float(peer.get(names.ZCTRL_IGAIN)), 2500)
 
 
-def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
+def test_restarted_translator_finds_the_scan(bench: Make) -> None:
     made = bench(speed=5.0)
     peer = made.start()
     ready(peer, shape=(64, 32))
@@ -206,15 +204,15 @@ def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
     peer.until(ScopeState.SCANNING)
     made.kill()
     peer = made.start()
-    heard = peer.until(FREE)
-    assert "SCANNING" in states(heard)
-    assert {scan.region for scan in scans(heard)} == {TURNED}
+    received = peer.until(FREE)
+    assert "SCANNING" in states(received)
+    assert {scan.region for scan in scans(received)} == {TURNED}
 
 
 @pytest.mark.parametrize(
-    ("emulator", "settings", "told"),
+    ("emulator", "settings", "logged"),
     [
-        ({"release": 19}, {"release": 18}, "Studio is of release 19, not 18"),
+        ({"release": 19}, {"release": 18}, "Studio is release 19, not 18"),
         ({}, {"session": "91-99-999"}, "Studio has no single measurement session 91-99-999"),
         ({}, {"parameters": {"zctrl-setpoint": {"unit": "nm"}}}, "Studio has z_control.setpoint in V, not in nm"),
         ({}, {"parameters": {"x-a": {"vendor": "no.such"}}}, "Studio has no no.such"),
@@ -222,15 +220,15 @@ def test_a_translator_that_is_started_again_finds_the_scan(bench: Make) -> None:
         ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
     ],
 )
-def test_what_does_not_fit_is_told(
-    bench: Make, emulator: dict[str, int], settings: dict[str, object], told: str
+def test_mismatches_are_reported(
+    bench: Make, emulator: dict[str, int], settings: dict[str, object], logged: str
 ) -> None:
     made = bench(**emulator)
     made.start(**settings)
-    made.until_said(told)
+    made.until_logged(logged)
 
 
-def test_values_that_studio_refuses_change_none(bench: Make) -> None:
+def test_refused_values_change_none(bench: Make) -> None:
     made = bench()
     peer = made.start(parameters={"scan-speed": {"range": [1e-9, 1.0]}})
     ready(peer)
@@ -242,7 +240,7 @@ def test_values_that_studio_refuses_change_none(bench: Make) -> None:
     assert made.emulator.program.values == before  # type: ignore[attr-defined]
 
 
-def test_no_command_is_called_that_the_release_does_not_have(bench: Make) -> None:
+def test_commands_missing_in_the_release_are_not_called(bench: Make) -> None:
     made = bench(release=19)
     asked: list[bytes] = []
     answer = made.emulator.answer

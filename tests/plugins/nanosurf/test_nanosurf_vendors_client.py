@@ -1,4 +1,4 @@
-"""The maker's own client (nanosurf-core), unmodified, drives the emulated Studio as the maker's examples do."""
+"""The maker's own client (nanosurf-core), unmodified, drives the emulated Studio as in the maker's examples."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ DEADLINE_S = 60.0
 
 @pytest.fixture
 def client(tmp_path: Path) -> Run:
-    """Run a script with the client in a process of its own; it writes into its own folder, so it has a copy."""
+    """Run a script with the client in a process; the client gets a copy of its own, since it writes to its folder."""
     if CLIENT is None or CLIENT.origin is None:
         pytest.skip("nanosurf-core is not installed")
     site = tmp_path / "site"
@@ -67,7 +67,7 @@ def emulated() -> Emulated:
     return Emulated(seed=2, start_s=0.01, file_s=0.01)
 
 
-def test_it_finds_the_application_and_its_release(tmp_path: Path, client: Run) -> None:
+def test_client_finds_the_application_and_its_release(tmp_path: Path, client: Run) -> None:
     with emulated().running(tmp_path / "gallery") as address:
         told = client(
             address,
@@ -79,7 +79,7 @@ print(json.dumps({"version": studio.version(), "list": listed}))
     assert told == {"version": [19, 0], "list": ["91-01-000"]}
 
 
-def test_it_measures_as_the_makers_example_does(tmp_path: Path, client: Run) -> None:
+def test_client_measures_as_in_the_makers_example(tmp_path: Path, client: Run) -> None:
     made = emulated()
     with made.running(tmp_path / "gallery") as address:
         told = client(
@@ -122,16 +122,16 @@ def test_the_makers_demo_runs_to_its_end(tmp_path: Path, client: Run) -> None:
             f"""
 from contextlib import redirect_stdout
 from io import StringIO
-said = StringIO()
-with redirect_stdout(said):
+printed = StringIO()
+with redirect_stdout(printed):
     runpy.run_path({str(SCRIPTS / "studio_scripting.py")!r}, run_name="__main__")
-print(json.dumps({{"said": said.getvalue()}}))
+print(json.dumps({{"printed": printed.getvalue()}}))
 """,
             ELSEWHERE,
         )
         wait_for_files(tmp_path / "gallery", 1)
-    assert str(told["said"]).endswith("Session complete.\n"), told
-    assert "Studio error" not in str(told["said"])
+    assert str(told["printed"]).endswith("Session complete.\n"), told
+    assert "Studio error" not in str(told["printed"])
     (file,) = (tmp_path / "gallery").glob("demo_20??-??-??_00001.nhf")
     assert afspm.read(file).scans[0].values.shape == (256, 256)
 
@@ -149,7 +149,7 @@ names, failed = {{}}, []
 for number, source in enumerate(code, 1):
     try:
         exec(source, names)
-    except Exception as error:
+    except Exception as error:  # any error of a cell is reported with its source
         failed.append(f"cell {{number}}: {{type(error).__name__}} {{error}}")
 studio = names["session"].workflow
 print(json.dumps({{
@@ -194,7 +194,7 @@ found["m"] = [control.setpoint, control.setpoint_min, control.setpoint_max]
 control.setpoint = 30e-9
 control.setpoint_unit = "V"
 found["after"] = control.setpoint
-said = []
+printed = []
 for call in (
     lambda: setattr(control, "setpoint_unit", "N"), calibration.apply,
     lambda: session.workflow.spectroscopy.select_cycle_by_id("none"),
@@ -208,41 +208,41 @@ for call in (
     try:
         call()
     except StudioScriptError as error:
-        said.append(str(error))
-print(json.dumps({**found, "said": said}))
+        printed.append(str(error))
+print(json.dumps({**found, "printed": printed}))
 """,
         )
-    sensitivity = 60e-9 * 1.2  # that of the maker of the cantilever, before it is calibrated
+    sensitivity = 60e-9 * 1.2  # nominal value of the cantilever, before the calibration
     assert told["V"] == [0.7, -10.0, 10.0]
     assert told["m"] == pytest.approx([0.7 * sensitivity, -10.0 * sensitivity, 10.0 * sensitivity])
     assert told["after"] == pytest.approx(30e-9 / sensitivity)
     assert told["units"] == ["V", "m"]
-    assert len(told["said"]) == 9  # type: ignore[arg-type]
+    assert len(told["printed"]) == 9  # type: ignore[arg-type]
 
 
-def test_an_error_of_a_script_is_an_error_of_the_client(tmp_path: Path, client: Run) -> None:
+def test_script_error_is_raised_by_the_client(tmp_path: Path, client: Run) -> None:
     with emulated().running(tmp_path / "gallery") as address:
         told = client(
             address,
             """
 session = studio.select_measurement_session()
-said = []
+printed = []
 for value in (1e9, 0):
     try:
         session.workflow.imaging.points_per_line = value
     except StudioScriptError as error:
-        said.append(str(error))
-print(json.dumps({"said": said}))
+        printed.append(str(error))
+print(json.dumps({"printed": printed}))
 """,
         )
-    assert told["said"] == [
+    assert told["printed"] == [
         "Script Error: imaging.points_per_line: 1000000000.0 is not within 2 to 8192",
         "Script Error: imaging.points_per_line: 0 is not within 2 to 8192",
     ]
 
 
 def wait_for_files(folder: Path, count: int) -> None:
-    """Wait until so many whole files are there."""
+    """Wait for a number of complete files."""
     deadline_s = time.monotonic() + DEADLINE_S
     while time.monotonic() < deadline_s:
         try:

@@ -10,7 +10,7 @@ from afspm.basics.errors import ConfigError
 from afspm.plugins.nanosurf.emulator import NanosurfEmulator
 
 
-def test_what_is_missing_is_told_with_the_command_that_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_package_is_reported_with_the_install_command(monkeypatch: pytest.MonkeyPatch) -> None:
     version = metadata.version
 
     def found(name: str) -> str:

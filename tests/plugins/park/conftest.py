@@ -1,4 +1,4 @@
-"""Fixtures for the tests of Park."""
+"""Fixtures for tests of Park."""
 
 from __future__ import annotations
 

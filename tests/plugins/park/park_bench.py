@@ -1,4 +1,4 @@
-"""The Park translator as a real process, an emulated SmartScan beside it, and a peer on the translator's sockets."""
+"""Bench: the Park translator as a process, an emulated SmartScan, and a peer on the translator's sockets."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.plugins.park.emulator import ParkEmulator
 
 
 class Emulated(AtPanel, ParkEmulator):
-    """With somebody at its panel."""
+    """An emulated SmartScan with a person at its panel."""
 
 
 class Bench(VendorBench[Emulated]):

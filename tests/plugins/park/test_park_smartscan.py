@@ -1,4 +1,4 @@
-"""The emulated SmartScan without its socket: what scripts measure and move, on a clock that the test moves."""
+"""The emulated SmartScan without its socket: measurements and moves of scripts, on the test's own clock."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from afspm.simulation.instrument import Instrument, InstrumentBusy
 
 
 class SmartScan(SmartScanProgram):
-    """With calls as a script makes them, and a clock that goes on until what was called is done."""
+    """SmartScan with calls in the form of scripts, on a clock that advances until a call has ended."""
 
     def __init__(self, folder: Path) -> None:
         self.clock = FakeClock()
@@ -96,7 +96,7 @@ def test_scanner_stepped_down_touches_without_a_crash(smartscan: SmartScan) -> N
 @pytest.mark.parametrize(
     ("path", "target_um"), [("zscanner.moveTo", -1.0), ("zstage.moveTo", -3.0), ("zstage.move", -3.0)]
 )
-def test_tip_that_is_driven_into_the_sample_leaves_a_crater(smartscan: SmartScan, path: str, target_um: float) -> None:
+def test_tip_driven_into_the_sample_leaves_a_crater(smartscan: SmartScan, path: str, target_um: float) -> None:
     smartscan.call(path, target_um)
     (crater,) = smartscan.rig.world.sample.marks
     assert crater.kind == "crash"
@@ -132,7 +132,7 @@ def test_value_out_of_range_is_refused_and_nothing_moves(smartscan: SmartScan, p
         ("scan.triggerLineScan", ()),
     ],
 )
-def test_nothing_moves_from_the_start_of_a_scan_on(smartscan: SmartScan, path: str, given: tuple[float, ...]) -> None:
+def test_moves_are_refused_during_a_scan(smartscan: SmartScan, path: str, given: tuple[float, ...]) -> None:
     smartscan.begin("scan.triggerImageScan")
     for _ in range(3):  # the ramp to the first line, and the first lines
         with pytest.raises(InstrumentBusy, match="busy with a scan"):
@@ -160,7 +160,7 @@ def test_stage_puts_another_place_under_the_tip_and_back(smartscan: SmartScan) -
 # --- channels ---
 
 
-def test_files_are_those_of_the_channels_that_are_recorded(smartscan: SmartScan, tmp_path: Path) -> None:
+def test_files_exist_for_recorded_channels_only(smartscan: SmartScan, tmp_path: Path) -> None:
     for name in smartscan.call("scan.channels.names"):
         smartscan.call("scan.channels.remove", name)
     smartscan.call("scan.channels.add", {"name": "ChannelZHeight", "unit": "um"})
@@ -216,7 +216,7 @@ def test_sweep_of_the_drive_frequency_keeps_the_instrument_busy(smartscan: Smart
 
 
 def run_on(script: Script) -> tuple[object, str] | None:
-    """The value of a script; None once it waits for the instrument."""
+    """Return the value of a script; None once it waits for the instrument."""
     while (found := script.step()) is None and not script.waits:
         pass
     return found
@@ -235,14 +235,14 @@ def test_script_sleeps_in_the_experiments_time(smartscan: SmartScan) -> None:
     assert smartscan.next_waking_s(smartscan.clock.t_s) is None
 
 
-def test_value_of_what_took_its_time_is_the_scripts(smartscan: SmartScan) -> None:
+def test_value_of_a_slow_call_returns_to_the_script(smartscan: SmartScan) -> None:
     script = Script("spm.readChannelAveraged('current', 2, 10).unit", smartscan.names, smartscan.ask)
     assert run_on(script) is None
     smartscan.clock.t_s += 1.0
     assert run_on(script) == ("pA", "pA")
 
 
-def test_script_that_computes_holds_nothing_up(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_computing_script_does_not_block_others(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
     script = Script("let sum = 0; for (let i = 0; i < 3e6; i++) { sum += i; } 5", smartscan.names, smartscan.ask)
     assert script.step() is None
@@ -250,7 +250,7 @@ def test_script_that_computes_holds_nothing_up(smartscan: SmartScan, monkeypatch
     assert run_on(script) == (5, "5")
 
 
-def test_script_without_an_end_is_given_up(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_script_is_ended(smartscan: SmartScan, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(engine, "_AT_ONCE_S", 0.01)
     monkeypatch.setattr(engine, "LONGEST_S", 0.0)
     script = Script("for (let i = 0; i < 3e6; i++) {} 5", smartscan.names, smartscan.ask)
@@ -265,7 +265,7 @@ NO_REQUESTS = (b"hello", b"", b"\xff\xfe", b"[" * 100_000, b"5", b"[]", b'{"id":
 
 
 @pytest.mark.parametrize("errors", ["rpc", "result", "value"])
-def test_request_that_is_no_object_of_json_is_refused_as_json_rpc_says(errors: Any, tmp_path: Path) -> None:
+def test_malformed_request_gets_the_json_rpc_error(errors: Any, tmp_path: Path) -> None:
     with (
         ParkEmulator(seed=2, errors=errors).running(tmp_path / "data") as address,
         zmq.Context() as context,

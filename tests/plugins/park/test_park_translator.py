@@ -1,4 +1,4 @@
-"""The Park translator against an emulated SmartScan: what is asked happens, where it should, and is published."""
+"""The Park translator with an emulated SmartScan: requests, their effects, and publications."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ VARIANTS: list[Settings] = [
 ]
 
 
-def test_a_scan_shows_the_sample_as_it_lies(bench: Make) -> None:
+def test_scan_shows_the_sample_in_place(bench: Make) -> None:
     made = bench(tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
     peer = made.start()
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
@@ -51,9 +51,7 @@ def test_a_scan_shows_the_sample_as_it_lies(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_withdrawn(
-    bench: Make, variant: Settings
-) -> None:
+def test_tip_moves_scans_and_withdraws_with_every_form_of_reply(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = made.start()
     ready(peer)
@@ -67,7 +65,7 @@ def test_whatever_smartscan_turns_out_to_say_the_tip_is_moved_scanned_with_and_w
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_what_smartscan_refuses_is_refused_with_its_own_words(bench: Make, variant: Settings) -> None:
+def test_refusal_has_smartscans_own_text(bench: Make, variant: Settings) -> None:
     made = bench(**variant)
     peer = small(made)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
@@ -90,14 +88,14 @@ def test_withdrawing_ends_a_scan_and_lifts_the_stage(bench: Make) -> None:
 
 
 @pytest.mark.parametrize("scanning", [True, False])
-def test_the_tip_is_withdrawn_when_the_run_ends(bench: Make, scanning: bool) -> None:
+def test_tip_is_withdrawn_at_the_end_of_a_run(bench: Make, scanning: bool) -> None:
     made = bench(speed=10.0)
     left_in_danger(made, scanning=scanning, retracts=True)
     assert not made.emulator.rig.engaged
 
 
 @pytest.mark.parametrize(
-    ("kind", "told"),
+    ("kind", "logged"),
     [
         ("no-reply", "no reply to"),
         ("late-reply", "no reply to"),
@@ -107,40 +105,40 @@ def test_the_tip_is_withdrawn_when_the_run_ends(bench: Make, scanning: bool) -> 
         ("dialog", "a dialog may wait on its screen"),
     ],
 )
-def test_a_bad_reply_has_a_name_and_smartscan_is_found_again(bench: Make, kind: str, told: str) -> None:
+def test_bad_reply_is_logged_and_smartscan_reconnected(bench: Make, kind: str, logged: str) -> None:
     made = bench()
     peer = small(made, **SOON)
     made.strike(kind, duration_s=500.0)
     peer.until(UNDEFINED)
     peer.until(FREE)
-    made.until_said(told)
+    made.until_logged(logged)
     response = peer.act_once_free(names.START_SCAN)
     assert response.ok, response.reason
     assert scans(peer.until(FREE))
 
 
-def test_a_word_that_is_not_known_is_named_and_not_guessed_at(bench: Make) -> None:
+def test_unknown_word_is_named_and_not_guessed(bench: Make) -> None:
     made = bench(scan_words=("true", "schläft"))
     with pytest.raises(AssertionError):
         small(made, **SOON)
-    made.until_said("replied 'schläft' to scan_query")
+    made.until_logged("replied 'schläft' to scan_query")
 
 
-def test_a_word_can_be_taught(bench: Make) -> None:
+def test_words_can_be_added(bench: Make) -> None:
     peer = bench(scan_words=("misst", "ruht")).start(scanning_words=["misst"], idle_words=["Ruht"])
     ready(peer)
     assert scanned(peer)
 
 
 @pytest.mark.parametrize(("kind", "state"), [("late-file", "FREE"), ("half-file", "FREE")])
-def test_a_file_that_is_late_is_waited_for(bench: Make, kind: str, state: str) -> None:
+def test_late_file_is_awaited(bench: Make, kind: str, state: str) -> None:
     made = bench()
     peer = small(made)
     made.strike(kind, duration_s=300.0)
     assert peer.act(names.START_SCAN).ok
-    heard = peer.until(FREE)
-    assert scans(heard)
-    assert states(heard)[-1] == state
+    received = peer.until(FREE)
+    assert scans(received)
+    assert states(received)[-1] == state
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -153,9 +151,9 @@ def test_a_curve_is_taken_where_the_tip_was_sent(bench: Make, kind: str, swept: 
     scanned(peer)
     assert peer.set(names.SPEC_KIND, kind).ok
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert states(heard) == ["SPEC", "FREE"]
-    (curve,) = [one for one in heard if isinstance(one, Spectrum)]
+    received = peer.until(FREE)
+    assert states(received) == ["SPEC", "FREE"]
+    (curve,) = [one for one in received if isinstance(one, Spectrum)]
     assert (curve.kind, curve.names[0], curve.position_m) == (kind, swept, (120e-9, -40e-9))
     taken = made.emulator.rig.spectrum
     assert taken is not None
@@ -171,12 +169,12 @@ def test_a_curve_can_be_stopped(bench: Make) -> None:
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok
-    heard = peer.until(FREE)
-    assert not any(isinstance(one, Spectrum) for one in heard)
+    received = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in received)
 
 
-def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(bench: Make) -> None:
-    """They go by two connections."""
+def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make) -> None:
+    # Start and stop use two connections.
     made = bench(speed=1.0, force={"duration_s": 20.0})
     peer = small(made)
     stops: list[float] = []
@@ -194,7 +192,7 @@ def test_a_stop_that_overtakes_the_start_of_its_curve_is_told_again(bench: Make)
     assert len(stops) > 1
 
 
-def test_a_curve_that_is_stopped_on_the_way_to_it_is_not_taken(bench: Make) -> None:
+def test_curve_stopped_during_the_move_to_it_is_not_taken(bench: Make) -> None:
     made = bench()
     peer = made.start()
     ready(peer)
@@ -218,17 +216,17 @@ def test_withdrawing_ends_a_curve(bench: Make) -> None:
     assert not made.emulator.rig.engaged
 
 
-def test_a_curve_that_smartscan_refuses_is_no_result(bench: Make) -> None:
+def test_refused_curve_has_no_result(bench: Make) -> None:
     made = bench()
     peer = small(made)
     made.at_panel(lambda emulator: emulator.rig.occupy("calibration", 1e4, emulator.clock.now_s()))
     peer.act(names.START_SPEC)
-    heard = peer.until(FREE)
-    assert states(heard)[-2:] == ["INTERRUPTED", "FREE"]
-    made.until_said("busy with a calibration")
+    received = peer.until(FREE)
+    assert states(received)[-2:] == ["INTERRUPTED", "FREE"]
+    made.until_logged("busy with a calibration")
 
 
-def test_a_gain_is_set_and_leaves_the_others(bench: Make) -> None:
+def test_setting_one_gain_keeps_the_others(bench: Make) -> None:
     made = bench()
     peer = small(made)
     assert peer.set(names.ZCTRL_IGAIN, 0.25).ok
@@ -238,30 +236,30 @@ def test_a_gain_is_set_and_leaves_the_others(bench: Make) -> None:
     assert peer.set(names.ZCTRL_PGAIN, 1000.0).code == ControlResponse.PARAM_ERROR
 
 
-def test_gains_that_smartscan_does_not_tell_are_not_supported(bench: Make) -> None:
-    made = bench(tells_gains=False)
+def test_unreported_gains_are_not_supported(bench: Make) -> None:
+    made = bench(reports_gains=False)
     peer = small(made)
     assert peer.get_response(names.ZCTRL_IGAIN).code == ControlResponse.PARAM_NOT_SUPPORTED
     assert scanned(peer)
-    made.until_said("does not tell the gains")
+    made.until_logged("does not report the gains")
 
 
 @pytest.mark.parametrize("kind", ["spectrum-refused", "no-file"])
-def test_a_curve_without_a_file_is_told_to_be_missing(bench: Make, kind: str) -> None:
+def test_curve_without_a_file_is_reported(bench: Make, kind: str) -> None:
     made = bench()
     peer = small(made, result_timeout_s=2.0)
     made.strike(kind)
     assert peer.act(names.START_SPEC).ok
-    heard = peer.until(FREE)
-    assert not any(isinstance(one, Spectrum) for one in heard)
-    assert "INTERRUPTED" in states(heard)
+    received = peer.until(FREE)
+    assert not any(isinstance(one, Spectrum) for one in received)
+    assert "INTERRUPTED" in states(received)
     made.strike("late-file", duration_s=100.0)
     assert peer.act(names.START_SPEC).ok
     assert [one.kind for one in peer.until(FREE) if isinstance(one, Spectrum)] == ["force"]
 
 
 @pytest.mark.parametrize("replies", ["at-end", "at-once"])
-def test_command_that_takes_long_keeps_the_microscope_busy_and_connected(bench: Make, replies: str) -> None:
+def test_long_command_keeps_the_microscope_busy_and_connected(bench: Make, replies: str) -> None:
     made = bench(speed=1.0, replies=replies)  # a sweep takes 3 s, and a reply may take one
     peer = small(made, actions={"x-sweep": {"command": "spm.ncm.sweepAutoFullRange()"}}, reply_timeout_s=1.0)
     assert peer.act("x-sweep").ok
@@ -269,7 +267,7 @@ def test_command_that_takes_long_keeps_the_microscope_busy_and_connected(bench: 
     assert not made.emulator.rig.busy(made.clock.now_s())
 
 
-def test_command_that_smartscan_does_not_know_is_refused_in_its_words(bench: Make) -> None:
+def test_unknown_command_is_refused_with_smartscans_own_text(bench: Make) -> None:
     peer = small(bench(), actions={"x-mode": {"command": "spm.head.setMode('ncm')"}})
     response = peer.act("x-mode")
     assert response.code == ControlResponse.ACTION_ERROR

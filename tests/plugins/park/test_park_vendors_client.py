@@ -28,7 +28,7 @@ DEADLINE_S = 60.0
 
 @pytest.fixture
 def client() -> Run:
-    """Run a script with the client in a process of its own."""
+    """Run a script with the client in a process."""
     if importlib.util.find_spec("SmartRemote") is None:
         pytest.skip("smartremote is not installed")
 
@@ -44,7 +44,7 @@ def client() -> Run:
     return run
 
 
-def test_its_queries_are_answered(tmp_path: Path, client: Run) -> None:
+def test_client_queries_are_answered(tmp_path: Path, client: Run) -> None:
     with Emulated(seed=2).running(tmp_path / "data") as address:
         told = client(
             address,
@@ -66,7 +66,7 @@ print(json.dumps({
 
 
 @pytest.mark.parametrize("replies", ["at-end", "at-once"])
-def test_it_approaches_scans_and_withdraws(tmp_path: Path, client: Run, replies: str) -> None:
+def test_client_approaches_scans_and_withdraws(tmp_path: Path, client: Run, replies: str) -> None:
     made = Emulated(seed=2, start_s=0.01, file_s=0.01, replies=replies)
     with made.running(tmp_path / "data") as address:
         told = client(
@@ -91,7 +91,7 @@ print(json.dumps({"value": remote.run(script)["value"], "ended": ended, "frame":
     assert scan.region.center_m == pytest.approx((3e-7, -1e-7))
 
 
-def test_it_takes_curves_where_it_moved_the_tip(tmp_path: Path, client: Run) -> None:
+def test_client_takes_curves_at_the_tip(tmp_path: Path, client: Run) -> None:
     made = Emulated(seed=2, file_s=0.01, force={"duration_s": 0.1}, iv={"duration_s": 0.1})
     with made.running(tmp_path / "data") as address:
         told = client(
@@ -111,7 +111,7 @@ print(json.dumps({mode: remote.run(f"spm.spect.start('{mode}', 'here')")["result
     assert made.rig.spectrum.position_m == pytest.approx((2e-7, -1e-7))
 
 
-def test_what_is_computed_needs_no_instrument(tmp_path: Path, client: Run) -> None:
+def test_computation_needs_no_instrument(tmp_path: Path, client: Run) -> None:
     with Emulated(seed=2, values="native").running(tmp_path / "data") as address:
         told = client(address, """print(json.dumps({"sum": remote.run("[1, 2, 3].map(x => x * x)")["value"]}))""")
     assert told == {"sum": [1, 4, 9]}

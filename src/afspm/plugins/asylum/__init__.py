@@ -1,4 +1,16 @@
-"""Asylum Research, over ZeroMQ-XOP in its Igor Pro. See the README beside this."""
+"""Driver of Asylum Research microscopes, over ZeroMQ-XOP in Igor Pro. See the README in this folder.
+
+**Theory of operation.** Each request calls one Igor function (`xop`, `link`), and Igor answers when it is idle. The
+state is polled from two sources, ARGetStatus and the values behind the panels (`session`).
+
+    comes in      replies, matched by their id; new .ibw files in Asylum's data folder
+    state         the running and the ended measurement, the frame of the open image (origin of spots), whether a scan
+                  has moved the tip: all persistent (`activity`)
+    goes out      calls of Asylum's functions and of `afspm.ipf`; scans and force curves from files (`result_files`)
+    always holds  one request is in flight; a reply without a result (NaN) is neither success nor failure: the state
+                  decides; all dependent values of a frame are set together, since PV updates none of them; a scan runs
+                  once (LastScan)
+"""
 
 from __future__ import annotations
 
@@ -31,22 +43,22 @@ _AT_FIRST: Final[dict[str, Value]] = {
 }
 _SPOTS: Final = ("image", "scanner", "none")
 _NAME: Final = "[A-Za-z][A-Za-z0-9_]{0,16}"
-"""Of a wave of Igor's, with room for the number; it is a file's name, too."""
+"""Base name of waves and files: Igor's limit for wave names, less four digits."""
 
 
 class Asylum(Driver):
     """The microscope behind Asylum Research's software.
 
     Args:
-        address: that was given to `zeromq_server_bind`.
-        folders: beginnings of Asylum's folders as Igor writes them, "C:Users:Me:", and where those are seen from
-            here; without it: Asylum runs on this computer.
-        base_name: of the files that Asylum saves; left out: what its panel says.
-        spots: what SpotX and SpotY count from: the lower left corner of the last "image", along its axes; the middle
-            of the "scanner"; "none": the tip can't be sent anywhere.
-        move_s: the time that a move to a spot may take, which Asylum does not tell, in experiment time.
-        reply_timeout_s: how long Igor may take to answer, in real time.
-        poll_period_s, common: as for every microscope.
+        address: the endpoint passed to `zeromq_server_bind` in Igor.
+        folders: Igor's folder prefixes, "C:Users:Me:", mapped to mount points on this computer. Default: Asylum runs on
+            this computer.
+        base_name: base name of the files that Asylum saves. Default: the name set on its panel.
+        spots: origin of SpotX and SpotY: "image" is the lower left corner of the last image, along its axes; "scanner"
+            is the middle of the scanner; "none" disables moving the tip.
+        move_s: longest duration of a move to a spot, experiment time. Asylum does not report the end of a move.
+        reply_timeout_s: longest wait for a reply of Igor, real time.
+        poll_period_s, common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -75,7 +87,7 @@ class Asylum(Driver):
         self._base_name = _checked_name(base_name)
         self._spots = spots
         if spots not in _SPOTS:
-            raise ConfigError(f"{spots!r}", where="spots", hint=" or ".join(_SPOTS))
+            raise ConfigError(f"{spots!r} is no origin of spots", where="spots", hint=" or ".join(_SPOTS))
         if spots == "none":
             self.table = self.table.without(POSITION)
         self._reply_timeout_s = reply_timeout_s
@@ -152,7 +164,7 @@ class Asylum(Driver):
             self._igor().put(vendor, value)
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the table, all numbers by one question."""
+        """Return values of the parameter table, all numbers with one request."""
         numbers = [name for name in wanted if self.table[name].type != "text" and name != names.ENGAGED]
         values = self._igor().values([self.table[name].vendor for name in numbers]) if numbers else {}
         found = {name: self.table[name].from_vendor(values[self.table[name].vendor]) for name in numbers}
@@ -168,16 +180,18 @@ class Asylum(Driver):
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Scan the frame once, in the direction of `x-scan-direction`."""
+        """Scan the frame once, in the direction `x-scan-direction`."""
         self._activity.saves(SCAN)
         probe_m = self._place.xy_m() if self._spots == "image" else None
         self._activity.begin(SCAN)
         up = self._kept[names.SCAN_DIRECTION] == names.UP
+        # with LastScan 0 Asylum scans the frame again and again
         self._igor().put("LastScan", 1)
         self._begin(SCAN, "DoScanFunc", "UpScan" if up else "DownScan")
-        self._igor().put("LastScan", 1)  # also where beginning to scan puts it back
+        self._igor().put("LastScan", 1)  # again, in case the start has reset it
         self._activity.await_begin(SCAN)
-        if probe_m is not None:  # it stays where it is, on another image
+        # spots count from the corner of the new image now: the same position is another spot
+        if probe_m is not None:
             try:
                 self._place.put(probe_m)
             except (XopError, Refused) as error:
@@ -194,14 +208,16 @@ class Asylum(Driver):
 
     @action(names.STOP_SCAN)
     def stop_scan(self) -> None:
-        """Break the scan off. Asylum withdraws the tip."""
+        """Stop the scan. Asylum also withdraws the tip."""
         self._igor().do("DoScanFunc", "StopScan")
         self._activity.stopped()
+        # StopScan also stops the feedback and withdraws the tip: a person should know
         self.log.warning("Asylum withdrew the tip, as it does whenever a scan is stopped")
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve where the tip was sent, or else where it is."""
+        """Take a force curve where the tip was sent; where the tip is if it was never sent."""
+        # ScanStatus and FMapStatus do not show single force curves
         if self._igor().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
@@ -224,13 +240,14 @@ class Asylum(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Stop whatever is going on, feedback too, and withdraw the tip."""
+        """Stop scan, force curve and feedback, and withdraw the tip."""
         self._igor().do("DoScanFunc", "StopScan")
         self._activity.stopped()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample, as the button Engage does."""
+        """Bring the tip to the sample, like the button Engage."""
+        # the function takes the name of the pressed button
         if not self._igor().do("SimpleEngageMe", "SimpleEngageButton"):
             raise Refused(ControlResponse.ACTION_ERROR, "Asylum refused to engage")
 
@@ -239,7 +256,7 @@ class Asylum(Driver):
         self.pulse_bias()
 
     def command(self, text: str) -> None:
-        """A function with its arguments as JSON: `DoScanFunc "DownScan"`, `PV "SaveImage", 2`."""
+        """Call an Igor function with arguments as JSON: `DoScanFunc "DownScan"`, `PV "SaveImage", 2`."""
         name, _, arguments = text.strip().partition(" ")
         try:
             parameters = json.loads(f"[{arguments}]")
@@ -251,7 +268,6 @@ class Asylum(Driver):
 
 
 def _checked_name(name: str) -> str:
-    """Return a base name that Asylum takes. Raises ConfigError."""
     fits = not name or (re.fullmatch(_NAME, name) and "mask" not in name.lower())
     if not fits:
         hint = 'up to 17 letters, digits and "_", beginning with a letter, without "Mask"'

@@ -1,4 +1,4 @@
-"""The state of Asylum, and what is awaited of it."""
+"""State of the Asylum controller, and the measurements that wait for their end."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from afspm.translator.state import Kept
 FORCE: Final = "force"
 
 _SAVED_TO: Final = {SCAN: "SaveImage", FORCE: "SaveForce"}
-"""Both a number, of which 2 means that it is saved, and a text, the folder."""
+"""Each name is a number (2: measurements are saved) and, in GS, a text (the folder)."""
 _SAVE: Final = 2.0
 
 
 class AsylumActivity(Activity):
-    """The measurement that runs at the controller, begun by a request or at its panel.
+    """The running measurement, started by a request or at Asylum's panel.
 
     Args:
-        files: takes what comes of it.
-        kept: JSON-able, and lasts: the frame of the image that spots are counted on, until when the tip moves, and
-            whether a scan has led it away since.
-        folders: see `local`.
-        frame_in_force: as it was set.
-        spot_m: gives the spot that the tip was sent to; None: there are no spots.
-        take_curve: begins a force curve.
+        files: collects the results.
+        kept: persistent, JSON-able: frame of the image whose corner is the origin of spots, arrival time of the tip,
+            and whether a scan has moved the tip since.
+        folders: Igor's folder prefixes; see `local`.
+        frame_in_force: returns the frame as it was set.
+        spot_m: returns the spot to which the tip was sent; None: moving the tip is disabled.
+        take_curve: starts a force curve.
     """
 
     program: ClassVar[str] = "Asylum"
@@ -63,7 +63,7 @@ class AsylumActivity(Activity):
         self.way = TipWay(kept, clock)
 
     def status(self) -> ScopeStatus:
-        """Return what it is doing now; what has ended is awaited from here on."""
+        """Return the present state; register measurements that have ended, whose files are then awaited."""
         state = self._session.doing().state
         if self.curve_awaited:
             return self._arriving(state)
@@ -75,7 +75,6 @@ class AsylumActivity(Activity):
         return ScopeStatus(ScopeState.MOVING) if self.way.is_on else self.at_rest()
 
     def _arriving(self, state: ScopeState) -> ScopeStatus:
-        """On the way to where a force curve is to be taken."""
         if state is ScopeState.FREE and self.way.is_on:
             return ScopeStatus(ScopeState.SPEC)
         self.curve_awaited = ""
@@ -89,29 +88,31 @@ class AsylumActivity(Activity):
 
     @property
     def image(self) -> Region:
-        """The frame of the last image that was begun, which Asylum counts spots on."""
+        """Return the frame of the last image, whose lower left corner is the origin of Asylum's spots."""
         return as_region(self._kept["image"])
 
     def find_image(self) -> None:
-        """Before anything was scanned, and another frame set: that of the image that is open is in force."""
+        """Take the frame in force for the open image's, unless an earlier run has stored one."""
         self._kept.setdefault("image", as_list(self._frame_in_force()))
 
     def _image_begins(self) -> None:
-        """A scan is seen running: not before, as one that does not begin leaves the image of before."""
+        # Only once the scan is seen running: a scan that does not start leaves the previous image open, and its spots
+        # valid.
         if (frame := self._files.frame) is not None:
             self._kept["image"] = frame
 
     def begin(self, what: str) -> None:
-        """Note that a measurement begins; of a force curve at the panel, only its file has the position."""
+        """Register the start of a measurement. Of a force curve from the panel, only the file has the position."""
         taken: dict[str, object] = {"position": None}
         if what == SCAN:
-            if "led_away" in self._kept:  # it was sent somewhere
+            # only if the tip was ever sent to a spot: else a force curve stays where it is
+            if "led_away" in self._kept:
                 self._kept["led_away"] = True
             taken = {"frame": as_list(self._frame_in_force())}
         self._files.begin_at(what, self._target(what), taken)
 
     def begin_curve(self) -> None:
-        """Note that a force curve begins where the tip was sent."""
+        """Register the start of a force curve at the spot where the tip was sent."""
         spot_m = None if self._spot_m is None else list(self._spot_m())
         self._files.begin_at(FORCE, self._target(FORCE), {"position": spot_m})
 
@@ -119,12 +120,13 @@ class AsylumActivity(Activity):
         self._files.end(self._clock.now_ns())
 
     def saves(self, what: str) -> None:
-        """Have it saved where it can be found.
+        """Switch on saving, and check that the folder is reachable.
 
         Raises:
-            Refused: ACTION_ERROR: its folder can't be seen from here.
+            Refused: ACTION_ERROR: the folder does not exist on this computer.
         """
         name = _SAVED_TO[what]
+        # the file is the only result: no function used here returns images or curves
         if self._session.values([name])[name] != _SAVE:
             self._log.warning("Asylum did not save its measurements (%s); saving is on from now on", name)
             self._session.put(name, _SAVE)
@@ -134,44 +136,41 @@ class AsylumActivity(Activity):
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def folder(self, what: str) -> Path:
-        """Where Asylum saves to, as seen from here.
-
-        Raises:
-            ConfigError: the settings don't say.
-        """
+        """Return Asylum's folder as a path on this computer. Raises ConfigError: `folders` has no prefix for it."""
         return local(self._session.text("GS", _SAVED_TO[what]), self._folders)
 
     def call_files(self, base: str) -> None:
-        """Have files called so from now on, their numbers following those that are there: Asylum overwrites."""
+        """Set the base name of files, with a number above those of existing files: Asylum overwrites files."""
         self._session.do("SetBaseName", base)
         self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
         try:
-            self._session.do("ARCheckSuffix")  # as the panel does; it sees folders that can't be seen from here, too
+            # the panel's own check also sees folders that are not reachable from this computer
+            self._session.do("ARCheckSuffix")
         except XopError as error:
             if error.number != MISSING:
                 raise
 
     def await_begin(self, what: str) -> None:
-        """Wait until what was begun is seen running, or has ended already. Raises Refused."""
+        """Wait until the measurement is seen running or has a file. Raises Refused."""
         state = ScopeState.SCANNING if what == SCAN else ScopeState.SPEC
         self.settle(what, lambda: self._session.doing().state is state or self._files.has_file())
         self._image_begins()
 
     def refuse(self, what: str) -> Refused:
-        """The refusal of what Asylum said that it does not do; nothing comes of it."""
+        """Forget the measurement, and return the refusal for a request that Asylum declined."""
         self.forget()
         return Refused(
             ControlResponse.ACTION_ERROR, f"Asylum refused to begin the measurement ({what}): see its history window"
         )
 
     def moves(self, lasts_s: float) -> None:
-        """The tip was sent away; it arrives, which Asylum does not tell, after so long at the latest."""
+        """Register a move that takes at most `lasts_s`, experiment time; Asylum does not report arrival."""
         self.way.sets_out(lasts_s)
         self._kept["led_away"] = False
 
     @property
     def was_led_away(self) -> bool:
-        """True if a scan has taken the tip from where it was sent."""
+        """True if a scan has moved the tip away from the spot where it was sent."""
         return bool(self._kept.get("led_away"))
 
     def _target(self, what: str) -> Target:

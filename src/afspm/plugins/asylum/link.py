@@ -1,4 +1,4 @@
-"""The connection to ZeroMQ-XOP: one request, then its reply. Igor never speaks unasked."""
+"""Connection to ZeroMQ-XOP: one request, then its reply. Igor sends nothing unrequested."""
 
 from __future__ import annotations
 
@@ -16,42 +16,43 @@ _HINTS = (
 
 
 class Link:
-    """A connection. For one thread. Whatever goes wrong but an error of Igor's own, it is closed.
+    """A connection for one thread, closed after any failure other than an error reported by Igor.
 
     Args:
         address: e.g. "tcp://127.0.0.1:5555".
-        timeout_s: how long a reply may take, in real time.
-        monotonic_s: real time.
+        timeout_s: longest wait for a reply, real time.
+        monotonic_s: returns real time.
 
     Raises:
-        ControllerLost: nobody listens there. ConfigError: it is no address.
+        ControllerLost: the port does not accept connections. ConfigError: the address is malformed.
     """
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._address = address
         self._numbers = itertools.count(1)
+        # a DEALER, since a REQ is unusable after one lost reply; without an identity, as the XOP refuses duplicates
         self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
 
     def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
-        """Call a function of Igor's that has one result. Raises: as `call`."""
+        """Call an Igor function that has one result. Raises: see `call`."""
         results = self.call(name, *parameters).results
         if len(results) != 1:
             raise xop.BadReply(f"{name} returned {len(results)} results instead of one", where=self._address)
         return results[0]
 
     def call(self, name: str, *parameters: xop.Parameter) -> xop.Reply:
-        """Call a function of Igor's.
+        """Call an Igor function.
 
         Raises:
-            XopError: it could not be done. InvalidValue: what was asked can't be sent.
-            ControllerLost, BadReply: no reply, or none to be trusted; the connection is closed.
+            XopError: Igor reports an error. InvalidValue: the arguments can't be sent.
+            ControllerLost, BadReply: no reply, or an untrustworthy one; the connection is closed.
         """
         message_id = str(next(self._numbers))
         message = xop.request(name, parameters, message_id)
 
         def parse(payload: bytes) -> xop.Reply | None:
             found = xop.reply(payload)
-            # an error found before Igor is asked comes without the id, and can only be that of what is in flight
+            # errors 3 to 7, found before Igor is asked, have no id: they belong to the only request in flight
             is_ours = found.message_id == message_id or (found.message_id is None and found.error is not None)
             return found if is_ours else None
 
@@ -61,19 +62,18 @@ class Link:
         return found
 
     def close(self) -> None:
-        """Let go of it."""
         self._connection.close()
 
 
 def text(result: object) -> str:
-    """A result that has to be a text. Raises BadReply."""
+    """Return a result as text. Raises BadReply: it has another type."""
     if isinstance(result, str):
         return result
     raise xop.BadReply(f"Igor returned {result!r} instead of a text")
 
 
 def number(result: object) -> float:
-    """A result that has to be a number, NaN too. Raises BadReply."""
+    """Return a result as a number, possibly NaN. Raises BadReply: it has another type."""
     if isinstance(result, float):
         return result
     raise xop.BadReply(f"Igor returned {result!r} instead of a number")

@@ -1,4 +1,4 @@
-"""NSID files (.h5, pycroscopy's format) of images: [x, y], both ascending; of Asylum's scans with their notes."""
+"""NSID files (.h5, pycroscopy's format): images [x, y], both ascending; with notes if Asylum's."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
-    """All images of a file. Raises FileError: none in it, or broken. UnitError: axes that are no lengths."""
+    """Read all images of a file. Raises FileError: no image, or damaged. UnitError: axes are not lengths."""
     with hdf5.opened(path) as file:
         nodes: list[h5py.Dataset | h5py.Group] = []
         file.visititems(lambda _, node: nodes.append(node))
@@ -42,7 +42,7 @@ def read_nsid(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _note(image: h5py.Dataset) -> dict[str, object]:
-    """The keys of Asylum's note, which all images of a file share; empty in files of other instruments."""
+    # All images of a file share the note. Files of other instruments have no XOffset.
     metadata = image.parent.get("original_metadata")
     if metadata is None:
         return {}
@@ -57,7 +57,6 @@ def _plain(value: object) -> object:
 
 
 def _axis_m(axis: h5py.Dataset, unit: str) -> NDArray[np.float64]:
-    """Its values in m; `unit`: that it is in, whatever it says."""
     values: NDArray[np.float64] = convert(hdf5.array(axis), unit or hdf5.text(axis.attrs.get("units", "m")), "m")
     return values
 
@@ -65,7 +64,7 @@ def _axis_m(axis: h5py.Dataset, unit: str) -> NDArray[np.float64]:
 def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path: Path) -> Scan:
     channel = hdf5.text(image.attrs["quantity"])
     values = hdf5.array(image).T
-    # what wrote Asylum's gave the axes the unit of their channel; they are in m
+    # the writer of Asylum's files gave axes the unit of their channel, but they are in m
     x, y = (_axis_m(image.parent[axis], "m" if note else "") for axis in "xy")
     if values.shape != (len(y), len(x)) or not ((np.diff(x) > 0).all() and (np.diff(y) > 0).all()):
         raise FileError(f"the axes of {channel} do not fit an image of {values.shape[1]} x {values.shape[0]} pixels")
@@ -73,6 +72,6 @@ def _scan(image: h5py.Dataset, note: dict[str, object], end_ns: int | None, path
     if note:
         center_m, angle_rad = asylum.center_and_angle(note)
     region = Region(center_m, (x[-1] - x[0], y[-1] - y[0]), angle_rad)
-    # what wrote these files gave "m" to channels that it did not know
+    # the writer gave "m" to channels that it did not know
     unit = (asylum.unit_of(channel) if note else "") or hdf5.text(image.attrs.get("units", ""))
     return Scan(region, channel, unit, np.ascontiguousarray(values), end_ns, str(path))

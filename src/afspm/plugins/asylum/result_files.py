@@ -1,4 +1,4 @@
-"""The results of measurements: the file that Asylum saves of it, once it is whole."""
+"""Results of measurements: the files that Asylum saves, once complete."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from pathlib import Path, PureWindowsPath
 from typing import Final
 
 from afspm.basics.errors import ConfigError
+from afspm.basics.formatting import area_text, position_text
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import Scan, Spectrum
+from afspm.model import Region, Scan, Spectrum
 from afspm.translator.folder_files import FolderFiles
 from afspm.translator.result_files import Entry, FilePrecision, as_region, modified_ns
 
@@ -22,11 +23,10 @@ _NUMBERED: Final = re.compile(r".*\d{4}\.ibw", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Target:
-    """Where Asylum will save next.
+    """The file that Asylum will save next: `<base><suffix as four digits>.ibw`.
 
     Attributes:
-        folder: as seen from here.
-        base, suffix: of the name; it is `<base><suffix as four digits>.ibw`.
+        folder: path on this computer.
     """
 
     folder: Path
@@ -42,27 +42,31 @@ class AsylumFiles(FolderFiles):
     """The measurement that is running or has just ended, and the results."""
 
     precision = FilePrecision(part=1e-4, angle_rad=1e-4 * math.tau)
-    """A note prints five digits of a number."""
+    """A note has five digits of a number."""
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
         super().__init__(kept, log)
         kept.setdefault("taken", 0)
 
     def begin_at(self, what: str, target: Target, taken: PlainMapping) -> None:
-        """A measurement begins, which is to be saved as a target."""
+        """Register the start of a measurement whose file is expected at `target`."""
         place = {"base": target.base, "suffix": target.suffix, "there_ns": modified_ns(target.path)}
         self.begin(what, target.folder, {**place, **taken})
 
     def result_name(self, path: Path) -> str:
-        """Return a name with a number, since Asylum may overwrite a file by one of the same name."""
+        """Return a unique name: the number distinguishes files that Asylum overwrites by a new one of the same name."""
         self._kept["taken"] += 1
         return f"{self._kept['taken']}: {path.name}"
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Warn if Asylum scanned another frame than was set: the file is right then."""
+        """Log a warning if the scanned frame differs from the one set; the file is right then."""
         if isinstance(one, Scan) and one.region != (wanted := as_region(measured["frame"])):
-            told = f"{path.name} holds a frame of {one.region} instead of {wanted}, which was set"
-            self._log.warning("%s; the scan is published as the file has it", told)
+            self._log.warning(
+                "%s has the frame %s instead of %s, which was set; it is published with the file's frame",
+                path.name,
+                _frame_text(one.region),
+                _frame_text(wanted),
+            )
 
     def _goes_on(self, running: Entry) -> None:
         running["suffix"] += 1
@@ -70,7 +74,7 @@ class AsylumFiles(FolderFiles):
         super()._goes_on(running)
 
     def _file(self, measured: Entry) -> Path | None:
-        """Return the file of a measurement, if it is there: the one that was to come, or a new one of another name."""
+        # A person may change the base name at the panel during a measurement: then any new file counts.
         expected = _target(measured).path
         if modified_ns(expected) not in (0, measured["there_ns"]):
             return expected
@@ -80,28 +84,32 @@ class AsylumFiles(FolderFiles):
         return _numbered(folder)
 
 
+def _frame_text(region: Region) -> str:
+    return f"{area_text(region.size_m)} at {position_text(region.center_m)}, {math.degrees(region.angle_rad):.5g}°"
+
+
 def free_suffix(folder: Path, base: str) -> int:
-    """Return the first number that no file of this base name has, nor any that follows."""
+    """Return the lowest number above those of all files with this base name."""
     named = re.compile(rf"{re.escape(base)}(\d{{4,}})\.ibw", re.IGNORECASE)
     taken = [int(match[1]) for path in _numbered(folder) if (match := named.fullmatch(path.name))]
     return max(taken, default=-1) + 1
 
 
 def local(igor_path: str, folders: Mapping[str, str]) -> Path:
-    """A path of Igor's, "C:Users:Me:Data:", here.
+    """Convert an Igor path, "C:Users:Me:Data:", to a path on this computer.
 
     Args:
-        folders: beginnings of such paths, and where those are from here; the longest that fits counts.
+        folders: prefixes of Igor paths with their local folders; the longest matching prefix counts.
 
     Raises:
-        ConfigError: it is on another computer, and nothing says where to see it from here.
+        ConfigError: no prefix matches, and the path is not on this computer.
     """
     parts = _parts(igor_path)
     fitting = [(start, here) for start, here in folders.items() if _begins(parts, _parts(start))]
     if fitting:
         start, here = max(fitting, key=lambda one: len(_parts(one[0])))
         return Path(here, *parts[len(_parts(start)) :])
-    if igor_path.startswith(":"):  # a computer without drives
+    if igor_path.startswith(":"):  # an emulator on a system without drive letters
         return Path("/", *parts)
     if sys.platform != "win32" or len(parts[0]) != 1:
         hint = f'folders = {{ "{igor_path}" = "/where/it/is/mounted" }}'
@@ -110,12 +118,12 @@ def local(igor_path: str, folders: Mapping[str, str]) -> Path:
 
 
 def _begins(parts: list[str], start: list[str]) -> bool:
-    """Windows does not tell upper from lower case."""
+    # Windows ignores the case of folder names.
     return [part.casefold() for part in parts[: len(start)]] == [part.casefold() for part in start]
 
 
 def _parts(igor_path: str) -> list[str]:
-    """Also of a path as Windows writes it."""
+    # Igor writes "C:Users:Me:"; a user may write `folders` in the form of Windows.
     return [part for part in igor_path.replace("\\", ":").split(":") if part]
 
 

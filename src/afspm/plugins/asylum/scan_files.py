@@ -1,8 +1,8 @@
-"""Asylum Research: Igor binary waves (.ibw), and what their notes mean.
+"""Asylum Research: Igor binary waves (.ibw) and the meaning of their notes.
 
-What is known of the note (from real files): XOffset and YOffset are the centre of the scan; images are [x, y, channel]
-with both axes ascending whichever way it was scanned, from first to last pixel FastScanSize; `Seconds` is local time
-since 1904, of saving; the units of a wave are those of its first channel alone.
+From real files: XOffset and YOffset are the centre of the scan; images are [x, y, channel] with both axes ascending for
+either scan direction, FastScanSize from first to last pixel; `Seconds` is the local time of saving, since 1904; the
+unit of a wave applies to its first channel only.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Note = PlainMapping
 
 CONTROLLER = "Asylum"
 _IGOR_EPOCH = datetime(1904, 1, 1)  # noqa: DTZ001  (local time of the controller)
-# Of channels by what their names begin with, without the "Nap" of a second pass.
+# By the beginning of a channel's name, without the "Nap" of a second pass: a wave has one unit for all its channels.
 _UNITS = {
     "Height": "m", "ZSensor": "m", "RawZSensor": "m", "Amplitude": "m", "Deflection": "m", "Phase": "deg",
     "Frequency": "Hz", "Current": "A", "UserIn": "V", "BackPackIn": "V", "Lateral": "V", "Potential": "V",
@@ -33,7 +33,7 @@ _UNITS = {
 
 
 def read_igor(path: Path, zone: tzinfo | None) -> FileContent:
-    """An image with its channels, or a force curve. Raises FileError: neither, or broken."""
+    """Read an image with its channels, or a force curve. Raises FileError: neither, or damaged."""
     wave = igor.read_wave(path.read_bytes())
     note = parsed_note(wave.note)
     first = wave.dimension_units[0]
@@ -47,7 +47,7 @@ def read_igor(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def parsed_note(text: str) -> dict[str, str]:
-    """The lines `key: value` of a wave's note. Of keys that come twice the first counts."""
+    """Return the lines `key: value` of a wave's note; the first of duplicate keys counts."""
     note: dict[str, str] = {}
     for line in text.replace("\n", "\r").split("\r"):
         key, colon, value = line.partition(":")
@@ -57,7 +57,7 @@ def parsed_note(text: str) -> dict[str, str]:
 
 
 def center_and_angle(note: Note) -> tuple[tuple[float, float], float]:
-    """Of the scan: (x, y) in m, and radians counter-clockwise. Raises FileError if the note does not say where."""
+    """Return the scan's centre (x, y) in m and its angle in radians. Raises FileError: the note lacks the position."""
     center = (number(note, "XOffset"), number(note, "YOffset"))
     if center[0] is None or center[1] is None:
         raise FileError("its note lacks the position of the scan (XOffset, YOffset)")
@@ -65,18 +65,21 @@ def center_and_angle(note: Note) -> tuple[tuple[float, float], float]:
 
 
 def counter_clockwise(scan_angle_deg: float) -> float:
-    """ScanAngle in radians as everybody else counts them: Asylum turns the fast axis to (cos, -sin) of it, clockwise,
-    about a centre that is not turned (so its software reckons where a scan begins, and where lithography goes)."""
+    """Convert ScanAngle (degrees, clockwise) to radians counter-clockwise.
+
+    Asylum turns the fast axis to (cos, -sin) of the angle about the unrotated centre, in its code for scans and
+    lithography.
+    """
     return 0.0 - math.radians(scan_angle_deg)
 
 
 def clockwise(angle_rad: float) -> float:
-    """The reverse, in degrees."""
+    """Convert radians counter-clockwise to degrees clockwise, as ScanAngle counts."""
     return 0.0 - math.degrees(angle_rad)
 
 
 def number(note: Note, key: str) -> float | None:
-    """A finite number of a note; None if there is none."""
+    """Return a finite number of a note; None if missing."""
     try:
         value = float(note[key])
     except (KeyError, TypeError, ValueError):
@@ -85,19 +88,19 @@ def number(note: Note, key: str) -> float | None:
 
 
 def upwards(note: Note) -> bool | None:
-    """Return True if small y was scanned first; None if that is not known."""
+    """Return True if the lowest row was scanned first; None: unknown."""
     down = number(note, "ScanDown")
     return None if down is None else down == 0.0
 
 
 def end_ns(note: Note, zone: tzinfo | None) -> int | None:
-    """When it was saved."""
+    """Return the time of saving."""
     seconds = number(note, "Seconds")
     return None if seconds is None else clock_ns(_IGOR_EPOCH + timedelta(seconds=seconds), zone)
 
 
 def start_ns(note: Note, rows: int, zone: tzinfo | None) -> int | None:
-    """When its first row was begun: so many lines before it was saved; each twice if there was a second pass."""
+    """Return the start of the first row: the lines' duration before saving, twice that with a second pass (NapMode)."""
     rate_hz, end = number(note, "ScanRate"), end_ns(note, zone)
     if end is None or rate_hz is None or rate_hz <= 0.0:
         return None
@@ -106,7 +109,7 @@ def start_ns(note: Note, rows: int, zone: tzinfo | None) -> int | None:
 
 
 def unit_of(channel: str) -> str:
-    """Of an image channel's values; empty where its name does not tell."""
+    """Return the unit of an image channel by its name; empty: unknown."""
     name = channel.removeprefix("Nap")
     return next((unit for start, unit in _UNITS.items() if name.startswith(start)), "")
 
@@ -133,7 +136,8 @@ def _image(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> File
 
 
 def _curve(wave: igor.Wave, note: Note, path: Path, zone: tzinfo | None) -> FileContent:
-    """Its columns are lengths (raw z, deflection, z sensor), at equal steps of time, which is added as the last."""
+    # The columns are lengths (raw z, deflection, z sensor) at equal time steps; the time is appended as the last
+    # column.
     points, count = wave.values.shape
     if len(wave.labels[1]) != count:
         raise FileError(f"{count} columns with {len(wave.labels[1])} names")

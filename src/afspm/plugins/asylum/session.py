@@ -1,4 +1,4 @@
-"""Questions to Igor, by the functions of Asylum's software and of `afspm.ipf`."""
+"""Requests to Igor, by functions of Asylum's software and of `afspm.ipf`."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from afspm.translator.parameters import Value
 
 SCAN_STATUS, MAP_STATUS = "ScanStatus", "FMapStatus"
 
+# Bits of ARGetStatus: only the published afspm documents them, so a second source decides, too (see `Doing.state`).
 _SCANNING, _ENGAGED, _FORCE, _MOTOR = 0x1, 0x2, 0xF0, 0x100000
 _LONGEST_LIST: Final = 800
-"""Characters: a longer one would not fit into a request."""
+"""Characters of names in one request, which has at most 1024 bytes."""
 
 
 @dataclass(frozen=True)
 class Doing:
-    """The state that the controller tells of itself.
+    """The state that the controller reports.
 
     Attributes:
-        bits: of ARGetStatus; None where that is not there.
-        scanning, mapping: of the values that Asylum's panels go by.
+        bits: result of ARGetStatus; None if this release lacks it.
+        scanning, mapping: the values behind Asylum's panels, ScanStatus and FMapStatus.
     """
 
     bits: int | None
@@ -35,7 +36,7 @@ class Doing:
 
     @property
     def state(self) -> ScopeState:
-        """Both sources count: what one of them says to be running, is."""
+        """The state by both sources; a measurement reported by one of them counts as running."""
         bits = self.bits or 0
         if self.mapping or bits & _FORCE:
             return ScopeState.SPEC
@@ -45,18 +46,18 @@ class Doing:
 
     @property
     def engaged(self) -> bool:
-        """True if the tip is at the sample; where that can't be known it is to be taken care of as if it were."""
+        """True if the tip is at the sample; also if unknown, so that the tip is treated with care."""
         return self.bits is None or bool(self.bits & (_ENGAGED | _SCANNING)) or self.scanning
 
 
 class Session:
-    """One connection, and what was found out about who is there.
+    """One connection, and the abilities of the peer.
 
     Args:
         link: connected.
 
     Attributes:
-        at_once: whether there is `afspm.ipf`: many values can then be had by one request.
+        at_once: True if Igor includes `afspm.ipf`, which returns many values with one request.
     """
 
     def __init__(self, link: Link) -> None:
@@ -64,49 +65,44 @@ class Session:
         self.at_once = True
 
     def ask(self, name: str, *parameters: xop.Parameter) -> xop.Result:
-        """Call any function with one result."""
         return self._link.ask(name, *parameters)
 
     def number(self, name: str, *parameters: xop.Parameter) -> float:
-        """Call a function that gives a number."""
         return number(self.ask(name, *parameters))
 
     def text(self, name: str, *parameters: xop.Parameter) -> str:
-        """Call a function that gives a text."""
         return text(self.ask(name, *parameters))
 
     def do(self, name: str, *parameters: xop.Parameter) -> bool:
-        """Call a function that does something: whether it did not say that it refuses.
+        """Call a function for its effect; return False if it reports a refusal.
 
-        Asylum's own give 1 for a refusal. Others end without a result, which arrives as NaN and says nothing.
+        Asylum's own functions return 1 for a refusal. Functions without a result arrive as NaN, which means nothing.
         """
         return self.ask(name, *parameters) != 1.0
 
     def close(self) -> None:
-        """End the connection."""
         self._link.close()
 
     def feedback_on(self) -> bool:
-        """Return True if the z feedback runs; where Igor can't be asked, if the tip is at the sample."""
+        """Return True if the z feedback runs; without `afspm.ipf`, if the tip is at the sample."""
         return bool(self.number("AfspmFeedbackOn")) if self.at_once else self.doing().engaged
 
     def controller(self) -> str:
-        """Return what it calls itself."""
+        """Return the controller's name and version."""
         return f"Asylum Research, {self.text('AfspmController')}" if self.at_once else "Asylum Research"
 
     # --- values ---
 
     def doing(self) -> Doing:
-        """Return what the controller does now."""
         bits, values = self._look((SCAN_STATUS, MAP_STATUS))
         scanning, mapping = (bool(value) and not math.isnan(value) for value in values)
         return Doing(None if math.isnan(bits) else int(bits), scanning, mapping)
 
     def values(self, names: Sequence[str]) -> dict[str, float]:
-        """Numbers of Asylum's by their names.
+        """Return Asylum's numbers by name.
 
         Raises:
-            Refused: PARAM_NOT_SUPPORTED: it has none of that name.
+            Refused: PARAM_NOT_SUPPORTED: Asylum has no number of this name.
         """
         found = dict(zip(names, self._look(names)[1], strict=True))
         for name, value in found.items():
@@ -115,15 +111,15 @@ class Session:
                 raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, reason)
         return found
 
+    # PV checks no range, and updates none of the values that the panel derives.
     def put(self, name: str, value: Value) -> None:
-        """Set a number or a text of Asylum's."""
         if isinstance(value, str):
             self.ask("PS", name, value)
         else:
             self.ask("PV", name, float(value))
 
     def _look(self, names: Sequence[str]) -> tuple[float, list[float]]:
-        """The bits of ARGetStatus (NaN where that is not there), and values."""
+        # Without `afspm.ipf`, each value is one request. Its absence is remembered until the next connection.
         if self.at_once:
             try:
                 bits, values = math.nan, list[float]()
@@ -138,11 +134,11 @@ class Session:
         return self._bits(), [self.number("GV", name) for name in names]
 
     def _several(self, names: Sequence[str]) -> list[float]:
-        told = self.text("AfspmLook", "".join(f"{name};" for name in names))
+        reply = self.text("AfspmLook", "".join(f"{name};" for name in names))
         try:
-            found = [float(word) for word in told.removesuffix(";").split(";")]
+            found = [float(word) for word in reply.removesuffix(";").split(";")]
         except ValueError as error:
-            raise xop.BadReply(f"AfspmLook returned {told!r}") from error
+            raise xop.BadReply(f"AfspmLook returned {reply!r}") from error
         if len(found) != 1 + len(names):
             raise xop.BadReply(f"AfspmLook returned {len(found) - 1} values instead of {len(names)}")
         return found
@@ -157,7 +153,7 @@ class Session:
 
 
 def _parts(names: Sequence[str]) -> list[list[str]]:
-    """The names in lists that fit into a request each."""
+    # ZeroMQ-XOP drops the connection at requests of more than 1024 bytes.
     parts: list[list[str]] = [[]]
     for name in names:
         if sum(len(one) + 1 for one in parts[-1]) + len(name) > _LONGEST_LIST:

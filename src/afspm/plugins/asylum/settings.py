@@ -1,8 +1,7 @@
-"""The frame, the speed and the place of the tip as Asylum has them, and as everybody else; lengths in m.
+"""Frame, speed and tip position: conversion between Asylum's values and generic parameters; lengths in m.
 
-Asylum's XOffset and YOffset are the centre of the frame (seen in images that were zoomed into). ScanSize is its longer
-side, and how long the other one is, is told by two ratios; FastScanSize and SlowScanSize are what comes of it. Its
-angles are in degrees, clockwise.
+Asylum's XOffset and YOffset are the centre of the frame (seen in images zoomed into). ScanSize is the longer side; two
+ratios define the other one; FastScanSize and SlowScanSize are the result. Angles are in degrees, clockwise.
 """
 
 from __future__ import annotations
@@ -25,11 +24,11 @@ NAMES: Final = frozenset({*FRAME, names.SCAN_SPEED})
 
 _OUR_SPOT: Final = 1.0
 PATH_OF_A_LINE: Final = 2.5
-"""In widths of the frame: there and back, and round the ends (ScanSpeed / (FastScanSize · ScanRate) in all notes)."""
+"""Path of the tip in a line, in widths of the frame: ScanSpeed / (FastScanSize · ScanRate) in all real notes."""
 
 
 def generic(found: Mapping[str, float]) -> dict[str, Value]:
-    """Of Asylum's `GLOBALS`, the generic parameters in SI."""
+    """Convert Asylum's `GLOBALS` to generic parameters in SI."""
     size_m = (found["FastScanSize"], found["SlowScanSize"])
     region = Region((found["XOffset"], found["YOffset"]), size_m, counter_clockwise(found["ScanAngle"]))
     shape = (round(found["ScanLines"]), round(found["ScanPoints"]))
@@ -38,20 +37,20 @@ def generic(found: Mapping[str, float]) -> dict[str, Value]:
 
 
 def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[str, float]:
-    """Return what to set at Asylum for generic parameters that are wanted, given all of `NAMES` as they were.
+    """Convert generic parameters to Asylum's values, given all of `NAMES` as set before.
 
-    All that depends on each other is set, as PV does none of what the panel does. Asylum scans by its ScanRate, so
-    that is set to keep the speed when the width changes.
+    All dependent values are included, since PV updates none of them, unlike the panel. Asylum scans by its ScanRate,
+    which is set so that the speed is kept when the width changes.
 
     Raises:
-        InvalidValue: they describe no frame.
+        InvalidValue: the parameters describe no frame.
     """
     values = {**before, **wanted}
     region, (rows, columns) = frame(values)
     speed_m_s = float(values[names.SCAN_SPEED])
     fast_m, slow_m = region.size_m
     if speed_m_s <= 0.0:
-        raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+        raise InvalidValue(f"the scan speed must be above 0, not {speed_m_s:g} m/s")
     shorter_m = min(fast_m, slow_m)
     return {
         "XOffset": region.center_m[0],
@@ -70,25 +69,25 @@ def asylums(wanted: Mapping[str, Value], before: Mapping[str, Value]) -> dict[st
 
 
 def on_image(xy_m: tuple[float, float], image: Region) -> tuple[float, float]:
-    """A place of the tip as a spot of Asylum's: from the lower left corner of an image, along its axes."""
+    """Convert a position to an Asylum spot: from the lower left corner of the image, along its axes."""
     cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
     dx, dy = xy_m[0] - image.center_m[0], xy_m[1] - image.center_m[1]
     return cos * dx + sin * dy + image.size_m[0] / 2, cos * dy - sin * dx + image.size_m[1] / 2
 
 
 def from_image(spot_m: tuple[float, float], image: Region) -> tuple[float, float]:
-    """The reverse of `on_image`."""
+    """Convert an Asylum spot to a position; the reverse of `on_image`."""
     cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
     dx, dy = spot_m[0] - image.size_m[0] / 2, spot_m[1] - image.size_m[1] / 2
     return image.center_m[0] + cos * dx - sin * dy, image.center_m[1] + cos * dy + sin * dx
 
 
 class FrameSettings(SettingsGroup):
-    """The frame and the speed.
+    """Frame and speed.
 
     Args:
-        igor: gives the session.
-        in_force: gives all of `NAMES` as they were set.
+        igor: returns the session.
+        in_force: returns all of `NAMES` as set before.
     """
 
     names = NAMES
@@ -112,8 +111,8 @@ class TipPlace(SettingsGroup):
     """The spot to which the tip is sent.
 
     Args:
-        image: gives the frame of the last image, which spots are counted on; None: from the middle of the scanner.
-        on_move: called when the tip was sent away.
+        image: returns the frame of the last image, the origin of spots; None: the origin is the middle of the scanner.
+        on_move: called when the tip starts moving.
     """
 
     names = POSITION
@@ -126,7 +125,7 @@ class TipPlace(SettingsGroup):
         self._on_move = on_move
 
     def xy_m(self) -> tuple[float, float]:
-        """Return where the tip was sent, (x, y) in m."""
+        """Return the position where the tip was sent, (x, y) in m."""
         spot_m = (self._igor().number("GetProbePosX"), self._igor().number("GetProbePosY"))
         return spot_m if self._image is None else from_image(spot_m, self._image())
 
@@ -139,24 +138,24 @@ class TipPlace(SettingsGroup):
         self.go()
 
     def put(self, xy_m: tuple[float, float]) -> None:
-        """Put the spot somewhere. Raises Refused."""
+        """Set the spot without moving the tip. Raises Refused."""
         x, y = xy_m if self._image is None else on_image(xy_m, self._image())
         if not (self._igor().do("SetProbePosX", x) and self._igor().do("SetProbePosY", y)):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused the spot")
 
     def go(self) -> None:
-        """Send the tip to the spot. Raises Refused."""
-        self._igor().put("ForceSpotNumber", _OUR_SPOT)  # whatever is chosen at the panel
+        """Move the tip to the spot. Raises Refused."""
+        self._igor().put("ForceSpotNumber", _OUR_SPOT)  # a person may have chosen another spot at the panel
         if not self._igor().do("DoForceFunc", "Go"):
             raise Refused(ControlResponse.PARAM_ERROR, "Asylum refused to move the tip")
         self._on_move()
 
 
 class FeedbackSwitch(SettingsGroup):
-    """The z feedback, on or off; it is switched where it is otherwise, and seen to be, as the tip may have a way to go.
+    """The z feedback switch. A write waits until the feedback is in the new state, as the tip may have to travel.
 
     Args:
-        wait_for: waits until a condition holds, but not for ever.
+        wait_for: waits for a condition, up to a time limit.
     """
 
     names = (FEEDBACK_ON,)

@@ -1,4 +1,4 @@
-"""Requests to ZeroMQ-XOP and its replies: a function of Igor's is called by JSON. Pure.
+"""Requests to ZeroMQ-XOP and its replies: calls of Igor functions as JSON. Pure.
 
 After the source and specification of ZeroMQ-XOP (byte physics and the Allen Institute), first version of the interface.
 """
@@ -16,10 +16,10 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.translator.driver_base import ControllerLost
 
 LONGEST_REQUEST: Final = 1024
-"""Bytes: what is longer makes the XOP drop the connection without a word."""
+"""Bytes. At a longer request the XOP drops the connection without a reply."""
 
 MISSING: Final = 101
-"""The error of a function that Igor does not have."""
+"""Error number for a function that Igor does not have."""
 
 _MEANINGS: Final = {
     1: "an error without a name",
@@ -47,10 +47,10 @@ Parameter = bool | int | float | str
 
 
 class XopError(AfspmError):
-    """Igor could not do what it was asked for.
+    """Igor reports an error.
 
     Attributes:
-        number: of ZeroMQ-XOP's errors.
+        number: error number of ZeroMQ-XOP.
     """
 
     code = "igor-error"
@@ -62,13 +62,13 @@ class XopError(AfspmError):
 
 
 class BadReply(ControllerLost):
-    """The bytes that came are no reply: the peer can't be trusted."""
+    """The received bytes are not a valid reply: the peer can't be trusted."""
 
     code = "igor-bad-reply"
 
 
 Result = float | str | None
-"""None: a wave, which no function that is asked for here returns."""
+"""None: a wave, which no function used here returns."""
 
 
 @dataclass(frozen=True)
@@ -76,9 +76,9 @@ class Reply:
     """A reply.
 
     Attributes:
-        message_id: that of the request; None where it could not be read.
-        error: the number and the message of an error; None: it was done.
-        results: what the function returned, one or several.
+        message_id: id of the request; None if the XOP could not read it.
+        error: number and message of an error; None: success.
+        results: one or several results of the function.
     """
 
     message_id: str | None
@@ -87,15 +87,16 @@ class Reply:
 
 
 def request(name: str, parameters: Sequence[Parameter], message_id: str) -> bytes:
-    """The bytes that call a function.
+    """Encode the call of a function.
 
     Raises:
-        InvalidValue: they can't be sent: too long, or not a number.
+        InvalidValue: longer than 1024 bytes, or a number that is not finite.
     """
     for value in parameters:
         if isinstance(value, float) and not math.isfinite(value):
             raise InvalidValue(f"{name} can't be called with {value}")
     call = {"name": name, "params": list(parameters)} if parameters else {"name": name}
+    # the XOP accepts the integer 1 only; its own readme has "v1" by mistake
     content = {"version": 1, "messageID": message_id, "CallFunction": call}
     try:
         message = json.dumps(content, ensure_ascii=False, separators=(",", ":")).encode()
@@ -107,11 +108,7 @@ def request(name: str, parameters: Sequence[Parameter], message_id: str) -> byte
 
 
 def reply(message: bytes) -> Reply:
-    """Return what a reply says.
-
-    Raises:
-        BadReply: it is none.
-    """
+    """Parse a reply. Raises BadReply: it is malformed."""
     try:
         return _reply(json.loads(message.decode("utf-8")))
     except BadReply:
@@ -130,8 +127,8 @@ def _reply(content: PlainMapping) -> Reply:
         raise ValueError("errorCode or messageID has the wrong type")
     if number:
         history = str(content.get("history") or "").strip()
-        told = str(content["errorCode"].get("msg", ""))
-        return Reply(message_id, (number, f"{told} {history}".strip()))
+        message = str(content["errorCode"].get("msg", ""))
+        return Reply(message_id, (number, f"{message} {history}".strip()))
     found = content.get("result", [])
     results = [_value(one) for one in (found if isinstance(found, list) else [found])]
     return Reply(message_id, None, tuple(results))
@@ -151,7 +148,7 @@ def _value(one: Mapping[str, object]) -> Result:
 
 
 def _number(value: object) -> float:
-    """NaN and infinities come as texts."""
+    # JSON has no NaN and no infinities: the XOP writes them as texts.
     if value in ("nan", "inf", "-inf") or (isinstance(value, int | float) and not isinstance(value, bool)):
         return float(value)
     raise ValueError(f"{value!r} is not a number")

@@ -1,9 +1,23 @@
-"""GXSM, versions 3 and 4: over Gxsm4's shared memory, or a script in the console. See the README beside this."""
+"""Driver of GXSM 3 and 4, over Gxsm4's shared memory or a script in its console. See the README in this folder.
+
+**Theory of operation.** GXSM reports no errors, no events, and no end of a measurement: `set` and `action` return 0 for
+anything. So names are checked against GXSM's own lists at the start, values are read back, and states are derived from
+polls of status bits, line numbers and file names (`activity`).
+
+    comes in      results of calls (`link`: `shared_memory` or `bridge_client`); new files, which appear late, one by
+                  one, and half written (`result_files`)
+    state         the running and the ended measurement, rows of GXSM's memory before it (`scan_memory`), the position
+                  where the tip was sent: all persistent
+    goes out      calls; scans and spectra from files; lines of the running scan from memory
+    always holds  one call at a time; a blocking call is never made, as it would wedge GXSM; a scan whose first or last
+                  row still holds the previous scan is not published; a file is read only once it has stopped growing
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Final
@@ -12,7 +26,7 @@ from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.units import Duration
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.plugins.gxsm import bridge
-from afspm.plugins.gxsm.activity import SHOWS_S, GxsmActivity, Saving
+from afspm.plugins.gxsm.activity import SHOWS_S, ConnectedGxsm, GxsmActivity, Saving
 from afspm.plugins.gxsm.hardware import (
     ABORT,
     APPROACH,
@@ -51,15 +65,15 @@ class Gxsm(Driver):
 
     Args:
         address: "HOST:PORT" of `bridge.py` in GXSM's console; "shm" for the shared memory of a Gxsm4 on this computer,
-            "shm:BLOCK@PROCESS" if that or its process is not called as usual.
-        saving: "afspm": while a scan of this translator runs, GXSM's Auto Save is off, and the translator has GXSM save
-            once at its end; else Auto Save is on. "gxsm": Auto Save is left on, and its files are waited for.
-        hardware: "SRanger", "RPSPMC" or "simulator", if the kind that is found is wrong.
-        scan_dir, probe_dir: where scans and spectra are saved, if not where GXSM says that it saves channels.
-        feedback_actions: GXSM's actions that switch the feedback on and off, where its hardware has such.
+            "shm:BLOCK@PROCESS" if the block or the process has another name.
+        saving: "afspm": Auto Save is off during this translator's scans, which are saved once at their end, and on at
+            other times. "gxsm": Auto Save is left on.
+        hardware: "SRanger", "RPSPMC" or "simulator", if detection is wrong.
+        scan_dir, probe_dir: folders of scans and spectra, if not the folder that GXSM reports for channels.
+        feedback_actions: names of the actions that switch the feedback on and off, if the hardware has them.
         secret_file: a copy of the bridge's `~/.afspm/gxsm-bridge-secret`, if GXSM runs on another computer.
-        reply_timeout_s: how long an answer may take, in real time.
-        common: as for every microscope.
+        reply_timeout_s: longest wait for a reply, real time.
+        common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -85,13 +99,13 @@ class Gxsm(Driver):
         super().__init__(**common)
         kinds = [kind.value for kind in Hardware]
         if hardware is not None and hardware not in kinds:
-            raise ConfigError(f"there is no {hardware!r}", where="hardware", hint=f"there are {', '.join(kinds)}")
+            raise ConfigError(f"unknown hardware {hardware!r}", where="hardware", hint=f"one of {', '.join(kinds)}")
         if saving not in _SAVERS:
             raise ConfigError(f"{saving!r} is not a way of saving", where="saving", hint=f"{' or '.join(_SAVERS)}")
         self.controller_at = address
         Address.parse(address)
-        folders = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
-        self._saving = Saving(saving == "afspm", *folders)
+        scans, probes = (None if path is None else Path(path) for path in (scan_dir, probe_dir))
+        self._saving = Saving(saving == "afspm", scans, probes)
         self._given_hardware = hardware
         self._feedback_actions: Sequence[str] = feedback_actions or ()
         secret = None if secret_file is None else Path(secret_file)
@@ -106,7 +120,7 @@ class Gxsm(Driver):
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:
-        """Return what GXSM's own simulator does otherwise than GXSM itself says."""
+        """Return the conformance checks that GXSM's own simulator fails, with the reason."""
         if not controller.endswith(f"({Hardware.SIMULATOR.value})"):
             return {}
         return {
@@ -114,11 +128,12 @@ class Gxsm(Driver):
         }
 
     def connect(self) -> None:
-        """The link; what this GXSM has, in which unit it has it, and how it saves."""
+        """Open the link, and find out the hardware, the unit of lengths and the way of saving."""
         self.close()
         address = Address.parse(self.controller_at)
         ask = self._asking = Asking(self._open(address, monotonic_s=self.clock.monotonic_s))
         self.prove()
+        # the only way to know: neither `set`, `get` nor `action` reports an unknown name
         refnames, actions = ask.names("list_refnames"), ask.names("list_actions")
         missing = [ref for ref in REFNAMES if ref not in refnames]
         if missing:
@@ -129,7 +144,8 @@ class Gxsm(Driver):
         self._find_parameters()
         self.lacking = self._missing_actions()
         scan_frame = ScanFrame(ask, user_unit_m(ask))
-        switches_autosave = self._saving.by_us and self._offered.actions.issuperset(AUTOSAVE.values())
+        can_switch = self._offered.actions.issuperset(AUTOSAVE.values())
+        saving = replace(self._saving, switches_autosave=self._saving.by_us and can_switch)
         self._kept.kept_in(self.memory)
         self._files = GxsmFiles(
             self.memory,
@@ -139,21 +155,18 @@ class Gxsm(Driver):
             late_s=self.patience_s(LATE_S),
         )
         self._activity = GxsmActivity(
-            ask,
-            hardware,
-            scan_frame,
+            ConnectedGxsm(ask, hardware, scan_frame),
             self._files,
             self.memory,
             self.clock,
             self.log,
             set_frame=lambda: frame(self.in_force(FRAME)),
             shows_s=self.patience_s(SHOWS_S),
-            saving=self._saving,
-            switches_autosave=switches_autosave,
+            saving=saving,
         )
         self._tip = TipPlace(scan_frame, self.memory, self._sets_out)
         own = FrameSettings(scan_frame, self._tip, is_led=self._offered.hardware is Hardware.RPSPMC)
-        feedback = FeedbackSwitch(ask, self._activity.doing, self._feedback_actions)
+        feedback = FeedbackSwitch(ask, self._activity.gxsm.doing, self._feedback_actions)
         self.groups = (own, self._tip, self._kept, feedback)
 
     def _find_parameters(self) -> None:
@@ -167,7 +180,8 @@ class Gxsm(Driver):
         self.log.info("GXSM with the hardware %s; unsupported: %s", self._offered.kind, ", ".join(lacking) or "none")
 
     def _missing_actions(self) -> dict[str, str]:
-        """GXSM says 0 to actions that it does not have."""
+        # GXSM returns 0 also for unknown actions and does nothing, so the actions are checked against its list at the
+        # start.
         needed = {names.ENGAGE: [APPROACH], names.STOP_SPEC: [ABORT]}
         if names.TIP_BIAS_VOLTAGE not in self.table:
             needed[names.PULSE] = [names.TIP_BIAS_VOLTAGE]
@@ -208,15 +222,14 @@ class Gxsm(Driver):
             send(self._ask, self._there(vendor), float(value))
 
     def _there(self, vendor: str) -> str:
-        """Return the name that this GXSM has, of those that a parameter may have: of others it does not say that it has
-        them not."""
+        # `get` returns -inf or uninitialised memory for an unknown name, `set` 0: neither reports that the name is
+        # unknown.
         there = available({"": vendor}, self._offered.refnames)
         if not there:
             raise Refused(ControlResponse.PARAM_NOT_SUPPORTED, f"this GXSM has no parameter {vendor!r}")
         return there[""]
 
     def _way_s(self, way_m: float) -> float:
-        """Return the time that the tip takes for so long a way; none if GXSM does not tell its speed."""
         if names.MOVE_SPEED not in self.table:
             return 0.0
         speed_m_s = float(self.read_rows([names.MOVE_SPEED])[names.MOVE_SPEED])
@@ -237,21 +250,22 @@ class Gxsm(Driver):
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """Return what is new in GXSM's memory; of channels that a scan was saved of."""
+        """Return new lines from GXSM's memory, for channels that were in the files of an earlier scan."""
         endings = self._activity.endings()
         if not endings:
             return ()
         done = self._activity.lines_done()
         found = new_lines(self._ask, endings, self._files.channels, self._files.scanning, start, done)
-        # of a scan that is stopped meanwhile GXSM says that it is at its last line
-        return found if self._activity.doing().measuring else ()
+        # a stopped scan reports its last line, as if all were complete
+        return found if self._activity.gxsm.doing().measuring else ()
 
     # --- actions ---
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Scan the frame once, with the channels and the direction of GXSM's panel."""
-        if REPEAT_OFF in self._offered.actions:  # it would never end
+        """Scan the frame once, with the channels and direction set on GXSM's panel."""
+        # a repeated scan never ends
+        if REPEAT_OFF in self._offered.actions:
             self._ask.call("action", REPEAT_OFF)
         self._activity.start_scan()
 
@@ -261,8 +275,7 @@ class Gxsm(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a spectrum of the kind `x-spec-kind` where the probe was sent to last: it is sent there again, since a
-        scan has moved it."""
+        """Take a spectrum of the kind `x-spec-kind` at the probe position. A scan moves the tip: it goes back first."""
         kind = str(self._kept[names.SPEC_KIND])
         if execute(kind) not in self._offered.actions:
             reason = f"this GXSM has no {execute(kind)} with its hardware ({self._offered.kind}): see x-spec-kind"
@@ -280,9 +293,9 @@ class Gxsm(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """The auto approach."""
+        """Start the auto approach."""
         self._ask.call("action", APPROACH)
 
     def command(self, text: str) -> None:
-        """One of GXSM's actions, e.g. "DSP_CMD_STOPALL"."""
+        """Execute a GXSM action, e.g. "DSP_CMD_STOPALL"."""
         self._ask.call("action", text)

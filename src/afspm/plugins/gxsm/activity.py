@@ -1,4 +1,4 @@
-"""The state of GXSM. It never says that something began or ended: that is seen by looking."""
+"""State of GXSM, by polling: GXSM reports neither the start nor the end of a measurement."""
 
 from __future__ import annotations
 
@@ -21,32 +21,34 @@ from afspm.translator.result_files import SCAN, as_list
 from afspm.translator.state import Kept
 
 SETTLES_S: Final = 0.3
-"""So long GXSM needs from the end of a scan until it is done with it: a file that is saved before lacks its end."""
+"""GXSM's own work after the end of a scan; a file saved earlier has no end time."""
 SHOWS_S: Final = 1.0
-"""So long what was begun may take to be seen running; 0.3 s were measured."""
+"""Longest delay until a started measurement shows in the status bits; measured: up to 0.3 s."""
 _CHANNELS: Final = 40
 _NO_CHANNEL: Final = "EE:"
 
 
 @dataclass(frozen=True)
 class Saving:
-    """The way that scans and spectra are saved.
+    """The way of saving scans and spectra.
 
     Attributes:
-        by_us: True if the translator has GXSM save its own scans at their end. GXSM saves all others by itself.
-        scan_dir, probe_dir: where files are, if not where GXSM says that it saves channels.
+        by_us: True if the translator triggers the saving of its own scans. GXSM saves all others by itself.
+        scan_dir, probe_dir: folders of scans and spectra, if not the folder that GXSM reports for channels.
+        switches_autosave: True if Auto Save is switched off during the translator's own scans.
     """
 
     by_us: bool
     scan_dir: Path | None = None
     probe_dir: Path | None = None
+    switches_autosave: bool = False
 
 
 @dataclass
 class LineWatch:
-    """The last line that GXSM reported, and the direction of the lines: one against it belongs to another scan.
+    """The last line reported by GXSM, and the direction of the lines; a reversed direction means another scan.
 
-    The first change shows no direction: until the first line is complete, GXSM reports the last one of the scan before.
+    The first change has no direction: GXSM reports the last line of the previous scan until the first line is complete.
     """
 
     line: int
@@ -54,8 +56,9 @@ class LineWatch:
     step: int = 0
 
     def turned(self, line: int, rows: int) -> bool:
-        """Take in a line. Return True if it goes against the direction."""
-        if line == self.line or not 0 <= line < rows:  # at the start of a scan Gxsm4 once reported line -296
+        """Register a line; return True if it reverses the direction."""
+        # Gxsm4's simulator reports line -296 at the start of its first scan
+        if line == self.line or not 0 <= line < rows:
             return False
         step = 1 if line > self.line else -1
         self.line, turned = line, self.step not in (0, step)
@@ -67,16 +70,16 @@ class LineWatch:
 
 @dataclass
 class ScanProgress:
-    """The running scan as it was seen.
+    """The running scan as observed so far.
 
     Attributes:
-        endings: of the files of its channels.
-        name: of its first file, in which GXSM raises the number with each scan; empty before the first look.
-        watch: of its lines; None before the first look.
-        goes_up: whether its last row is the first of the picture; None: not seen yet.
-        settles_until_s, ended_ns: when GXSM is done with it, and when it has ended.
-        y_before, y_moved: the line of the scan before, and whether GXSM has reported another one since.
-        follows: it was begun before the one before it was seen to end.
+        endings: endings of its channels' file names.
+        name: name of its first file, whose number rises with each scan; empty before the first poll.
+        watch: direction of its lines; None before the first poll.
+        goes_up: True if the top row of the picture is scanned last; None: unknown.
+        settles_until_s, ended_ns: end of GXSM's own work on it, and end of the scan.
+        y_before, y_moved: last line of the previous scan, and whether GXSM has reported another line since.
+        follows: True if it started before the end of the previous scan was seen.
     """
 
     endings: list[str] = field(default_factory=list)
@@ -90,11 +93,30 @@ class ScanProgress:
     follows: bool = False
 
 
-class AutosaveSwitch:
-    """GXSM's Auto Save: on for scans of its panel, off while a scan of the translator's may be stopped.
+@dataclass(frozen=True)
+class ConnectedGxsm:
+    """A connected GXSM.
 
     Attributes:
-        on: as it was set by this translator; None: not known.
+        ask: calls its functions.
+        hardware: kind of its driver, which defines the meaning of the status bits.
+        frame: frame of the next scan.
+    """
+
+    ask: Asking
+    hardware: Hardware
+    frame: ScanFrame
+
+    def doing(self) -> Doing:
+        """Return the state that GXSM reports. Raises BadReply: the value is no set of bits."""
+        return decoded(self.hardware, self.ask.numbers("rtquery", STATUS))
+
+
+class AutosaveSwitch:
+    """GXSM's Auto Save: on for scans from its panel, off for the translator's own scans.
+
+    Attributes:
+        on: state set by this translator; None: unknown.
     """
 
     def __init__(self, ask: Asking, *, is_used: bool) -> None:
@@ -102,30 +124,26 @@ class AutosaveSwitch:
         self.on: bool | None = None
 
     def switch(self, *, on: bool) -> None:
-        """Switch it, unless it is so already."""
         if self._is_used and self.on is not on:
             self._ask.call("action", AUTOSAVE[on])
             self.on = on
 
 
 class GxsmActivity(Activity):
-    """See the module.
+    """Measurements, moves and saving of one GXSM.
 
     Args:
-        ask: GXSM.
-        frame: of the next scan; `set_frame` gives the same, as it was set, and (rows, columns).
-        kept: JSON-able, and lasts: when the tip arrives that was sent away.
-        shows_s: how long what was begun may take to be seen running, in experiment time.
-        switches_autosave: GXSM's Auto Save is off while a scan of the translator's runs.
+        gxsm: the connection.
+        set_frame: returns the frame of the next scan as it was set, and (rows, columns).
+        kept: persistent, JSON-able: arrival time of the tip.
+        shows_s: longest delay until a started measurement is seen running, experiment time.
     """
 
     program: ClassVar[str] = "GXSM"
 
     def __init__(
         self,
-        ask: Asking,
-        hardware: Hardware,
-        frame: ScanFrame,
+        gxsm: ConnectedGxsm,
         files: GxsmFiles,
         kept: Kept,
         clock: Clock,
@@ -134,68 +152,64 @@ class GxsmActivity(Activity):
         set_frame: Callable[[], tuple[Region, tuple[int, int]]],
         shows_s: float,
         saving: Saving,
-        switches_autosave: bool,
     ) -> None:
         super().__init__(files, clock, log)
-        self._ask = ask
-        self._hardware = hardware
-        self._frame = frame
+        self.gxsm = gxsm
         self._set_frame = set_frame
         self._files = files
         self._shows_s = shows_s
         self._saving = saving
-        self._autosave = AutosaveSwitch(ask, is_used=switches_autosave)
+        self._autosave = AutosaveSwitch(gxsm.ask, is_used=saving.switches_autosave)
         self._way = TipWay(kept, clock)
-        self._looked_ns = 0  # at the last look
+        self._looked_ns = 0  # time of the last poll
         self._shows_until_s = 0.0
         self._scan = ScanProgress()
         self._seen_last: tuple[tuple[int, int], Rows | None] = (0, 0), None
 
-    # --- what is begun ---
+    # --- start and stop ---
 
     def start_scan(self) -> None:
-        """Scan the frame."""
-        self._autosave.on = None  # a person may have switched it at the panel
+        self._autosave.on = None  # unknown: a person may have switched it at the panel
         self._autosave.switch(on=False)
         self._begin_scan(self._clock.now_ns(), own=True)
-        self._scan.y_before = int(self._ask.number("y_current"))
+        self._scan.y_before = int(self.gxsm.ask.number("y_current"))
         rows, columns = self._set_frame()[1]
-        self._files.looked(looked_at(self._ask, len(self._channels()), (0, rows - 1), columns), None)
+        # a scan that is stopped or does not start is recognised by rows that still hold the previous scan
+        self._files.looked(looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns), None)
         self._shows_until_s = self._clock.now_s() + self._shows_s
-        self._ask.call("startscan")
+        # returns 0 at once, even if no scan starts (no channel set, or one running)
+        self.gxsm.ask.call("startscan")
 
     def start_curve(self, kind: str, position_m: tuple[float, float], way_s: float) -> None:
-        """Send the tip to where a spectrum is to be taken, and take it when it is there.
+        """Move the tip, then take a spectrum.
 
         Args:
-            way_s: how long it may be on its way, in experiment time.
+            way_s: longest duration of the move, experiment time.
 
         Raises:
             Refused: the position is out of the tip's reach.
         """
-        self._frame.move_tip(position_m)
+        self.gxsm.frame.move_tip(position_m)
         self.sets_out(way_s)
         self._begin_curve(kind, position_m)
         self.curve_awaited = kind
 
     def stop_scan(self) -> None:
-        """Break the scan off."""
-        self._ask.call("stopscan")
+        self.gxsm.ask.call("stopscan")
         self.stopped()
 
     def stop_curve(self) -> None:
-        """Break the spectrum off."""
+        """Stop the spectrum, or the move before it."""
         if not self.curve_awaited:
-            self._ask.call("action", ABORT)
+            self.gxsm.ask.call("action", ABORT)
         self.stopped()
 
     def sets_out(self, way_s: float) -> None:
-        """The tip was sent on, and arrives so long, experiment time, after it would have been where it was sent before,
-        at the latest."""
+        """Register a move of at most `way_s`, experiment time, which starts when the previous move has ended."""
         self._way.sets_out(way_s, after_last_way=True)
 
     def next_change_s(self) -> float | None:
-        """When the tip has arrived, what was begun must show, or files must be there."""
+        """Return the time of the next expected change: arrival, visible start, end of settling, or missing files."""
         now_s = self._clock.now_s()
         times = (self._way.arrives_s, self._shows_until_s, self._scan.settles_until_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
@@ -203,8 +217,10 @@ class GxsmActivity(Activity):
     # --- what goes on ---
 
     def endings(self) -> list[str]:
-        """Of the files of each channel of the running scan; none before it was seen running: GXSM would still tell of
-        the scan before."""
+        """Return the endings of the running scan's file names.
+
+        Empty before the scan is seen running: GXSM still reports the names of the previous scan.
+        """
         if self._files.what != SCAN or self._shows_until_s > 0.0:
             return []
         if not self._scan.endings:
@@ -212,22 +228,18 @@ class GxsmActivity(Activity):
         return self._scan.endings
 
     def lines_done(self) -> int:
-        """Return how many lines of the running scan are complete; until the first is, GXSM tells of the scan before."""
-        y = int(self._ask.number("y_current"))
+        """Return the number of complete lines of the running scan."""
+        y = int(self.gxsm.ask.number("y_current"))
         if self._scan.y_before is None:
             self._scan.y_before = y
         self._scan.y_moved = self._scan.y_moved or y != self._scan.y_before
         return y if self._scan.y_moved else 0
 
-    def doing(self) -> Doing:
-        """Return what GXSM says."""
-        return decoded(self._hardware, self._ask.numbers("rtquery", STATUS))
-
     def status(self) -> ScopeStatus:
-        """Return what GXSM is doing now; what has ended is awaited from here on."""
-        doing, now_s = self.doing(), self._clock.now_s()
-        # a RedPitaya does not tell measuring from a program of its own that may lead the tip
-        led = self._hardware is Hardware.RPSPMC and self._way.is_on
+        """Return the present state; register measurements that have ended, whose files are then awaited."""
+        doing, now_s = self.gxsm.doing(), self._clock.now_s()
+        # RPSPMC has one bit for scans, spectra and its own vector programs, which also move the tip
+        led = self.gxsm.hardware is Hardware.RPSPMC and self._way.is_on
         if self.curve_awaited and doing.measuring and not led:
             return self._forestalled()
         if self.curve_awaited:
@@ -238,7 +250,7 @@ class GxsmActivity(Activity):
             return self._measuring(doing)
         self._looked_ns = self._clock.now_ns()
         moving = doing.moving or self._way.is_on
-        # a stopped spectrum may still be at the tip's way to it
+        # the stopped spectrum may not have started yet: the tip is still moving to its place
         if self._stopping and (moving or (self._autosave.on is False and not self._is_settled(now_s))):
             return ScopeStatus(ScopeState.INTERRUPTED)
         self._stopping = False
@@ -258,7 +270,7 @@ class GxsmActivity(Activity):
         if self._files.what == SCAN and doing.scanning and self._is_another():
             self._follow()
         self._shows_until_s = self._scan.settles_until_s = 0.0
-        if not self._files.what and not self._stopping:  # somebody began it at the panel
+        if not self._files.what and not self._stopping:  # started at the panel
             self.begin(SCAN if doing.scanning else "VP")
         if self._files.what == SCAN and self._files.before is None:
             self._look_at_memory()
@@ -267,18 +279,15 @@ class GxsmActivity(Activity):
         return ScopeStatus(ScopeState.SPEC if curve else ScopeState.SCANNING, doing.paused or None)
 
     def _is_another(self) -> bool:
-        """Return whether another scan runs than at the last look, though none was seen to end.
-
-        Repeated by GXSM, or by a person, scans follow in less time than passes between two looks. GXSM then has a new
-        number in the names of the files, and begins with its lines again.
-        """
-        before, name = self._scan.name, self._ask.text("chfname", 0)
+        # A repeated scan starts sooner than the next poll, so its predecessor is never seen to end. Two facts reveal
+        # it: a new number in the file names, and lines that start from the beginning.
+        before, name = self._scan.name, self.gxsm.ask.text("chfname", 0)
         self._scan.name = name
-        # once GXSM has saved, it reports another number in place of one that was taken
+        # after saving, GXSM reports the next free number if the first one was taken: no sign of another scan
         is_another = bool(before) and name != before and not self._files.is_written(Path(self._absolute(name)))
-        if self._files.is_own:  # Repeat was switched off for it
+        if self._files.is_own:  # Repeat is off: no scan follows by itself
             return is_another
-        line, watch = int(self._ask.number("y_current")), self._scan.watch
+        line, watch = int(self.gxsm.ask.number("y_current")), self._scan.watch
         if watch is None:
             self._scan.watch = LineWatch(line)
             return is_another
@@ -287,7 +296,8 @@ class GxsmActivity(Activity):
         return watch.turned(line, self._files.scanning[1][0]) or is_another
 
     def _follow(self) -> None:
-        """End a scan that another one has followed. Only its files, if GXSM saved it, show whether it was whole."""
+        # GXSM's memory already holds the next scan: only files that GXSM saved show whether the previous scan was
+        # complete.
         self._log.warning("another scan was begun at GXSM's panel before the last one was seen to end")
         channels, folder, before = self._channels(), self._folder(), self._before()
         name, ended_ns, now_ns = self._scan.name, self._scan.ended_ns, self._clock.now_ns()
@@ -298,20 +308,19 @@ class GxsmActivity(Activity):
         self._seen_last = (0, 0), None
 
     def _look_at_memory(self) -> None:
-        """Keep the first and last row of a scan that was found running, unless its last line may have been scanned."""
+        # Not near the last row: GXSM may have scanned it already, and overwritten the previous scan there.
         rows, columns = self._files.scanning[1]
-        found = looked_at(self._ask, len(self._channels()), (0, rows - 1), columns)
-        line = int(self._ask.number("y_current"))
+        found = looked_at(self.gxsm.ask, len(self._channels()), (0, rows - 1), columns)
+        line = int(self.gxsm.ask.number("y_current"))
         if abs(line - self._last_row()) > 1:
             self._files.looked(found, line)
 
     def _last_row(self) -> int:
-        """Return the row that is scanned last, as far as is known of a scan that the panel has begun."""
         goes_up = self._files.upwards if self._scan.goes_up is None else self._scan.goes_up
         return 0 if goes_up else self._files.scanning[1][0] - 1
 
     def _before(self) -> Rows | None:
-        """Return the rows that the running scan found in GXSM's memory, and has to have replaced at its end."""
+        # Rows of the previous scan that must have changed when this scan is complete.
         if self._files.before is None:
             return None
         rows, line = self._files.before
@@ -321,13 +330,12 @@ class GxsmActivity(Activity):
         return only(rows, last) if abs(line - last) > 1 else None
 
     def _is_settled(self, now_s: float) -> bool:
-        """Return whether GXSM is done with the scan that has just ended."""
         if not self._scan.settles_until_s:
             self._scan.settles_until_s, self._scan.ended_ns = now_s + SETTLES_S, self._clock.now_ns()
         return now_s >= self._scan.settles_until_s
 
     def _forestalled(self) -> ScopeStatus:
-        """The tip was on its way to a spectrum: that must not be taken into what somebody measures."""
+        # The spectrum must not be taken: it would end up in the measurement that a person has started meanwhile.
         self.curve_awaited = ""
         self._way.give_up()
         self.forget()
@@ -336,16 +344,16 @@ class GxsmActivity(Activity):
     def _take_curve(self, now_s: float) -> None:
         action, self.curve_awaited = execute(self.curve_awaited), ""
         self._shows_until_s = now_s + self._shows_s
-        self._ask.call("action", action)
+        self.gxsm.ask.call("action", action)
 
     def begin(self, what: str) -> None:
-        """Note a measurement that was begun at the panel, since the last look."""
+        """Register a measurement that was started at the panel since the last poll."""
         if what != SCAN:
-            self._begin_curve(what, self._frame.tip())
+            self._begin_curve(what, self.gxsm.frame.tip())
             return
         self._begin_scan(self._looked_ns, own=False)
         self._autosave.switch(on=True)
-        self._is_another()  # the first look, which later ones are compared with
+        self._is_another()  # the first observation, for comparison with later ones
 
     def _begin_scan(self, begun_ns: int, *, own: bool) -> None:
         self._stopping, self._scan = False, ScanProgress()
@@ -371,46 +379,44 @@ class GxsmActivity(Activity):
         is_whole = self._is_whole()
         if is_whole and not self._files.is_saved_by_gxsm:
             try:
-                self._ask.call("autosave")
+                # its return value is the line, not a path; calling it twice would save the scan twice
+                self.gxsm.ask.call("autosave")
             except GxsmError as error:
                 self._log.error("the scan can't be saved: %s", error)
-        # only now: before, GXSM may still tell of the folder of the scan before
+        # not earlier: up to 40 ms after a start GXSM still reports the paths of the previous scan
         channels, folder = self._channels(), self._folder()
         self._files.end(self._scan.ended_ns, self._clock.now_ns(), channels, folder, is_whole=is_whole)
 
     def _is_whole(self) -> bool | None:
-        """Return whether the scan that has ended came to its end, as far as GXSM's memory shows.
-
-        None: it followed another one at once, and was seen too late to know what it found there.
-        """
+        # None: the scan followed another one at once, and was seen too late to know the rows of the previous scan.
         before, (_, shape) = self._before(), self._files.scanning
-        if before is None and self._seen_last[0] == shape:  # somebody began it, and it was soon over
+        if before is None and self._seen_last[0] == shape:  # a short scan from the panel
             before = self._seen_last[1]
         columns = shape[1] if before is None else before["columns"]
-        after = looked_at(self._ask, len(self._channels()), (0, shape[0] - 1), columns)
+        after = looked_at(self.gxsm.ask, len(self._channels()), (0, shape[0] - 1), columns)
         self._seen_last = shape, after
         if before is None:
             return None if self._scan.follows else True
         return not is_unfinished(before, after)
 
     def _folder(self) -> Path | None:
-        """Return where GXSM saves; before its first scan it does not say, and saves where it was started."""
+        # Before its first scan GXSM reports no folder: it saves to the folder in which it was started.
         if self._saving.scan_dir:
             return self._saving.scan_dir
         channels = self._channels(1)
-        return Path(channels[0]).parent if channels else self._ask.working_folder()
+        return Path(channels[0]).parent if channels else self.gxsm.ask.working_folder()
 
     def _channels(self, most: int = _CHANNELS) -> list[str]:
-        """Where GXSM would save each channel."""
         found: list[str] = []
         for channel in range(most):
-            path = self._ask.text("chfname", channel)
+            # GXSM has no list of channels: the first number without one is answered with "EE: invalid channel"
+            path = self.gxsm.ask.text("chfname", channel)
             if path.startswith(_NO_CHANNEL):
                 break
             found.append(self._absolute(path))
         return found
 
     def _absolute(self, path: str) -> str:
-        """Return a path that does not depend on where GXSM was started, if that can be told."""
-        folder = None if path.startswith("/") else self._ask.working_folder()
+        # "./name" is relative to the folder in which GXSM was started.
+        folder = None if path.startswith("/") else self.gxsm.ask.working_folder()
         return path if folder is None else str(folder / path)

@@ -1,10 +1,10 @@
-"""Lets afspm call GXSM: run this in GXSM's Python console, and leave it running.
+"""Bridge between afspm and GXSM: run this file in GXSM's Python console, and leave it running.
 
-The bridge listens on this computer only, and passes on calls of the functions named below and no others. A client and
-the bridge first prove to each other that they know a secret, which is in a file that only this user can read. The
-secret itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`).
-A line that is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several
-clients are served, one call at a time. Set `script-control` to 0 to end the bridge. Nothing but Python is needed here.
+The bridge listens on the loopback interface, and passes on calls of the functions listed below only. A client and the
+bridge first prove to each other that they know a secret, which is in a file that only this user can read. The secret
+itself is never sent, so a program that listens here in place of the bridge learns nothing (`Introduction`). A line that
+is neither a proof nor a call ends its connection, so that no page in a browser can command GXSM. Several clients are
+served, one call at a time. Set `script-control` to 0 to end the bridge. It needs the standard library only.
 """
 
 from __future__ import annotations
@@ -19,31 +19,32 @@ import socket
 import time
 from pathlib import Path
 
-HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if it is in use: another number here and in `address`
+HOST, PORT = "127.0.0.1", globals().get("PORT", 65431)  # if in use: choose another number here and in `address`
 SECRET = "~/.afspm/gxsm-bridge-secret"
 FOLDER = globals().get("FOLDER", str(Path.cwd()))
 WELCOME = "afspm bridge 2"
+# waitscan is missing on purpose: it blocks, and wedges Gxsm4 until it is restarted.
 METHODS = {
     *("set", "get", "gets", "list_refnames", "list_actions", "action", "rtquery", "y_current"),
     *("startscan", "stopscan", "autosave", "chfname", "moveto_scan_xy"),
     *("get_geometry", "get_dimensions", "get_differentials", "get_slice", "get_probe_event"),
 }
 LONGEST, LONGEST_PROOF = 10_000, 200  # bytes of a line
-LOOK_S, WAIT_S = 0.5, 0.1  # between two looks at script-control, and at what clients owe
-PROVES_S = 2.0  # since it connected, however much a client sends meanwhile
-TAKES_S = 10.0  # for a client to take an answer; and a client that is silent so long makes room for another
+LOOK_S, WAIT_S = 0.5, 0.1  # period of checks of script-control, of clients' deadlines
+PROVES_S = 2.0  # deadline for the proof, also for a client that keeps sending
+TAKES_S = 10.0  # to receive an answer; a client silent for longer may be replaced
 MOST_STRANGERS, MOST_CLIENTS = 64, 8
 NONCE = 64  # hexadecimal digits
-gxsm = globals().get("gxsm")  # the console has it
+gxsm = globals().get("gxsm")  # defined in the console
 
 
 def packed(value):  # type: ignore[no-untyped-def]
-    """An array, which JSON does not know."""
+    """Encode an array for JSON."""
     return {"array": value.dtype.str, "shape": value.shape, "bytes": base64.b64encode(value.tobytes()).decode()}
 
 
 def secret() -> bytes:
-    """Return the secret, made when this is run for the first time."""
+    """Return the secret; create it at the first run."""
     path = Path(SECRET).expanduser()
     path.parent.mkdir(mode=0o700, exist_ok=True)
     if not path.exists():
@@ -58,23 +59,23 @@ def secret() -> bytes:
 
 
 def proof(known: bytes, side: str, address: str, client_nonce: str, bridge_nonce: str) -> str:
-    """Return the proof that a side ("bridge", "client") knows the secret, for the random numbers of both.
+    """Return the proof that a side ("bridge" or "client") knows the secret, for the nonces of both.
 
-    The address of the bridge is part of it, as both ends of the connection see it. A program in between that listens
-    somewhere else can therefore not pass a proof on.
+    The proof includes the address of the bridge as both ends of the connection see it, so that a program in between,
+    which listens at another address, can't pass a proof on.
     """
     facts = "\n".join((WELCOME, side, address, client_nonce, bridge_nonce))
     return hmac.new(known, facts.encode("utf-8", "replace"), "sha256").hexdigest()
 
 
 class Introduction:
-    """The first two lines of a connection: the bridge proves that it knows the secret, then the client does.
+    """The handshake in the first two lines of a connection: both sides prove that they know the secret.
 
         client: ["challenge", nonce]     bridge: {"value": [nonce, proof]}
         client: ["response", proof]      bridge: {"value": "afspm bridge 2"}
 
     Attributes:
-        is_over: True once the client has proven that it knows the secret.
+        is_over: True after the client's proof.
     """
 
     def __init__(self, known: bytes, address: str) -> None:
@@ -82,11 +83,11 @@ class Introduction:
         self.is_over = False
 
     def reply_to(self, line: bytes) -> str:
-        """Return the answer to a line; empty: hang up."""
+        """Return the answer to a line; empty: disconnect."""
         return self.reply(parsed(line))
 
     def reply(self, call) -> str:  # type: ignore[no-untyped-def]
-        """Return the answer to a line (`parsed`); empty: hang up."""
+        """Return the answer to a parsed line; empty: disconnect."""
         step, *arguments = call or [""]
         text = arguments[0] if len(arguments) == 1 and isinstance(arguments[0], str) else ""
         if step == "challenge" and len(text) == NONCE and not self._expected:
@@ -101,7 +102,7 @@ class Introduction:
 
 
 def parsed(line: bytes):  # type: ignore[no-untyped-def]
-    """Return a call, ["method", arguments…] in JSON; None if it is none."""
+    """Parse a call, ["method", arguments…] in JSON; return None for anything else."""
     try:
         call = json.loads(line)
     except (ValueError, RecursionError):
@@ -111,21 +112,21 @@ def parsed(line: bytes):  # type: ignore[no-untyped-def]
 
 
 def answer(method, arguments) -> str:  # type: ignore[no-untyped-def]
-    """Return what a call comes to."""
+    """Execute a call; return its value or error as JSON."""
     try:
         if method == "getcwd":
             return json.dumps({"value": FOLDER})
         if method not in METHODS:
             raise NameError(f"{method} is not a method that the bridge passes on")
         value = getattr(gxsm, method)(*arguments)
-        # what `action` returns in Gxsm3 is not initialised: it must not be looked at
+        # Gxsm3 returns uninitialised memory from `action`, which must not be touched
         return json.dumps({"value": None if method == "action" else value}, default=packed)
-    except Exception as error:  # what a call raises is the client's to handle: the bridge goes on
+    except Exception as error:  # any error of GXSM goes to the client, and the bridge serves the others
         return json.dumps({"error": f"{type(error).__name__}: {error}"})
 
 
 def wanted() -> bool:
-    """Return True if the script is to go on."""
+    """Return True while the script should run."""
     return gxsm is not None and gxsm.get("script-control") > 0.5
 
 
@@ -133,9 +134,9 @@ class Client:
     """A connection. Times are monotonic.
 
     Attributes:
-        until_s: when it is dropped, unless it has proven itself, or taken its answer, by then.
-        active_s: when it last sent something.
-        is_open: False from when it should be dropped.
+        until_s: deadline for the proof, later for receiving an answer.
+        active_s: time of the last received bytes.
+        is_open: False once the connection has to end.
     """
 
     def __init__(self, connection: socket.socket, known: bytes, now_s: float) -> None:
@@ -152,16 +153,16 @@ class Client:
 
     @property
     def has_line(self) -> bool:
-        """True if there is a line that can be answered now."""
+        """True if a complete line can be answered now."""
         return self.is_open and not self._unsent and b"\n" in self._received
 
     @property
     def events(self) -> int:
-        """What to wait for: more is read when the last answer has been taken."""
+        """The events to wait for. Nothing is read until the client has received the last answer."""
         return selectors.EVENT_WRITE if self._unsent else selectors.EVENT_READ
 
     def exchange(self, now_s: float) -> None:
-        """Send the rest of an answer, or receive. Too long a line ends the connection."""
+        """Send the rest of an answer, or receive. A line that is too long ends the connection."""
         if self._unsent:
             self.send("", now_s)
         elif not self.has_line:
@@ -171,7 +172,7 @@ class Client:
             self.is_open = bool(part) and len(self._received) <= longest
 
     def reply(self) -> str:
-        """Return the answer to the next line; empty: hang up."""
+        """Return the answer to the next line; empty: disconnect."""
         line, self._received = self._received.split(b"\n", 1)
         call = parsed(line)
         if self.is_stranger:
@@ -179,7 +180,7 @@ class Client:
         return answer(call[0], call[1:]) if call else ""
 
     def send(self, reply: str, now_s: float) -> None:
-        """Send an answer, as much of it as the connection takes now."""
+        """Send an answer, as far as the connection accepts it now."""
         self._unsent += reply.encode()
         try:
             sent = self.connection.send(self._unsent)
@@ -190,12 +191,12 @@ class Client:
             self.until_s = now_s + TAKES_S
 
     def is_late(self, now_s: float) -> bool:
-        """Return True if it has not proven itself, or not taken its answer, in time."""
+        """Return True if the deadline for the proof or for receiving an answer has passed."""
         return now_s >= self.until_s and (self.is_stranger or bool(self._unsent))
 
 
 class Bridge:
-    """Serves the connections to one listening socket."""
+    """The server for all connections to one listening socket."""
 
     def __init__(self, listener: socket.socket, known: bytes) -> None:
         self._listener, self._known = listener, known
@@ -205,7 +206,6 @@ class Bridge:
         self._refused, self._shown_s = 0, 0.0
 
     def serve(self) -> None:
-        """Answer clients until script-control is 0."""
         look_s = time.monotonic()
         while True:
             if time.monotonic() >= look_s:
@@ -226,7 +226,6 @@ class Bridge:
                 self._drop(client)
 
     def close(self) -> None:
-        """End all connections."""
         for client in list(self._clients):
             self._drop(client)
         self._selector.close()
@@ -234,7 +233,7 @@ class Bridge:
     def _accept(self) -> None:
         try:
             client = Client(self._listener.accept()[0], self._known, time.monotonic())
-        except OSError:  # it has gone before it was served
+        except OSError:  # the client has disconnected before it was accepted
             return
         self._clients.append(client)
         self._selector.register(client.connection, client.events, client)
@@ -265,7 +264,7 @@ class Bridge:
         client.send(reply + "\n", now_s)
 
     def _has_room(self, client: Client, now_s: float) -> bool:
-        """Return True if one more client can be served. The one that is silent longest may have lost its connection."""
+        # The client that is silent longest may have lost its connection without notice: a new client takes its place.
         others = [one for one in self._clients if one is not client and not one.is_stranger]
         if len(others) < MOST_CLIENTS:
             return True
@@ -276,7 +275,7 @@ class Bridge:
         return True
 
     def _refuse(self, why: str) -> None:
-        """Show refusals, at most a line in ten seconds: a stranger must not fill GXSM's console."""
+        # At most one line in ten seconds: a flood of connections must not fill GXSM's console.
         self._refused += 1
         if time.monotonic() >= self._shown_s + 10.0:
             print(f"afspm bridge: refused connections: {self._refused}, the last for {why}")  # noqa: T201

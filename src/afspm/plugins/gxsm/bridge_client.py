@@ -1,4 +1,4 @@
-"""The link to GXSM by way of the script in its console (`bridge.py`): two proofs, and then lines of JSON, over TCP."""
+"""Link to GXSM through the script in its console (`bridge.py`): a handshake, then lines of JSON over TCP."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class BridgeLink:
     """A connection to the bridge; the other arguments are those of `TcpConnection`.
 
     Args:
-        secret_file: left out: where the bridge of this user puts it.
+        secret_file: copy of the bridge's secret. Default: the bridge's own file in this user's home.
     """
 
     def __init__(
@@ -45,7 +45,6 @@ class BridgeLink:
         self.close = self._tcp.close
 
     def call(self, method: str, *arguments: str | int | float) -> object:
-        """Call a function of GXSM (see `Link`)."""
         if not self._is_welcome:
             self._introduce()
         reply = self._tcp.ask(method, message(method, *arguments), _read)
@@ -54,15 +53,12 @@ class BridgeLink:
         return reply["value"]
 
     def working_folder(self) -> Path | None:
-        """Return where GXSM was started; it saves there until its user chooses another folder."""
+        """Return the folder in which GXSM was started, where it saves until its user chooses another one."""
         return Path(str(self.call("getcwd")))
 
     def _introduce(self) -> None:
-        """Have the bridge prove that it knows the secret, then prove the same to it.
-
-        Raises:
-            ControllerLost: there is no secret here, or the other end does not know it, or refuses this proof.
-        """
+        # Both sides prove that they know the secret without sending it, so that a program that listens at the bridge's
+        # port in its place neither learns the secret nor receives calls.
         known, nonce = self._secret(), secrets.token_hex(NONCE // 2)
         try:
             answer = self._step("challenge", nonce)
@@ -104,7 +100,7 @@ class BridgeLink:
 
 
 def _read(receiver: Receiver) -> dict[str, object]:
-    """Return the reply in the one line that is replied."""
+    # More bytes after the line: the answer to an earlier call, or a second answer. The connection is out of step.
     parts = [receiver.some()]
     size = len(parts[0])
     while not parts[-1].endswith(b"\n"):
@@ -117,19 +113,19 @@ def _read(receiver: Receiver) -> dict[str, object]:
     return _reply(b"".join(parts))
 
 
-@lru_cache(256, typed=True)  # the same few are asked again and again, a frame by seven questions
+@lru_cache(256, typed=True)  # few different calls, often repeated: reading the frame takes seven
 def message(method: str, *arguments: str | int | float) -> bytes:
-    """Return the line that calls a function."""
+    """Encode the call of a function as a line."""
     return json.dumps([method, *arguments]).encode() + b"\n"
 
 
 def value_line(value: object) -> bytes:
-    """Return the line by which the bridge gives a value."""
+    """Encode a value as the bridge sends it."""
     return json.dumps({"value": value}, default=_packed).encode() + b"\n"
 
 
 def value_of(line: bytes) -> object:
-    """Return the value of such a line. Raises BadReply: it has none."""
+    """Return the value in a line. Raises BadReply: it has none."""
     return _reply(line)["value"]
 
 

@@ -1,4 +1,4 @@
-"""The errors of a call to GXSM."""
+"""Errors of a call to GXSM."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from afspm.translator.driver_base import ControllerLost
 
 
 class GxsmError(AfspmError):
-    """GXSM, or the script in its console, could not do a call, and says so."""
+    """GXSM, or the script in its console, reports an error of a call."""
 
     code = "gxsm"
 
 
 class BadReply(ControllerLost):
-    """A reply that is not what it should be: nothing more on this link is believed."""
+    """A malformed reply: the link can't be trusted any more."""
 
     code = "gxsm-bad-reply"

@@ -1,4 +1,4 @@
-"""The hardware behind GXSM: its drivers ("HwI") differ in what they have and in how they tell what they are doing."""
+"""Hardware behind GXSM: its drivers ("HwI") differ in their names and in the meaning of their status bits."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ STATUS: Final = "s"
 ABORT: Final = "DSP_VP_ABORT_EXECUTE"
 APPROACH: Final = "DSP_CMD_AUTOAPP"
 AUTOSAVE: Final = {True: "CHECK-MainAutoSave", False: "UNCHECK-MainAutoSave"}
-"""The actions that switch it on and off."""
+"""Actions that switch Auto Save on and off."""
 REPEAT_OFF: Final = "UNCHECK-SCAN-REPEAT"
-_MODES: Final = {"force": "FZ"}  # other kinds of spectra are called as GXSM calls them
+_MODES: Final = {"force": "FZ"}  # other kinds have GXSM's own names
 _MOST_BITS: Final = 1 << 24
 
 
 class Hardware(Enum):
-    """A kind of driver."""
+    """A kind of hardware driver."""
 
     SRANGER = "SRanger"
     RPSPMC = "RPSPMC"
@@ -30,7 +30,7 @@ class Hardware(Enum):
 
 @dataclass(frozen=True)
 class Offered:
-    """The names that a running GXSM has, and its kind of hardware."""
+    """The names that a running GXSM has, and the kind of its hardware."""
 
     refnames: frozenset[str]
     actions: frozenset[str]
@@ -43,10 +43,10 @@ class Offered:
 
 @dataclass(frozen=True)
 class Doing:
-    """The state that GXSM tells of itself.
+    """The state that GXSM reports.
 
     Attributes:
-        scanning, probing: both, where it does not tell them apart.
+        scanning, probing: both True where GXSM does not distinguish them.
     """
 
     feedback_on: bool
@@ -62,7 +62,7 @@ class Doing:
 
 
 def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
-    """The kind, by the names that it adds to GXSM's."""
+    """Return the kind of hardware, by the names that it adds to GXSM's lists."""
     if any(name.startswith("dsp-GVP-") for name in refnames) or any(name.startswith("GVP_CMD_") for name in actions):
         return Hardware.RPSPMC
     if any(name.startswith(("sim-", "template-")) for name in refnames):
@@ -71,17 +71,17 @@ def recognised(refnames: Collection[str], actions: Collection[str]) -> Hardware:
 
 
 def decoded(hardware: Hardware, slots: list[float]) -> Doing:
-    """Return what `rtquery("s")` says; of its three numbers only the first has a meaning.
+    """Decode the result of `rtquery("s")`; only the first of its three numbers is initialised.
 
     Raises:
-        BadReply: that is no set of bits.
+        BadReply: the number is no set of bits.
     """
     value = slots[0] if slots else math.nan
     if not (0.0 <= value < _MOST_BITS and value == int(value)):
         raise BadReply(f"GXSM reports its state as {slots}, which is not a set of bits")
     bits = int(value)
     if hardware is Hardware.RPSPMC:
-        running = bool(bits & 2)  # a scan or a spectrum: it does not tell
+        running = bool(bits & 2)  # one bit for scan and spectrum
         return Doing(bool(bits & 1), running, running, bool(bits & 4), moving=False, approaching=False)
     return Doing(
         bool(bits & 1),
@@ -94,15 +94,15 @@ def decoded(hardware: Hardware, slots: list[float]) -> Doing:
 
 
 def execute(kind: str) -> str:
-    """The action that takes a spectrum of a kind."""
+    """Return the action that takes a spectrum of a kind."""
     return f"DSP_VP_{_MODES.get(kind, kind)}_EXECUTE"
 
 
 def available(vendors: Mapping[str, str], refnames: Collection[str]) -> dict[str, str]:
-    """Of parameters that GXSM has names for, which of those there is here; those that there are not are left out.
+    """Return the available name of each parameter, by generic name; parameters without one are left out.
 
     Args:
-        vendors: by generic names, e.g. "dsp-fbs-bias | sim-stm-bias".
+        vendors: alternative names by generic name, e.g. "dsp-fbs-bias | sim-stm-bias".
     """
     found = {}
     for name, vendor in vendors.items():

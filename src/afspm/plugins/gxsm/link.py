@@ -1,4 +1,4 @@
-"""Calls of GXSM: one small protocol, whichever way they go."""
+"""Calls of GXSM's functions: one protocol for both transports."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ HINT = 'address = "127.0.0.1:65431", or "shm" for Gxsm4 without the bridge'
 
 
 class Link(Protocol):
-    """Calls of the functions of GXSM's own module `gxsm`."""
+    """A transport for calls of GXSM's own module `gxsm`."""
 
     def call(self, method: str, *arguments: str | int | float) -> Any:
-        """Call one.
+        """Call a function.
 
         Raises:
-            GxsmError: it could not be done; the link is as before.
-            ControllerLost: no answer, or none to be believed; the link is of no more use.
+            GxsmError: GXSM reports an error; the link stays usable.
+            ControllerLost: no answer, or an untrustworthy one; the link is closed.
         """
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which GXSM was started; None: that can't be told. Raises as `call`."""
+        """Return the folder in which GXSM was started; None: unknown. Raises: see `call`."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the link."""
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where GXSM is.
+    """The address of GXSM: a bridge, or shared memory.
 
     Attributes:
-        host, port: of the bridge; or
-        block, process: of the shared memory, and the name or number of the process that has it.
+        host, port: address of the bridge.
+        block, process: name of the shared memory; name or number of its process.
     """
 
     host: str = ""
@@ -51,11 +51,7 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """From "HOST:PORT", or "shm[:BLOCK[@PROCESS]]".
-
-        Raises:
-            ConfigError: neither.
-        """
+        """Parse "HOST:PORT" or "shm[:BLOCK[@PROCESS]]". Raises ConfigError: neither."""
         kind, _, rest = text.partition(":")
         if kind == "shm":
             block, _, process = rest.partition("@")
@@ -69,15 +65,15 @@ class Address:
 def open_link(
     address: Address, timeout_s: float, monotonic_s: Callable[[], float], secret_file: Path | None = None
 ) -> Link:
-    """A link to GXSM.
+    """Open a link to GXSM.
 
     Args:
-        timeout_s: how long an answer may take, in real time.
-        monotonic_s: real time.
-        secret_file: of the bridge, if it is not where the bridge puts it.
+        timeout_s: longest wait for an answer, real time.
+        monotonic_s: returns real time.
+        secret_file: the bridge's secret, if not at its default place.
 
     Raises:
-        ControllerLost: it is not there. ConfigError: not on this computer.
+        ControllerLost: GXSM does not answer. ConfigError: shared memory without Linux.
     """
     if address.block:
         from afspm.plugins.gxsm.shared_memory import SharedMemoryLink
@@ -89,7 +85,7 @@ def open_link(
 
 
 class Asking:
-    """A link whose answers are of the kind that they should be."""
+    """A link with type-checked answers."""
 
     def __init__(self, link: Link) -> None:
         self.call = link.call
@@ -97,31 +93,31 @@ class Asking:
         self.close = link.close
 
     def number(self, method: str, *arguments: str | int | float) -> float:
-        """A number. Raises BadReply: another thing. As `Link.call`."""
+        """Call a function that returns a number. Raises BadReply: it returned something else. See `Link.call`."""
         value = self.call(method, *arguments)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is not a number")
         return float(value)
 
     def text(self, method: str, *arguments: str | int | float) -> str:
-        """A text. Raises BadReply: another thing. As `Link.call`."""
+        """Call a function that returns text. Raises BadReply: it returned something else. See `Link.call`."""
         value = self.call(method, *arguments)
         if not isinstance(value, str):
             raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which is not a text")
         return value
 
     def numbers(self, method: str, *arguments: str | int | float) -> list[float]:
-        """Several numbers. Raises BadReply: another thing. As `Link.call`."""
+        """Call a function that returns numbers. Raises BadReply: it returned something else. See `Link.call`."""
         value = self.call(method, *arguments)
         if not isinstance(value, tuple | list) or not all(isinstance(one, int | float) for one in value):
-            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which are no numbers")
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}{arguments}, which are not numbers")
         return [float(one) for one in value]
 
     def names(self, method: str) -> frozenset[str]:
-        """A list of names. Raises BadReply: another thing. As `Link.call`."""
+        """Call a function that returns names. Raises BadReply: it returned something else. See `Link.call`."""
         value = self.call(method)
         if not isinstance(value, tuple | list) or not all(isinstance(one, str) for one in value):
-            raise BadReply(f"GXSM replied {value!r:.100} to {method}, which are no names")
+            raise BadReply(f"GXSM replied {value!r:.100} to {method}, which are not names")
         return frozenset(value)
 
 

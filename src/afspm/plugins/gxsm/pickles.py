@@ -1,7 +1,7 @@
-"""Reads what Gxsm4 pickles with an allow-list: numbers, texts, bytes, containers and numpy arrays of numbers.
+"""Restricted unpickler for Gxsm4's results: numbers, texts, bytes, containers and numpy arrays of numbers.
 
-Nothing is imported, and nothing called but the stand-ins for numpy's types here, whatever the bytes say. Python's own
-unpickler in Python is used, since that in C sets aside as much memory as a damaged pickle asks for.
+Nothing is imported, and only the stand-ins for numpy's types below are called. The unpickler is Python's own one
+written in Python: the one in C allocates as much memory as a damaged pickle announces.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _MOST_PARTS: Final = 1_000_000
 
 
 class _DType:
-    """Stands for numpy's dtype of plain numbers."""
+    """Stand-in for numpy's dtype of plain numbers."""
 
     def __init__(self, code: object, *_: object) -> None:
         if code not in _NUMBERS:
@@ -31,7 +31,7 @@ class _DType:
 
 
 class _Array:
-    """Stands for numpy's array, filled from (version, shape, type, True if by columns, bytes)."""
+    """Stand-in for numpy's array, filled from (version, shape, type, True for column-major, bytes)."""
 
     values: np.ndarray | None = None
 
@@ -57,7 +57,7 @@ def _scalar(kind: object, content: object) -> object:
 
 
 _ALLOWED: Final[dict[tuple[str, str], object]] = {("numpy", "dtype"): _DType, ("numpy", "ndarray"): _Array}
-for _core in ("numpy.core", "numpy._core"):  # before numpy 2, and since
+for _core in ("numpy.core", "numpy._core"):  # names before and since numpy 2
     _ALLOWED[f"{_core}.multiarray", "_reconstruct"] = lambda *_: _Array()
     _ALLOWED[f"{_core}.multiarray", "scalar"] = _scalar
     _ALLOWED[f"{_core}.numeric", "_frombuffer"] = _from_buffer
@@ -74,7 +74,7 @@ def loads(content: bytes) -> object:
     """Return the value of a pickle.
 
     Raises:
-        BadReply: it is none, or of something that GXSM does not reply.
+        BadReply: malformed, or a type that GXSM does not send.
     """
     try:
         return _Values().of(_Unpickler(io.BytesIO(content), encoding="latin-1").load())
@@ -82,12 +82,12 @@ def loads(content: bytes) -> object:
         raise
     except RecursionError:
         raise BadReply("GXSM's reply is nested too deeply") from None
-    except Exception as error:  # whatever the bytes make of the unpickler
+    except Exception as error:  # damaged bytes make the unpickler raise almost any error
         raise BadReply(f"GXSM's reply is not a pickle of a value: {type(error).__name__}: {error}") from error
 
 
 class _Values:
-    """Puts arrays in place of their stand-ins; it ends also where a list holds itself, or many times the same."""
+    """Replaces stand-ins by arrays. Counts parts, so that it ends for a list that contains itself."""
 
     def __init__(self) -> None:
         self._left = _MOST_PARTS

@@ -1,4 +1,4 @@
-"""The process that is to be signalled: a signal to the wrong one would end it. Linux only."""
+"""The process to signal. A signal to the wrong process would end it. Linux only."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ _SIGUSR1_BIT: Final = 1 << 9  # signal 10, counted from 1
 
 
 class NoProcess(ControllerLost):
-    """No process of that name, or number, is there."""
+    """No process has this name or number."""
 
 
 @dataclass(frozen=True)
 class GxsmProcess:
-    """A process, told from a later one with the same number by when it was started, in ticks."""
+    """A process, identified by number and start time (in ticks), since numbers are reused."""
 
     pid: int
     started: str | None
 
     def lives(self) -> bool:
-        """Return True if it is still there; asked often, so without psutil, which is ten times slower."""
+        """Return True if it still runs. Without psutil, which is ten times slower: each poll asks."""
         return self.started is not None and _started(self.pid) == self.started
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which it runs; None: it may not be known."""
+        """Return the folder in which it runs; None: not accessible."""
         try:
             return Path(psutil.Process(self.pid).cwd())
         except psutil.Error:
             return None
 
     def signal(self, number: int) -> None:
-        """Send it a signal.
+        """Send a signal.
 
         Raises:
-            ControllerLost: it is gone, or belongs to somebody else.
+            ControllerLost: the process has ended, or belongs to another user.
         """
         if not self.lives():
             raise ControllerLost(f"GXSM, process {self.pid}, has ended")
@@ -51,10 +51,10 @@ class GxsmProcess:
 
 
 def find(process: str) -> GxsmProcess:
-    """Return the process of a name, or of a number, which expects to be signalled.
+    """Find the process with a name or number that handles the signal.
 
     Raises:
-        NoProcess: there is none. ControllerLost: there are several, or it does not expect signals.
+        NoProcess: none. ControllerLost: several, or it does not handle the signal.
     """
     named = (one.pid for one in psutil.process_iter(["name"]) if process in (str(one.pid), one.info["name"]))
     found = [one for one in (GxsmProcess(pid, _started(pid)) for pid in named) if one.lives()]
@@ -79,7 +79,7 @@ def _started(pid: int) -> str | None:
 
 
 def _expects_signals(pid: int) -> bool:
-    """Return True if it handles the signal, or waits for it: one that does neither is ended by it."""
+    # SIGUSR1 ends a process that neither handles it nor waits for it.
     try:
         status = Path("/proc", str(pid), "status").read_text(errors="replace")
     except OSError:

@@ -1,4 +1,4 @@
-"""The results of measurements: GXSM's files, which come late, one for each channel, one after the other."""
+"""Results of measurements: GXSM's files, which appear late, one for each channel, one after the other."""
 
 from __future__ import annotations
 
@@ -28,20 +28,20 @@ from afspm.translator.result_files import (
 _NUMBERED: Final = re.compile(r"\d{3,}-((?:M-)?X[pm]-.+\.nc)$")
 _PRECISION: Final = FilePrecision(part=1e-5, angle_rad=1e-6)
 _CLOCK_NS: Final = 2 * NS_PER_S
-"""Files tell the second in which a scan began."""
+"""Resolution of start times in files, with a margin: they have whole seconds."""
 LATE_S: Final = 20.0
-"""One scan may begin so much later after it was asked for than another."""
+"""Longest difference of start delays between two scans."""
 SOON_S: Final = 1.0
-"""After so long a channel that did not come before will not come; 0.3 s were measured."""
+"""Longest wait for a channel that the previous scan did not save; measured: up to 0.3 s."""
 
 
 class GxsmFiles(ResultFiles):
-    """The measurement that is running or has just ended, and the results.
+    """The running or just ended measurement, and the results.
 
     Args:
-        patience_s: how long all files may take, in experiment time like the others.
-        soon_s: how long those of channels may that did not come before.
-        late_s: how much later than another a scan may begin, after it was asked for.
+        patience_s: longest wait for all files, experiment time.
+        soon_s: longest wait for files of channels that the previous scan did not save, experiment time.
+        late_s: longest difference of start delays between two scans, experiment time.
     """
 
     def __init__(
@@ -60,70 +60,68 @@ class GxsmFiles(ResultFiles):
         self._sizes: dict[Path, tuple[int, int]] = {}
         self._before: set[int] = set()
         self._whole: dict[Path, FileContent] = {}
-        self._outcome: bool | None = None  # of a measurement that another one followed at once
+        self._outcome: bool | None = None  # of a measurement directly followed by another one
         self.upwards = False
         kept.setdefault("absent", [])
         kept.setdefault("channels", {})
         kept.setdefault("program", "")
-        kept.setdefault("starts", [])  # of the last scan's files
-        kept.setdefault("behind_ns", 0)  # how much their clock was
+        kept.setdefault("starts", [])  # start times in the last scan's files
+        kept.setdefault("behind_ns", 0)  # lag of the clock in the files
 
     @property
     def scanning(self) -> tuple[Region, tuple[int, int]]:
-        """The frame of the running scan, and (rows, columns). Only while one runs."""
+        """Frame of the running scan, and (rows, columns). Valid during a scan only."""
         rows, columns = self._kept["running"]["shape"]
         return as_region(self._kept["running"]["frame"]), (rows, columns)
 
     @property
     def is_own(self) -> bool:
-        """True if the translator began the running scan."""
         return bool(self._kept["running"]["own"])
 
     @property
     def is_saved_by_gxsm(self) -> bool:
-        """True if GXSM saves the running scan by itself."""
         return bool(self._kept["running"]["by_gxsm"])
 
     @property
     def before(self) -> tuple[Rows, int | None] | None:
-        """The rows in GXSM's memory before the running scan, with the line that was being scanned when they were read.
+        """Rows in GXSM's memory before the running scan, and the line being scanned when they were read.
 
-        The line is None if the scan had not begun. None: no rows were read.
+        The line is None if the scan had not started. None: no rows were read.
         """
         found = self._kept["running"]["before"]
         return None if found is None else (found["rows"], found["line"])
 
     def looked(self, rows: Rows, line: int | None) -> None:
-        """Keep these for `before`."""
+        """Keep rows for `before`."""
         self._kept["running"]["before"] = {"rows": rows, "line": line}
 
     def is_written(self, file: Path) -> bool:
-        """Return True if a file was written since the running measurement began."""
+        """Return True if the file is newer than the start of the running measurement."""
         return modified_ns(file) > int(self._kept["running"]["newest_ns"])
 
     @property
     def channels(self) -> dict[str, list[str]]:
-        """Name and unit of each channel of the last scans, by the ending of its files."""
+        """Name and unit of the channels of earlier scans, by the ending of their files."""
         found: dict[str, list[str]] = self._kept["channels"]
         return found
 
     @property
     def program(self) -> str:
-        """Its name and version, which only its files tell; empty before the first of them."""
+        """GXSM's name and version, known from its files only; empty before the first one."""
         found: str = self._kept["program"]
         return found
 
     def begin(
         self, what: str, folder: Path | None, begun_ns: int, taken: Entry, *, own: bool = False, by_gxsm: bool = False
     ) -> None:
-        """A measurement begins. One that has ended, and whose files were not read yet, is still waited for.
+        """Register the start of a measurement. An ended one whose files were not read yet is still awaited.
 
         Args:
-            folder: where its files will be; None: GXSM does not say yet.
-            begun_ns: not before this; 0: it was found running, and nobody knows since when.
+            folder: folder of its files; None: unknown yet.
+            begun_ns: earliest start; 0: unknown, as it was found running.
             taken: "frame" and "shape" of a scan, "position" of a spectrum.
-            own: the translator has begun it.
-            by_gxsm: GXSM saves it by itself: its files may be there before it is over, and be written again.
+            own: True if started by the translator.
+            by_gxsm: True if GXSM saves by itself: files may appear before the end, and be written again.
         """
         self._hurry(begun_ns / NS_PER_S)
         followed = self._kept["ended"]
@@ -132,7 +130,7 @@ class GxsmFiles(ResultFiles):
         facts = {"folder": place, "newest_ns": newest, "begun_ns": begun_ns, "before": None}
         self._begins(what, {**facts, "own": own, "by_gxsm": by_gxsm, **taken})
         if followed is not None:
-            # GXSM saves a scan before it begins the next: all that is there now is of the one that has ended
+            # GXSM saves a scan before it starts the next: all present files belong to the ended one
             there = _files(_folder(followed), followed["what"])
             names = [str(file) for file in there if modified_ns(file) > followed["newest_ns"]]
             self._kept["ended"] = {**followed, "names": sorted(names)}
@@ -147,12 +145,13 @@ class GxsmFiles(ResultFiles):
         is_whole: bool | None = True,
         before: Rows | None = None,
     ) -> None:
-        """It has ended, and its files are awaited from now on.
+        """Register the end of the measurement; its files are awaited from now on.
 
         Args:
-            channels: where GXSM says that it saves each channel of a scan.
-            folder: of them, which may be another than at the beginning.
-            is_whole: a scan came to its last row; None: unknown until its files are compared with the rows `before`.
+            channels: path of each channel's file as reported by GXSM.
+            folder: folder of the files, which may have changed since the start.
+            is_whole: True if a scan reached its last row; None: unknown until its files are compared with `before`.
+            before: rows of the previous scan.
         """
         order = [next(iter(endings([Path(path)])), "") for path in channels]
         now_s = now_ns / NS_PER_S
@@ -160,7 +159,7 @@ class GxsmFiles(ResultFiles):
         awaited = {"soon_s": now_s + self._soon_s, "until_s": now_s + self._patience_s}
         self._ends({"end_ns": end_ns, **awaited, "channels": order, "before": before, "is_whole": is_whole})
         ended = self._kept["ended"]
-        if folder is not None and str(folder) != ended["folder"]:  # old scans in there are told by when they began
+        if folder is not None and str(folder) != ended["folder"]:  # old scans there are recognised by their start
             ended["folder"] = str(folder)
             ended["begun_ns"] = ended["begun_ns"] or end_ns
         self._sizes, self._whole, self._before = {}, {}, set()
@@ -168,8 +167,8 @@ class GxsmFiles(ResultFiles):
             self._give_up("it was stopped or never began: GXSM's first or last row still holds the previous scan")
 
     def _hurry(self, now_s: float) -> None:
-        """Read now, or not at all, the files of a measurement that another one followed."""
-        for _ in range(2):  # they are read when they have not grown since the last look
+        # The next measurement overwrites GXSM's memory and may overwrite files: read them now, or never.
+        for _ in range(2):  # a file is read once it has not grown between two looks
             if self._is_followed:
                 self.results(now_s)
         if self._is_followed:
@@ -180,24 +179,24 @@ class GxsmFiles(ResultFiles):
         return self._kept["ended"] is not None and "names" in self._kept["ended"]
 
     def followed(self) -> bool | None:
-        """Return, once, whether a measurement is whole that another one followed at once; None: there was none."""
+        """Return, once, whether a measurement directly followed by another one was complete; None: there was none."""
         found, self._outcome = self._outcome, None
         return found
 
     def forget(self) -> None:
-        """Forget what is running or has ended: it was broken off."""
+        """Forget the running or ended measurement after a stop."""
         if self._is_followed:
             self._give_up("the one that followed it was stopped before its files were read")
         self._outcome = None
         super().forget()
 
     def next_s(self) -> float | None:
-        """When to look again at the latest."""
+        """Return the time of the next necessary look."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["until_s"])
 
     def results(self, now_s: float) -> list[str]:
-        """The last results, oldest first: each by one of its files and when it ended."""
+        """Return the last results, oldest first, each named by one of its files and its end."""
         self.broken_off = False
         ended = self._kept["ended"]
         if ended is not None:
@@ -220,7 +219,6 @@ class GxsmFiles(ResultFiles):
         return self._listed()
 
     def _why_unfinished(self, ended: Entry, files: Mapping[Path, FileContent]) -> str:
-        """Return why a scan is not published that another one followed; empty: it came to its end."""
         before, named = ended["before"], endings(files)
         if before is None:
             return "one scan followed the other at once, and whether this one came to its end is unknown"
@@ -234,7 +232,7 @@ class GxsmFiles(ResultFiles):
         return [_PRECISION.as_set(one, entry) for content in contents for one in content]
 
     def _new(self, ended: Entry) -> dict[Path, FileContent]:
-        """The files of what has ended that are whole: they have stopped growing, and can be read."""
+        # Complete files only: a file is read once its size has been the same in two looks.
         found = {}
         names = ended.get("names")
         there = _files(_folder(ended), ended["what"]) if names is None else [Path(name) for name in names]
@@ -250,20 +248,18 @@ class GxsmFiles(ResultFiles):
                 try:
                     self._whole[file] = read_result(file)
                 except (AfspmError, OSError):
-                    continue  # not yet
+                    continue  # incomplete: GXSM is still writing it
             content = self._whole.get(file)
             if content is not None and not self._is_of_before(content, ended["begun_ns"]):
                 found[file] = content
-        if ended["what"] == SCAN:  # one for each channel, should somebody have it saved again
+        if ended["what"] == SCAN:  # one for each channel: a person may save it again
             return {file: found[file] for file in endings(found).values()}
         return {file: found[file] for file in sorted(found, key=lambda file: file.stat().st_mtime_ns)[-1:]}
 
     def _is_of_before(self, content: FileContent, begun_ns: int) -> bool:
-        """Return True if it is a scan of before: the last one, saved again, or one that was stopped, saved late.
-
-        When it began is told by the clock of GXSM's computer, which may be another than ours, and be set meanwhile:
-        what began before the last scan did, by that clock, is new.
-        """
+        # Files have the time of GXSM's computer, whose clock may differ from this one and be set at any time. A start
+        # before the last scan's start, by GXSM's clock, therefore means that the clock was set back, not that the scan
+        # is old.
         start_ns, known = content.start_ns, self._kept["starts"]
         if start_ns is None:
             return False
@@ -278,12 +274,11 @@ class GxsmFiles(ResultFiles):
         return is_of_before
 
     def _saw(self, ended: Entry, starts: set[int]) -> None:
-        """Files that began then, after what was begun."""
         self._kept["starts"] = sorted(starts)
         self._kept["behind_ns"] = ended["begun_ns"] - max(starts) if starts and ended["begun_ns"] else 0
 
     def _all(self, ended: Entry, files: Iterable[Path], now_s: float) -> bool:
-        """Return True if no file is missing; those that the scan before did not have are not waited for as long."""
+        # A channel that the previous scan did not save either is awaited for a short time only.
         if "names" in ended:
             return all(Path(name) in self._whole for name in ended["names"])
         missing = set(ended["channels"]) - endings(files).keys() - {""}
@@ -322,7 +317,8 @@ class GxsmFiles(ResultFiles):
             absent = sorted(set(ended["channels"]) - endings(files).keys() - {""})
             if set(absent) - set(self._kept["absent"]):
                 self._log.warning(
-                    "GXSM did not save %s; the translator waits less long for it from now on", ", ".join(absent)
+                    "GXSM did not save %s; from now on the translator waits for it for a short time only",
+                    ", ".join(absent),
                 )
             self._kept["absent"] = absent
             self._saw(ended, {content.start_ns for content in files.values() if content.start_ns})
@@ -332,7 +328,7 @@ class GxsmFiles(ResultFiles):
                 self._kept["program"] = f"{header.get('Creator', '')} {header.get('Version', '')}".strip()
                 self._kept["channels"][ending] = [scan.channel, scan.unit]
         names = [str(file) for file in files]
-        # numbered by its end: files of spectra may be overwritten
+        # the end time makes the name unique: SRanger overwrites files of spectra
         content = [_PRECISION.as_set(one, ended) for file in files.values() for one in file]
         self._add(f"{names[0]} ({ended['end_ns']})", ended, {"files": names}, content)
         self._kept["ended"] = None
@@ -341,7 +337,7 @@ class GxsmFiles(ResultFiles):
 
 
 def endings(files: Iterable[Path]) -> dict[str, Path]:
-    """Return the last file of each channel of a scan, by what follows the number in its name."""
+    """Return the last file of each channel, by the part of its name after the number."""
     named = ((_NUMBERED.search(file.name), file) for file in files)
     return {match[1]: file for match, file in named if match}
 

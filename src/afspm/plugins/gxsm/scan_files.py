@@ -1,7 +1,7 @@
-"""NetCDF (.nc): GXSM's scans, NetCDF-3 of Gxsm3 and NetCDF-4 (which is HDF5) of Gxsm4, one channel a file.
+"""NetCDF files (.nc) of GXSM's scans: NetCDF-3 of Gxsm3, NetCDF-4 (HDF5) of Gxsm4, one channel each.
 
-Values are FloatField * dz; rows come from the top; lengths are in ångström whatever their attributes say; rangex goes
-from the first pixel to the last; offsetx is the centre; alpha is clockwise in degrees.
+Values are FloatField * dz; rows come from the top; lengths are in ångström even if their attributes name another unit;
+rangex is from the first pixel to the last; offsetx is the centre; alpha is clockwise in degrees.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _WAS_DASH = re.compile(r"(?<=[A-Z0-9])m(?=[A-Z])")
 
 @dataclass(frozen=True, eq=False)
 class _Raw:
-    """The parts that are needed of a file, whichever NetCDF it is.
+    """The needed parts of a file, for both kinds of NetCDF.
 
     Attributes:
         values: FloatField, (time, value, y, x).
-        attributes: of FloatField.
-        numbers, texts: of the other variables.
-        about: attributes of the whole, such as the program's version.
+        attributes: attributes of FloatField.
+        numbers, texts: other variables.
+        about: global attributes, such as the program's version.
     """
 
     values: NDArray[np.float64]
@@ -48,7 +48,7 @@ class _Raw:
 
 
 def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
-    """A scan. Raises FileError, KeyError and ValueError: something else, or broken."""
+    """Read a scan. Raises FileError, KeyError, ValueError: another format, or damaged."""
     if hdf5.is_hdf5(path):
         return _content(_netcdf4(path), path)
     return _content(_netcdf3(netcdf.read(path)), path)
@@ -112,17 +112,14 @@ def _region(numbers: dict[str, float]) -> Region:
 
 
 def _ns(numbers: dict[str, float], key: str) -> int | None:
-    """Zero is what a scan has that was never begun."""
+    # A scan that never started has the time zero.
     seconds = numbers.get(key, 0.0)
     return round(seconds) * NS_PER_S if seconds > 0.0 else None
 
 
 def _unit(raw: _Raw) -> tuple[str, float]:
-    """Return the unit of the values times dz, and dz; ångström is given as m.
-
-    ZSrcUnit is the name of the unit in GXSM's own list, where a second millivolt is "mV1". The unit itself is var_unit
-    in Gxsm4, which has that name in `unit`, and `unit` in Gxsm3. A length is in ångström by either.
-    """
+    # ZSrcUnit is the unit's name in GXSM's own list, where a second millivolt is "mV1". The unit is in `var_unit` in
+    # Gxsm4, whose `unit` has that name, too, and in `unit` in Gxsm3. A length by either one is in ångström.
     given = raw.attributes
     named = given.get("ZSrcUnit", "")
     unit = given.get("var_unit") or given.get("unit", "") or named
@@ -130,11 +127,8 @@ def _unit(raw: _Raw) -> tuple[str, float]:
 
 
 def _channel(raw: _Raw, path: Path) -> str:
-    """Return the channel's name as the program shows it, and mark the way back.
-
-    "ZS-Topo" is ZSmTopo in the file's name. Gxsm3 has the name nowhere else: "ADC0-ITunnel" has the label "I". There an
-    "m" between a capital or digit and a capital is taken for the dash that it was.
-    """
+    # "ZS-Topo" is ZSmTopo in the file's name. Gxsm3 has the full name nowhere else: "ADC0-ITunnel" has the label "I".
+    # There, an "m" between a capital or digit and a capital is taken for the original dash.
     label = raw.attributes.get("ZLabel", "")
     match = _FILE_NAME.search(raw.texts.get("basename", "")) or _FILE_NAME.search(path.name)
     if match is None:
@@ -144,8 +138,8 @@ def _channel(raw: _Raw, path: Path) -> str:
 
 
 def _measured(image: NDArray[np.float64], upwards: bool | None) -> NDArray[np.float64]:
-    """[y, x], both ascending, from rows that begin at the top. What a stopped scan has not reached is zero, and nothing
-    marks it: whole rows of zeros at its end become NaN (all of them: a signal that was zero)."""
+    # Rows that a stopped scan did not reach are zero, without any mark: whole rows of zeros at its end become NaN. If
+    # all rows are zero, they are values.
     rows = image[::-1].copy()
     zero = (rows == 0.0).all(axis=1)
     if zero.all():

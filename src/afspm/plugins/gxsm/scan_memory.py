@@ -1,8 +1,7 @@
-"""The scan in GXSM's memory: its lines while it runs, and whether it came to its end.
+"""GXSM's memory of a scan: lines of the running scan, and the check for completeness.
 
-GXSM keeps the values of the scan before wherever it did not come to, and does not tell which rows are new. A scan that
-ended has written both the first and the last row of each channel; one
-that was stopped has left at least one of them, bit by bit, as it was.
+GXSM keeps the values of the previous scan in rows not yet scanned, and does not mark new rows. A complete scan has
+rewritten the first and the last row of each channel; a stopped one has left at least one of them bit-identical.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ class Rows(TypedDict):
     """A few rows of GXSM's memory, JSON-able.
 
     Attributes:
-        columns: how many of each row were looked at.
-        digests: by channel and row; that of a constant row, which says nothing, begins with `_CONSTANT`.
+        columns: number of compared columns.
+        digests: digest by channel and row. The digest of a constant row, which proves nothing, starts with `_CONSTANT`.
     """
 
     columns: int
@@ -35,11 +34,11 @@ class Rows(TypedDict):
 
 
 def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -> Rows:
-    """Return what is in GXSM's memory now.
+    """Return the digests of rows in GXSM's memory.
 
     Args:
-        channels: how many, from 0 on.
-        columns: at most: a scan before may have had fewer.
+        channels: number of channels, from 0 on.
+        columns: highest number of columns; the previous scan may have fewer.
     """
     facts = {channel: (ask.call("get_dimensions", channel), _factor(ask, channel)) for channel in range(channels)}
     there = {channel: (shape, dz) for channel, (shape, dz) in facts.items() if dz and _is_shape(shape)}
@@ -60,7 +59,7 @@ def looked_at(ask: Asking, channels: int, rows: Collection[int], columns: int) -
 
 
 def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
-    """Return what files have in the rows that were looked at in GXSM's memory; by the number of their channel."""
+    """Return the digests of the same rows in files, by channel number."""
     return Rows(
         columns=like["columns"],
         digests={
@@ -76,21 +75,20 @@ def in_files(files: Mapping[int, FileContent], like: Rows) -> Rows:
 
 
 def _stored(file: FileContent) -> np.ndarray:
-    """Return the values as GXSM has them in its memory, rows from the top."""
     scan, dz = file.scans[0], float(str(file.header["dz"]))
     return scan.values[::-1] / (ANGSTROM_M if scan.unit == "m" else 1.0) / dz
 
 
 def only(rows: Rows, row: int) -> Rows:
-    """Return one of the rows that were looked at, of each channel."""
+    """Return the digests of one row only."""
     digests = {channel: {str(row): there[str(row)]} for channel, there in rows["digests"].items() if str(row) in there}
     return Rows(columns=rows["columns"], digests=digests)
 
 
 def is_unfinished(before: Rows, after: Rows) -> bool:
-    """Return whether a scan was stopped, or did not begin: some rows are as before.
+    """Return True if a scan was stopped or never started: some rows are unchanged.
 
-    A channel that is the same from first to last, while others are not, is one that does not change.
+    A channel with no changed row at all, beside channels with changes, is a constant signal.
     """
     changed = unchanged = False
     for channel, rows in before["digests"].items():
@@ -104,7 +102,7 @@ def is_unfinished(before: Rows, after: Rows) -> bool:
 
 
 def _digest(stored: np.ndarray) -> str:
-    """Return that of values as they are stored: the factor that they are told with may change between two scans."""
+    # Of stored values, without dz: GXSM may change dz between two scans.
     values = stored.astype(np.float32)
     kind = _CONSTANT if (values == values[0]).all() else ""
     return kind + hashlib.blake2b(values.tobytes(), digest_size=12).hexdigest()
@@ -114,11 +112,10 @@ def _is_shape(found: Any) -> bool:
     is_shape = (
         isinstance(found, tuple | list) and len(found) == 4 and all(isinstance(one, int | float) for one in found)
     )
-    return is_shape and 0 < found[0] < _MOST  # where there is no scan, GXSM says 4294967295
+    return is_shape and 0 < found[0] < _MOST  # without a scan GXSM reports 4294967295
 
 
 def _factor(ask: Asking, channel: int) -> float:
-    """Return what stored values are multiplied with; 0: there are none."""
     found = ask.call("get_differentials", channel)
     return float(found[2]) if isinstance(found, tuple | list) and len(found) == 4 else 0.0
 
@@ -131,14 +128,14 @@ def new_lines(
     start: int,
     done: int,
 ) -> list[ScanLines]:
-    """The lines from `start` to `done`, in the order in which they are scanned.
+    """Return the lines from `start` to `done`, in scanning order.
 
-    GXSM tells neither names nor units of what it hands out: those of the files before are taken.
+    GXSM's memory has neither names nor units of channels: those of earlier files are used.
 
     Args:
-        endings: of the channels' files, by number.
-        known: name and unit of a channel, by the ending of its files.
-        taken: the frame that is being scanned, and (rows, columns).
+        endings: endings of the channels' files, by channel number.
+        known: name and unit of a channel, by file ending.
+        taken: frame of the running scan, and (rows, columns).
     """
     region, shape = taken
     count = min(done, shape[0]) - start
@@ -148,7 +145,7 @@ def new_lines(
     for channel, ending in enumerate(endings):
         if ending in known:
             found = ask.call("get_slice", channel, 0, 0, start, count)
-            # of another shape: somebody has changed the next frame, and this one was found running
+            # another shape: a person has changed the next frame, after this scan was found running
             if isinstance(found, np.ndarray) and found.shape == (count, shape[1]):
                 images[ending] = found.astype(np.float64)
     lines = []

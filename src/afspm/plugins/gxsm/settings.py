@@ -1,7 +1,7 @@
-"""The scan frame and the tip in it: GXSM has the centre, a clockwise angle, and lengths in the unit of its panel.
+"""Scan frame and tip position: GXSM has the centre, a clockwise angle, and lengths in the unit of its panel.
 
-`get` and `set` are in the unit that the user prefers; `moveto_scan_xy` and files are in ångström, always. A range goes
-from the centre of the first pixel to that of the last, as everywhere in afspm.
+`get` and `set` use the unit that the user prefers; `moveto_scan_xy` and files are always in ångström. A range goes from
+the centre of the first pixel to the centre of the last, as in afspm.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from afspm.translator.state import Kept
 
 ANGSTROM_M: Final = 1e-10
 _UNITS: Final = {"AA": "Å", "Ang": "Å", "\u00c5": "Å", "\u212b": "Å", "\u03bcm": "um", "\u00b5m": "um"}
-_ROUNDED: Final = 0.06  # what a panel's digits may leave out
+_ROUNDED: Final = 0.06  # rounding of the panel's digits
 REFNAMES: Final = ("PointsX", "PointsY", "RangeX", "RangeY", "OffsetX", "OffsetY", "Rotation")
 _SIZE: Final = {names.SCAN_SIZE_X, names.SCAN_SIZE_Y}
 PIXELS: Final = {names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
@@ -31,10 +31,10 @@ _CORNER: Final = {names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y}
 
 
 def user_unit_m(ask: Asking) -> float:
-    """The unit of lengths that GXSM's panel shows, in m.
+    """Return the unit of lengths on GXSM's panel, in m.
 
     Raises:
-        AfspmError: it can't be told, or GXSM would take 12.5 for 12.
+        AfspmError: the unit is unknown, or a decimal comma would make GXSM read 12.5 as 12.
     """
     shown, number = ask.text("gets", "RangeX").strip(), ask.number("get", "RangeX")
     digits, _, unit = shown.partition(" ")
@@ -46,7 +46,7 @@ def user_unit_m(ask: Asking) -> float:
     except (ValueError, AfspmError) as error:
         raise BadReply(f"GXSM shows {shown!r} for RangeX: {error}") from error
     if not math.isclose(read, number, rel_tol=0.01, abs_tol=_ROUNDED):
-        raise BadReply(f"GXSM shows {shown!r} for RangeX, and says {number}")
+        raise BadReply(f"GXSM shows {shown!r} for RangeX on its panel, but returns {number}")
     return unit_m
 
 
@@ -54,7 +54,7 @@ class ScanFrame:
     """The frame of the next scan.
 
     Args:
-        unit_m: what `user_unit_m` says.
+        unit_m: unit of lengths; see `user_unit_m`.
     """
 
     def __init__(self, ask: Asking, unit_m: float) -> None:
@@ -62,14 +62,14 @@ class ScanFrame:
         self._unit_m = unit_m
 
     def read(self) -> dict[str, Value]:
-        """In SI, by generic names."""
+        """Return the frame as generic parameters in SI."""
         columns, rows, width, height, x, y, clockwise_deg = (number(self._ask, ref) for ref in REFNAMES)
         center_m, size_m = (x * self._unit_m, y * self._unit_m), (width * self._unit_m, height * self._unit_m)
         angle_rad = 0.0 - math.radians(math.remainder(clockwise_deg, 720.0))
         return frame_values(Region(center_m, size_m, angle_rad), (round(rows), round(columns)))
 
     def write(self, values: Mapping[str, Value]) -> None:
-        """Change what is given. X goes before Y: setting one in x, GXSM changes that in y."""
+        """Set the given parameters. X is set before Y, since GXSM changes Y with X."""
         asked = values.keys()
         before = {} if asked >= set(FRAME) else self.read()
         region, (rows, columns) = frame({**before, **values})
@@ -86,15 +86,10 @@ class ScanFrame:
             self._send("Rotation", 0.0 - math.degrees(region.angle_rad))
 
     def region(self) -> Region:
-        """Of the next scan."""
         return frame(self.read())[0]
 
     def move_tip(self, xy_m: tuple[float, float]) -> None:
-        """Send the tip to a place, which must lie in the frame.
-
-        Raises:
-            Refused: PARAM_ERROR: it does not.
-        """
+        """Move the tip to a position within the frame. Raises Refused: PARAM_ERROR: outside the frame."""
         region = self.region()
         u_m, v_m = in_frame(region, xy_m)
         if self._ask.number("moveto_scan_xy", u_m / ANGSTROM_M, v_m / ANGSTROM_M) != 0.0:
@@ -102,7 +97,7 @@ class ScanFrame:
             raise Refused(ControlResponse.PARAM_ERROR, reason)
 
     def tip(self) -> tuple[float, float]:
-        """Where the tip was last sent in the frame, (x, y) in m; its centre where that can't be told."""
+        """Return the position where the tip was last sent in the frame, (x, y) in m; if unknown the frame's centre."""
         region = self.region()
         try:
             u_m, v_m = (number(self._ask, ref) * self._unit_m for ref in ("ScanX", "ScanY"))
@@ -115,10 +110,10 @@ class ScanFrame:
 
 
 class FrameSettings(SettingsGroup):
-    """The frame of the next scan, as settings.
+    """The frame of the next scan, as a group of settings.
 
     Args:
-        is_led: True if the tip goes along with its frame, and GXSM does not tell that it moves.
+        is_led: True if the tip moves with its frame without being reported as moving.
     """
 
     names = FRAME
@@ -140,11 +135,11 @@ class FrameSettings(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The place that the tip was sent to, which GXSM's files of spectra do not tell.
+    """The position where the tip was sent, which GXSM's files of spectra lack.
 
     Args:
-        kept: JSON-able, and lasts.
-        on_move: called with the length of the way when the tip is sent away.
+        kept: persistent, JSON-able.
+        on_move: called with the length of a move at its start.
     """
 
     names = POSITION
@@ -155,7 +150,7 @@ class TipPlace(SettingsGroup):
         self.on_move = on_move
 
     def xy_m(self) -> tuple[float, float]:
-        """Return where the tip was sent, (x, y) in m."""
+        """Return the position where the tip was sent, (x, y) in m."""
         sent = self._kept.get("probe")
         return self.frame.tip() if sent is None else (float(sent[0]), float(sent[1]))
 
@@ -171,10 +166,10 @@ class TipPlace(SettingsGroup):
 
 
 class FeedbackSwitch(SettingsGroup):
-    """The feedback, which only some hardware has actions to switch.
+    """The feedback switch, by actions that only some hardware has.
 
     Args:
-        actions: that switch it on and off.
+        actions: names of the actions for on and off.
     """
 
     names = (FEEDBACK_ON,)
@@ -193,30 +188,30 @@ class FeedbackSwitch(SettingsGroup):
 
 
 def number(ask: Asking, ref: str) -> float:
-    """The value of a parameter. Raises BadReply: GXSM has none."""
+    """Return the value of a parameter. Raises BadReply: GXSM has none."""
     value = ask.number("get", ref)
     if not math.isfinite(value):
-        raise BadReply(f"GXSM says {value} for {ref}")
+        raise BadReply(f"GXSM returned {value} for {ref}")
     return value
 
 
 def send(ask: Asking, ref: str, value: float) -> None:
-    """Set a parameter; GXSM never says whether it did, so that it must be read again.
+    """Set a parameter. GXSM never reports a failure: the value must be read back.
 
-    It wants a text, reads it up to what it doesn't understand, and has a '.' in it.
+    GXSM takes text, and parses the longest numeric prefix with a decimal point.
     """
     ask.call("set", ref, repr(value))
 
 
 def in_frame(region: Region, xy_m: tuple[float, float]) -> tuple[float, float]:
-    """A place as seen from the centre of a frame, along its sides."""
+    """Convert a position to the frame: from its centre, along its sides."""
     x, y = xy_m[0] - region.center_m[0], xy_m[1] - region.center_m[1]
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     return cos * x + sin * y, cos * y - sin * x
 
 
 def in_space(region: Region, uv_m: tuple[float, float]) -> tuple[float, float]:
-    """The reverse of `in_frame`."""
+    """Convert a position in the frame to (x, y); the reverse of `in_frame`."""
     cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
     (u, v), (x, y) = uv_m, region.center_m
     return x + cos * u - sin * v, y + sin * u + cos * v

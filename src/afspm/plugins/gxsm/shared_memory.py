@@ -1,7 +1,7 @@
-"""The link to Gxsm4 by way of the shared memory that it serves to other programs of the same user (Linux).
+"""Link to Gxsm4 through the shared memory that it serves to other programs of the same user (Linux).
 
-A call is written into the block and announced by a signal; the answer appears in the block. Whoever calls holds the
-lock that GXSM's own tools take, too: two callers at once would get each other's answers.
+A call is written into the block and announced by a signal; the answer appears in the block. A caller holds the lock
+that GXSM's own tools also take: two callers at once would receive each other's answers.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ class SharedMemoryLink:
     """The block of a running Gxsm4. For one thread.
 
     Args:
-        block: the name of the shared memory.
-        process: the name of GXSM's process, or its number.
-        timeout_s: how long an answer may take, in real time.
-        monotonic_s: real time.
+        block: name of the shared memory.
+        process: name or number of GXSM's process.
+        timeout_s: longest wait for an answer, real time.
+        monotonic_s: returns real time.
 
     Raises:
-        ControllerLost: no block, or no process that serves it. ConfigError: this computer runs no Linux.
+        ControllerLost: no block, or no process serves it. ConfigError: the system is not Linux.
     """
 
     def __init__(self, block: str, process: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
@@ -62,7 +62,7 @@ class SharedMemoryLink:
         self._timeout_s = timeout_s
         self._monotonic_s = monotonic_s
         self._where = f"shm:{block}"
-        # what waits for the memory to change has nothing to be woken by but the end
+        # waits in polls of the memory: nothing but `close` could wake them
         self._closed = Event()
         path = _FOLDER / block
         try:
@@ -75,7 +75,7 @@ class SharedMemoryLink:
                 self.close()
             raise
         self._memory = self._mapped(path)
-        # traced as if the bridge had passed the calls on: it is one form for both, and can be played back anywhere
+        # traced in the form of the bridge's calls: one form for both, which can be replayed on any system
         self._trace = TRACE.connection(TCP)
 
     def _mapped(self, path: Path) -> mmap.mmap:
@@ -89,7 +89,6 @@ class SharedMemoryLink:
             raise ControllerLost(f"no shared memory: {error}", where=self._where, hint=hint) from error
 
     def call(self, method: str, *arguments: str | int | float) -> object:
-        """Call a function of GXSM (see `Link`)."""
         if self._closed.is_set():
             raise ControllerLost("the link was closed", where=self._where)
         try:
@@ -103,7 +102,6 @@ class SharedMemoryLink:
             raise
 
     def working_folder(self) -> Path | None:
-        """Return the folder in which GXSM was started."""
         folder = self._process.working_folder()
         with self._trace.asking("getcwd", bridge_client.message("getcwd")) as traced:
             traced.add(bridge_client.value_line(str(folder)))
@@ -111,7 +109,6 @@ class SharedMemoryLink:
         return folder
 
     def close(self) -> None:
-        """Let go of the block."""
         if not self._closed.is_set():
             self._closed.set()
             self._memory.close()
@@ -119,7 +116,9 @@ class SharedMemoryLink:
     def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> object:
         until_s = self._monotonic_s() + self._timeout_s
         self._see_alive()
-        if self._status() == _REQUEST:  # of somebody who has given up waiting: its answer would be taken for ours
+        if (
+            self._status() == _REQUEST
+        ):  # of a caller that has given up waiting: its answer would be taken for the next one's
             before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
             self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
         content = pickle.dumps(arguments, 4)
@@ -142,7 +141,7 @@ class SharedMemoryLink:
         status = self._status()
         if status in _FAILURES:
             raise GxsmError(_FAILURES[status], where=method)
-        length = struct.unpack_from("<I", self._memory, _LENGTH)[0]  # GXSM itself takes 32 bits of it
+        length = struct.unpack_from("<I", self._memory, _LENGTH)[0]  # a uint64, but GXSM itself reads 32 bits
         if status != 0 or length > _BYTES - _CONTENT:
             raise BadReply(f"GXSM replied {length} bytes, with the status {status}, to {method}", where=self._where)
         return pickles.loads(self._memory[_CONTENT : _CONTENT + length])
@@ -151,7 +150,6 @@ class SharedMemoryLink:
         return int(struct.unpack_from("<q", self._memory, _STATUS)[0])
 
     def _wait(self, until_s: float, complaint: str) -> None:
-        """Until the status is no request any more. Raises ControllerLost."""
         looks = 0
         while self._status() == _REQUEST:
             looks += 1
@@ -164,19 +162,19 @@ class SharedMemoryLink:
             self._closed.wait(_SOON_S if looks < _LOOKS_SOON else _LATER_S)
 
     def _see_alive(self) -> None:
-        """Raise ControllerLost if GXSM has ended. The next one would find, and never answer, what it was asked."""
+        # A request left in the block of an ended GXSM would stay there for the next instance, which never answers it.
         if not self._process.lives():
             self._withdraw_request()
             raise ControllerLost("Gxsm4 has ended", where=self._where)
 
     def _withdraw_request(self) -> None:
-        """Take back what nobody is there to answer. Only under the lock."""
+        # Call only under the lock.
         if self._status() == _REQUEST:
             struct.pack_into("<q", self._memory, _STATUS, 0)
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """While nobody else calls GXSM. Raises ControllerLost: somebody does not stop to."""
+        # The lock of GXSM's own tools: two callers at once receive each other's answers.
         import fcntl
 
         path = Path(tempfile.gettempdir()) / _LOCK

@@ -19,13 +19,13 @@ _BEGIN, _END = "#C Data Table", "#C END."
 
 
 def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
-    """The curve; `kind` is that of the file's name ("VP", "IV" …).
+    """Read a spectrum; `kind` is in the file's name ("VP", "IV" …).
 
-    Where it was taken is not known: the file has the offset of the scan, not the place of the probe. Columns without
-    a unit (the number of the row, where blocks begin) are left out, and those that come a second time.
+    Its position is unknown: the file has the offset of the scan, not the place of the probe. Columns without a unit
+    (row number, block starts) and repeated columns are left out.
 
     Raises:
-        FileError, ValueError: no probe data, or broken.
+        FileError, ValueError: another format, or damaged.
     """
     lines = decoded(path.read_bytes()).splitlines()
     starts = [k for k, line in enumerate(lines) if line.startswith(_BEGIN)]
@@ -35,9 +35,9 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
     header = _header(lines[: starts[0]])
     columns = lines[starts[0] + 1].removeprefix("#C ").split("\t")
     rows = [line.split("\t") for line in lines[starts[0] + 2 : ends[0]] if line.strip("#C \t")]
-    told = re.search(r"N=(\d+)", header.get("Probe Data Number", ""))
-    if told is None or len(rows) != int(told[1]):
-        raise FileError(f"has {len(rows)} rows in its table and announces {told and told[1]}")
+    announced = re.search(r"N=(\d+)", header.get("Probe Data Number", ""))
+    if announced is None or len(rows) != int(announced[1]):
+        raise FileError(f"has {len(rows)} rows in its table instead of the announced {announced and announced[1]}")
     for number, row in enumerate(rows):
         if len(row) != len(columns) or row[0] != str(number):
             raise FileError(f"row {number} of its table is damaged")

@@ -1,4 +1,4 @@
-"""A picture, or a scan that another microscope took, as the sample of a simulated microscope."""
+"""A picture, or a scan of another microscope, as the sample of a simulated microscope."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from afspm.simulation.simulator import Simulator
 
 __all__ = ["ImageMicroscope"]
 
-# An instrument that shows the picture as it is; whoever wants noise, drift or a blunt tip says so.
+# An ideal instrument shows the picture as it is; settings add noise, drift or a blunt tip.
 _IDEAL: Mapping[str, PlainMapping] = {
     "tip": {"radius_m": 1e-12, "half_angle_deg": 1.0, "spread": 0.0},
     "noise": dict.fromkeys(
@@ -24,15 +24,15 @@ _IDEAL: Mapping[str, PlainMapping] = {
 
 
 class ImageMicroscope(Simulator):
-    """The simulated microscope with the heights of a file as its sample, shown as they are.
+    """The simulated microscope, ideal, with the heights of a file as its sample.
 
-    The middle of the picture lies at the origin; beyond its borders it goes on mirrored.
+    The middle of the picture is at the origin; beyond its borders it continues mirrored.
 
     Args:
-        file: a picture (bright is high), a numpy array, or a scan of any controller that `afspm.read` reads.
-        width: from its first to its last pixel; a scan says that itself.
-        height: from its lowest to its highest; a scan says that itself.
-        settings: as of the Simulator: with `noise`, `drift`, `tip` … the picture is seen less well than it is.
+        file: a picture (bright is high), a numpy array, or a scan in any format that `afspm.read` reads.
+        width: distance from the first to the last pixel; not needed for a scan.
+        height: distance from the lowest to the highest value; not needed for a scan.
+        settings: settings of the Simulator: `noise`, `drift`, `tip` … make the instrument less than ideal.
     """
 
     def __init__(self, file: Path, *, width: Length = 0.0, height: Length = 0.0, **settings: Any) -> None:

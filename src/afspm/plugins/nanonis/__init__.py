@@ -1,4 +1,18 @@
-"""Nanonis (SPECS), over the TCP programming interface of its own software. See the README beside this."""
+"""Driver of Nanonis controllers (SPECS), over their TCP programming interface. See the README in this folder.
+
+**Theory of operation.** The first connection carries quick requests, the second one blocking call at a time, in a
+thread of its own (`session`): the wait for the end of a scan, or a spectrum with its data. Nanonis sends nothing
+unrequested.
+
+    comes in      replies, decoded by the fields of the software's release (`protocol`); events of the second
+                  connection; new files in the session folder
+    state         the running and the ended measurement, and the present occupation, all persistent (`activity`);
+                  the goal of the tip (`settings`)
+    goes out      requests; scans and spectra from files (`result_files`), or from Nanonis' memory (`fetched`)
+    always holds  a reply that does not fit its request ends the connection; a value of a getter never goes into a
+                  setter as it is, since both count differently; a scan that was never seen running is not published,
+                  because Nanonis' memory then holds the previous one
+"""
 
 from __future__ import annotations
 
@@ -30,7 +44,7 @@ _AT_FIRST: Final[dict[str, Value]] = {
     names.CRASH_DEPTH: 1e-9,
 }
 _AT_ONCE: Final = 0
-"""To what could also wait until it is done."""
+"""Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
 
 
@@ -38,15 +52,15 @@ class Nanonis(Driver):
     """The microscope behind a Nanonis controller.
 
     Args:
-        address: "host:port,port": two of the ports at File > Settings > TCP, as each serves one client. One is enough
-            for an emulator.
-        session_dir: where Nanonis' session folder is seen from here; left out: Nanonis runs on this computer.
-            What can't be seen is fetched over TCP.
-        release: of Nanonis' software (Help > Info), where it can't tell or tells wrong.
-        reply_timeout_s: how long it may take to answer, in real time.
-        autosave: whether Nanonis is to save every scan; if not, what its panel says is left alone.
+        address: "host:port,port": two of the ports at File > Settings > TCP; each serves one client. One is enough for
+            an emulator.
+        session_dir: local path of Nanonis' session folder. Default: Nanonis runs on this computer. Data in unreachable
+            files is fetched over TCP.
+        release: release of Nanonis' software (Help > Info), if it reports none or a wrong one.
+        reply_timeout_s: longest wait for a reply, real time.
+        autosave: True switches on saving of every scan; False leaves the panel's setting alone.
         grabbed_rows, grabbed_backward: see `fetched.Grabbing`.
-        common: as for every microscope.
+        common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -124,7 +138,7 @@ class Nanonis(Driver):
         return own.same_float32(name, a, b, among)
 
     def get(self, vendor: str) -> Value:
-        """By the name of a pair of functions: "Bias." is Bias.Get."""
+        """Return a value by the prefix of a pair of functions: "Bias." stands for Bias.Get."""
         if vendor == names.CONTROLLER:
             return self._there.controller
         value: Value = own.numbers(self._ask, f"{vendor}Get")[0]
@@ -152,7 +166,7 @@ class Nanonis(Driver):
         return [fetched.spectrum(curve, ended["what"], (ended["position"][0], ended["position"][1]))]
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """From Nanonis' memory, where lines that were not scanned yet are NaN."""
+        """Return new lines from Nanonis' memory, where lines not yet scanned are NaN."""
         region, _ = frame(self.in_force(FRAME))
         return fetched.new_lines(fetched.images(self._ask, self._grabbing), region, start)
 
@@ -160,7 +174,7 @@ class Nanonis(Driver):
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Scan the frame once, in the direction of `x-scan-direction`."""
+        """Scan the frame once, in the direction `x-scan-direction`."""
         self._activity.refuse_safe_tip()
         self._prepare_panel()
         self._activity.begin_scan(frame(self.in_force(FRAME))[0])
@@ -170,7 +184,7 @@ class Nanonis(Driver):
         except protocol.NanonisError:
             self._activity.forget()
             raise
-        if self._ask("Scan.StatusGet")[0]:  # it may be over before it is looked at again
+        if self._ask("Scan.StatusGet")[0]:  # it may be over before the next poll
             self._files.seen()
 
     @action(names.STOP_SCAN)
@@ -179,7 +193,7 @@ class Nanonis(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a spectrum of the kind `x-spec-kind` where the tip is."""
+        """Take a spectrum of the kind `x-spec-kind` at the tip's place."""
         self._activity.refuse_safe_tip()
         kind = str(self._kept[names.SPEC_KIND])
         if MODULES[kind] not in self._there.opened:
@@ -192,7 +206,7 @@ class Nanonis(Driver):
 
     @action(names.PULSE, state=ScopeState.BUSY_PARAM)
     def pulse(self) -> None:
-        """Do a bias pulse of `x-pulse-voltage` for `x-pulse-duration`, the z controller on hold meanwhile."""
+        """Pulse the bias to `x-pulse-voltage` for `x-pulse-duration`, with the z controller on hold."""
         duration_s = self._kept.number(names.PULSE_DURATION)
         hold, absolute = 1, 2
         with self._activity.occupied(ScopeState.BUSY_PARAM, duration_s):
@@ -200,11 +214,12 @@ class Nanonis(Driver):
 
     @action(names.CRASH, state=ScopeState.MOVING)
     def crash(self) -> None:
-        """Shape the tip: `x-crash-depth` down at `x-crash-speed`, up again, and the z controller as it was."""
+        """Shape the tip: `x-crash-depth` down at `x-crash-speed` and up again; the z controller is restored."""
         self._activity.refuse_safe_tip()
         depth_m = self._kept.number(names.CRASH_DEPTH)
         ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
         bias_v = own.numbers(self._ask, "Bias.Get")[0]
+        # one dip at the present bias: the tip shaper's second lift undoes the first
         same_bias, settle_s, restore = 2, 0.1, 1
         before = (settle_s, same_bias, bias_v)
         self._ask("TipShaper.PropsSet", *before, -depth_m, ramp_s, bias_v, settle_s, depth_m, ramp_s, settle_s, restore)
@@ -213,7 +228,8 @@ class Nanonis(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Withdraw the tip by its piezo, whatever is going on, and whether that can be stopped or not."""
+        """Withdraw the tip by its piezo, even if the running measurement can't be stopped."""
+        # the approach first: going on, it would bring the withdrawn tip back
         for stop in (self._activity.stop_approach, self._activity.stop_measuring):
             try:
                 stop()
@@ -223,7 +239,7 @@ class Nanonis(Driver):
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Switch the z controller on: it brings the tip back that `x-retract` or the safe tip has withdrawn."""
+        """Switch the z controller on, which brings back a tip withdrawn by `x-retract` or the safe tip."""
         on = 1
         self._ask("ZCtrl.OnOffSet", on)
 
@@ -239,10 +255,8 @@ class Nanonis(Driver):
         self._ask(name, *arguments)
 
     def _prepare_panel(self) -> None:
-        """Have one scan made and saved; told to Nanonis only if its panel says otherwise.
-
-        What is got is not set as it is: continuous, bouncy and autosave count differently there.
-        """
+        # Set only if the panel differs: one scan, not continuous, saved. PropsGet and PropsSet count differently (in
+        # Get, autosave 0 is "all"; in Set, 0 is "no change"), so nothing is passed from one to the other as it is.
         continuous, bouncy, autosave, series, comment, *rest = self._ask("Scan.PropsGet")
         save = self._autosave and autosave != 0
         if continuous or bouncy or save:

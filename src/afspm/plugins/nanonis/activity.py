@@ -1,4 +1,4 @@
-"""The state of Nanonis, from what both connections say of it."""
+"""State of Nanonis, from both connections."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from afspm.basics.errors import Refused
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.result_files import NanonisFiles
-from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, Heard, ScanEnded, Session
+from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, ListenerEvent, ScanEnded, Session
 from afspm.plugins.nanonis.settings import Probe, ScanFrame
 from afspm.translator.activity import Activity
 from afspm.translator.driver_base import ControllerLost
@@ -21,20 +21,20 @@ from afspm.translator.setting_groups import frame
 from afspm.translator.state import Kept
 
 _SHOWS_S: Final = 10.0
-"""Real time that a scan may take to be seen running, which may have to go to its first line."""
+"""Real time until a started scan shows as running: the tip may first have to move to its first line."""
 _LATEST_S: Final = 10.0
-"""Experiment time that the tip may arrive later than it should."""
+"""Experiment time after the expected arrival of the tip at which it counts as failed."""
 _SAFE_TIP, _WITHDRAWING = 5, 6
 
 
 class NanonisActivity(Activity):
-    """The measurements, moves and pauses of one controller.
+    """Measurements, moves and pauses of one controller.
 
     Args:
-        kept: JSON-able, and lasts: what it is occupied with.
+        kept: persistent, JSON-able: present occupation.
 
     Attributes:
-        curve: the data of the last spectrum, once it has ended.
+        curve: data of the last ended spectrum.
     """
 
     program: ClassVar[str] = "Nanonis"
@@ -58,24 +58,24 @@ class NanonisActivity(Activity):
         self._kept = kept
         self.curve: CurveEnded | None = None
         self._kind_asked = ""
-        self._told: str | None = None
+        self._reported_path: str | None = None
         self._was_safe = False
         self._shows_until_s = 0.0
 
-    # --- what is begun ---
+    # --- start and stop ---
 
     def begin_scan(self, region: Region) -> None:
-        """A scan of a frame begins, or was found running."""
+        """Register the start of a scan, or a scan found running."""
         self._stopping = False
         self._listener.scan()
         self._files.begin(SCAN, self._session_folder(), {"frame": as_list(region)})
         self._shows_until_s = self._clock.monotonic_s() + _SHOWS_S
 
     def start_curve(self, kind: str) -> None:
-        """Take a spectrum; its data come over the second connection.
+        """Take a spectrum; its data arrive over the second connection.
 
         Raises:
-            Refused: ACTION_ERROR: Nanonis would not.
+            Refused: ACTION_ERROR: Nanonis reports an error.
         """
         self._stopping = False
         self.begin(kind)
@@ -85,7 +85,7 @@ class NanonisActivity(Activity):
         self._await_curve(f"{MODULES[kind]}.StatusGet")
 
     def begin(self, what: str) -> None:
-        """Note that a measurement begins; a scan with the frame that Nanonis has."""
+        """Register the start of a measurement; of a scan with the frame read from Nanonis."""
         if what == SCAN:
             self.begin_scan(frame(ScanFrame(self._ask).read())[0])
             return
@@ -93,39 +93,38 @@ class NanonisActivity(Activity):
         self._files.begin(what, self._session_folder(), {"position": list(self._probe.xy_m())})
 
     def end(self, path: str | None = None) -> None:
-        """Note that the measurement has ended.
+        """Register the end of the measurement.
 
         Args:
-            path: of its file, where Nanonis reported it; empty: it is not saved.
+            path: file path reported by Nanonis; empty: not saved; None: not reported.
         """
         self._files.end(self._clock.now_ns(), self._clock.now_s(), path)
 
     def _await_curve(self, status: str) -> None:
-        """Return once what was begun is seen running, or has ended already. Raises Refused: Nanonis would not."""
+        # Nanonis reports a refused start only as the error of the blocking call on the second connection.
         until_s = self._clock.monotonic_s() + self.settles_s
         while not self._ask(status)[0] and self._clock.monotonic_s() < until_s:
-            for heard in self._listener.heard():
-                if isinstance(heard, Exception) and not isinstance(heard, ControllerLost):
+            for event in self._listener.events():
+                if isinstance(event, Exception) and not isinstance(event, ControllerLost):
                     self.forget()
-                    raise Refused(ControlResponse.ACTION_ERROR, str(heard))
-                self._take(heard)
+                    raise Refused(ControlResponse.ACTION_ERROR, str(event))
+                self._take(event)
                 return
 
     def stop_measuring(self) -> None:
-        """Break off whatever is being measured."""
+        """Stop the running scan or spectrum."""
         if self._files.what == SCAN or self._ask("Scan.StatusGet")[0]:
             self.stop_scan()
         elif self._files.what:
             self.stop_curve()
 
     def stop_scan(self) -> None:
-        """Break the scan off."""
         stop, no_direction = 1, 0
         self._ask("Scan.Action", stop, no_direction)
         self.stopped()
 
     def stop_curve(self) -> None:
-        """Break the spectrum off."""
+        """Stop the running spectrum."""
         for module in self._opened.intersection(MODULES.values()):
             if self._ask(f"{module}.StatusGet")[0]:
                 self._ask(f"{module}.Stop")
@@ -137,10 +136,12 @@ class NanonisActivity(Activity):
 
     @contextmanager
     def occupied(self, state: ScopeState, lasts_s: float) -> Iterator[None]:
-        """Note that what is begun in the block takes so long, experiment time, which Nanonis itself does not tell.
+        """Register that the action in the block occupies the controller for `lasts_s`, experiment time.
 
-        It holds also where its answer is lost, or the connection, or this process.
+        Nanonis does not report the end of such an action. The occupation persists if the answer, the connection or this
+        process is lost.
         """
+        # kept before the action starts: it may go on although the answer, or this process, is lost
         self._kept["occupied"] = [state.name, self._clock.now_s() + lasts_s]
         try:
             yield
@@ -150,54 +151,54 @@ class NanonisActivity(Activity):
 
     @property
     def _occupied(self) -> tuple[ScopeState, float]:
-        """The state that it is in, and until when."""
         name, until_s = self._kept.get("occupied") or (ScopeState.FREE.name, 0.0)
         return ScopeState[name], float(until_s)
 
     def next_change_s(self) -> float | None:
-        """Return when a move, a pulse or the wait for a file is over."""
+        """Return the end of a move, a pulse or the wait for a file."""
         now_s = self._clock.now_s()
         times = (self._occupied[1], self._probe.arrives_s, self._files.next_s() or 0.0)
         return min((at_s for at_s in times if at_s > now_s), default=None)
 
-    # --- what goes on ---
+    # --- state ---
 
     def status(self) -> ScopeStatus:
-        """Return what Nanonis is doing now; what has ended is awaited from here on.
+        """Return the present state; register measurements that have ended, whose files are then awaited.
 
         Raises:
-            ControllerLost: one of both connections.
+            ControllerLost: one of both connections failed.
         """
-        for heard in self._listener.heard():
-            self._take(heard)
+        for event in self._listener.events():
+            self._take(event)
         scanning = bool(self._ask("Scan.StatusGet")[0])
-        told, self._told = self._told, None
+        path, self._reported_path = self._reported_path, None
         if scanning:
-            return self._scanning(told)
+            return self._scanning(path)
         if self._files.what == SCAN and not self._files.was_seen and not self._files.has_file():
+            # It may still be moving to its first line; until it is seen, Nanonis' memory holds the previous scan.
             if self._clock.monotonic_s() < self._shows_until_s:
-                self._listener.scan()  # what it has heard was not of this one
+                self._listener.scan()  # an earlier event belonged to the scan before
                 return ScopeStatus(ScopeState.SCANNING)
-            told = None
-        if self._files.what == SCAN or told is not None:
-            self.end(told)
+            path = None
+        if self._files.what == SCAN or path is not None:
+            self.end(path)
         return self.at_rest(self._besides_scans())
 
     def refuse_safe_tip(self) -> None:
-        """Raise Refused where the tip was withdrawn in an emergency: nothing is to be measured then."""
+        """Raise Refused after the safe tip has withdrawn the tip: no measurement is useful then."""
         if self._ask("ZCtrl.StatusGet")[0] == _SAFE_TIP:
             reason = "Nanonis' safe tip withdrew the tip: find out why, then run x-engage to bring it back"
             raise Refused(ControlResponse.ACTION_ERROR, reason)
 
-    def _scanning(self, told: str | None) -> ScopeStatus:
-        if told:  # it scans again and again
-            self.end(told)
+    def _scanning(self, path: str | None) -> ScopeStatus:
+        if path:  # a continuous scan: one frame has ended, the next one runs
+            self.end(path)
         self.follow(SCAN)
         if not self._stopping:
             self._files.seen()
             self._listener.scan()
             if self._watch_safe_tip(self._ask("ZCtrl.StatusGet")[0]):
-                self.stop_scan()  # it may go on in the air, and look well
+                self.stop_scan()  # the scan may go on in the air, and its picture look plausible
                 self._failed = True
         return ScopeStatus(ScopeState.SCANNING)
 
@@ -216,7 +217,7 @@ class NanonisActivity(Activity):
         return ScopeState.FREE if self._is_there() else ScopeState.MOVING
 
     def stop_approach(self) -> None:
-        """Stop an approach, which would bring a tip back that is withdrawn meanwhile."""
+        """Stop a running approach, which would bring a withdrawn tip back."""
         if self._approaches():
             off = 0
             self._ask("AutoApproach.OnOffSet", off)
@@ -225,6 +226,7 @@ class NanonisActivity(Activity):
         return APPROACH in self._opened and bool(self._ask("AutoApproach.OnOffGet")[0])
 
     def _kind_running(self) -> str:
+        # the blocking call on the second connection reports the end of the translator's own spectra
         if self._kind_asked:
             return self._kind_asked
         for kind, module in MODULES.items():
@@ -242,23 +244,22 @@ class NanonisActivity(Activity):
         return True
 
     def _watch_safe_tip(self, z_controller: int) -> bool:
-        """Return True if it has withdrawn the tip, which is logged once."""
+        # Logged once, not at each poll.
         safe = z_controller == _SAFE_TIP
         if safe and not self._was_safe:
             self._log.error("Nanonis' safe tip withdrew the tip: nothing is measured until it is engaged again")
         self._was_safe = safe
         return safe
 
-    def _take(self, heard: Heard) -> None:
-        """Take in what the second connection has to say."""
-        if isinstance(heard, ScanEnded):
-            self._told = heard.path
-        elif isinstance(heard, CurveEnded):
-            self._kind_asked, self.curve = "", heard
-        elif isinstance(heard, ControllerLost):
-            raise heard
+    def _take(self, event: ListenerEvent) -> None:
+        if isinstance(event, ScanEnded):
+            self._reported_path = event.path
+        elif isinstance(event, CurveEnded):
+            self._kind_asked, self.curve = "", event
+        elif isinstance(event, ControllerLost):
+            raise event
         else:
-            self._log.error("%s", heard)
+            self._log.error("%s", event)
             if self._kind_asked:
                 self._kind_asked = ""
                 not_saved = ""

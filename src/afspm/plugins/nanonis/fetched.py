@@ -1,4 +1,4 @@
-"""Scans and spectra that Nanonis has not saved: fetched over TCP, and kept in a file of ours so that they last."""
+"""Scans and spectra that Nanonis has not saved: fetched over TCP, and kept in files of the translator."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _UP: Final = 1
 
 @dataclass(frozen=True)
 class Grabbing:
-    """The way that Nanonis hands out the scan in its memory, which its specification does not say.
+    """The layout of scans from Nanonis' memory, which its specification does not define.
 
     Attributes:
-        rows: "top-first" whatever the direction of the scan, or as they were "recorded".
+        rows: "top-first" for both scan directions, or as "recorded".
         backward: "mirrored": backward lines run from right to left; or "as-seen".
     """
 
@@ -38,10 +38,13 @@ class Grabbing:
     def __post_init__(self) -> None:
         for name, value, choices in (("rows", self.rows, ROWS), ("backward", self.backward, BACKWARD)):
             if value not in choices:
-                raise ConfigError(f"{value!r}", where=f"grabbed_{name}", hint=f"one of {', '.join(choices)}")
+                raise ConfigError(
+                    f"unknown value {value!r}", where=f"grabbed_{name}", hint=f"one of {', '.join(choices)}"
+                )
 
     def image(self, raw: np.ndarray, *, upwards: bool, backward: bool) -> np.ndarray:
-        """[y, x] with both ascending."""
+        """Return the image [y, x] with both axes ascending."""
+        # Unconfirmed: a public note on one instrument says that the top row comes first in both directions.
         rows = raw if self.rows == "recorded" and upwards else raw[::-1]
         pixels = rows[:, ::-1] if backward and self.backward == "mirrored" else rows
         return np.ascontiguousarray(pixels, dtype=np.float64)
@@ -53,8 +56,8 @@ class Image:
 
     Attributes:
         name: as in its files, e.g. "Z Forward".
-        values: [y, x], both ascending; lines that were not scanned are NaN.
-        upwards: whether the lowest was scanned first.
+        values: [y, x], both ascending; lines not scanned are NaN.
+        upwards: True if the lowest row was scanned first.
     """
 
     name: str
@@ -64,7 +67,7 @@ class Image:
 
 
 def images(ask: Ask, how: Grabbing) -> list[Image]:
-    """Every channel of the scan in Nanonis' memory, forward and backward."""
+    """Fetch every channel of the scan in Nanonis' memory, forward and backward."""
     signals = ask("Signals.NamesGet")[0]
     found = []
     for channel in ask("Scan.BufferGet")[0]:
@@ -78,8 +81,9 @@ def images(ask: Ask, how: Grabbing) -> list[Image]:
 
 
 def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLines]:
-    """The lines beyond the first `start` that all channels have, in the order in which they are scanned."""
+    """Return the complete lines beyond the first `start`, in scanning order."""
     lines = []
+    # Lines not yet scanned are NaN; channels may differ by the line being scanned.
     done = min((int(np.isfinite(image.values).all(axis=1).sum()) for image in found), default=0)
     for image in found if done > start else ():
         shape = (image.values.shape[0], image.values.shape[1])
@@ -90,11 +94,7 @@ def new_lines(found: Sequence[Image], region: Region, start: int) -> list[ScanLi
 
 
 def spectrum(curve: CurveEnded, kind: str, position_m: tuple[float, float]) -> Spectrum:
-    """The data that Nanonis replied with at the end of a spectrum.
-
-    Raises:
-        FileError: they do not fit together.
-    """
+    """Convert the data of an ended spectrum. Raises FileError: names and values don't fit together."""
     if not curve.names or curve.values.shape[0] != len(curve.names):
         raise FileError(f"a spectrum of {len(curve.names)} channels with {curve.values.shape[0]} rows of values")
     values = np.array(curve.values.T, dtype=np.float64)
@@ -103,13 +103,13 @@ def spectrum(curve: CurveEnded, kind: str, position_m: tuple[float, float]) -> S
 
 
 def name_and_unit(text: str) -> tuple[str, str]:
-    """ "Current (A)" -> ("Current", "A")."""
+    """Split "Current (A)" into name and unit."""
     unit = re.search(r" ?\(([^()]*)\)", text)
     return (text, "") if unit is None else ((text[: unit.start()] + text[unit.end() :]).strip(), unit[1])
 
 
 def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
-    """Keep all channels of one scan, or one spectrum, in a file that `afspm.storage.formats.read` reads."""
+    """Write all channels of one scan, or one spectrum, to a file for `afspm.storage.formats.read`."""
     facts = FileFacts(end_ns, {})
     one = content[0]
     if isinstance(one, Spectrum):
@@ -117,8 +117,8 @@ def write(path: Path, content: Sequence[Scan | Spectrum], end_ns: int) -> None:
     else:
         scans = [scan for scan in content if isinstance(scan, Scan)]
         names = [scan.channel for scan in scans]
-        told_apart = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
-        channels = {name: (scan.unit, scan.values) for name, scan in zip(told_apart, scans, strict=True)}
+        unique = (name if name not in names[:k] else f"{name} #{k + 1}" for k, name in enumerate(names))
+        channels = {name: (scan.unit, scan.values) for name, scan in zip(unique, scans, strict=True)}
         encoded = encode_scan(one.region, channels, facts)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, [encoded])

@@ -1,7 +1,7 @@
-"""The bytes of Nanonis' TCP protocol: requests to them, results from them. No sockets here.
+"""Nanonis' TCP protocol: requests to bytes, results from bytes. No sockets here.
 
-A header of 40 bytes (name, size of the body), then the body; after the results every reply has an error block. What
-may be asked stands in `functions.txt`, where some fields are there only from a release of the software on.
+A header of 40 bytes (name, size of the body), then the body; every reply ends with an error block. The functions stand
+in `functions.txt`; some fields exist only from a release of the software on.
 """
 
 from __future__ import annotations
@@ -21,22 +21,23 @@ from afspm.translator.driver_base import ControllerLost
 
 HEADER_BYTES: Final = 40
 NEWEST: Final = 1 << 31
-"""A release that has every field."""
+"""A release with all fields."""
 LARGEST_BODY: Final = 1 << 28
-"""Eight channels of the largest scan are less: what claims to be longer is no reply."""
+"""Bytes; eight channels of the largest scan are less, so a longer body is no reply."""
 
+# Big-endian: name padded with zeros, size of the body, 1 to request a reply, zero.
 _HEADER: Final = struct.Struct(">32sihh")
 _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
 
 
 class BadReply(ControllerLost):
-    """The bytes that came can't be the reply: nothing that follows on that connection can be trusted."""
+    """The received bytes can't be the reply: nothing that follows on this connection can be trusted."""
 
     code = "nanonis-reply"
 
 
 class NanonisError(AfspmError):
-    """Nanonis says that it could not do it, in its own words."""
+    """Nanonis reports an error, with its own text."""
 
     code = "nanonis"
 
@@ -54,11 +55,11 @@ class Function:
     results: tuple[tuple[str, int], ...]
 
     def argument_codes(self, release: int) -> tuple[str, ...]:
-        """The fields of a request to that release."""
+        """Return the fields of a request to a release."""
         return tuple(code for code, since in self.arguments if since <= release)
 
     def result_codes(self, release: int) -> tuple[str, ...]:
-        """The fields of a reply of that release."""
+        """Return the fields of a reply of a release."""
         return tuple(code for code, since in self.results if since <= release)
 
 
@@ -69,7 +70,7 @@ def _fields(text: str) -> tuple[tuple[str, int], ...]:
 
 @cache
 def functions() -> Mapping[str, Function]:
-    """All that are known, by name."""
+    """Return the known functions by name."""
     rows = {}
     for line in Path(__file__).with_name("functions.txt").read_text(encoding="ascii").splitlines():
         if line and not line.startswith("#"):
@@ -79,21 +80,17 @@ def functions() -> Mapping[str, Function]:
 
 
 def function(name: str) -> Function:
-    """A function by its name.
-
-    Raises:
-        InvalidValue: there is none, or it is not known here.
-    """
+    """Return a function by name. Raises InvalidValue: unknown."""
     if name not in functions():
         raise InvalidValue(f"Nanonis has no function {name[:50]!r}")
     return functions()[name]
 
 
 def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> bytes:
-    """The bytes that ask for `name`; arguments that the release does not have are left out.
+    """Encode a request; arguments that the release lacks are left out.
 
     Raises:
-        InvalidValue: the arguments are not those of the function.
+        InvalidValue: the arguments do not fit the function.
     """
     fields = function(name).arguments
     if len(arguments) != len(fields):
@@ -105,14 +102,15 @@ def request(name: str, arguments: Sequence[object], release: int = NEWEST) -> by
                 body += _WRITERS[code](value)
             except (struct.error, OverflowError, TypeError, ValueError) as error:
                 raise InvalidValue(f"{name}: {value!r} can't be sent as {code}: {error}") from error
+    # A reply is always requested: without one, a refusal would go unnoticed.
     return _HEADER.pack(name.encode("ascii"), len(body), 1, 0) + body
 
 
 def body_bytes(header: bytes, asked: str) -> int:
-    """Return how many bytes follow the header of a reply to `asked`.
+    """Return the number of bytes after the header of a reply to `asked`.
 
     Raises:
-        BadReply: it is the reply to something else, or none at all.
+        BadReply: malformed, or the reply to another function.
     """
     raw_name, size, _, _ = _HEADER.unpack(header)
     name = text_of(raw_name.split(b"\0", 1)[0])
@@ -124,15 +122,16 @@ def body_bytes(header: bytes, asked: str) -> int:
 
 
 def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[object, ...]:
-    """The results in the body of a reply.
+    """Decode the results in a reply's body.
 
-    After an error the results may be there or not: the specification does not say.
+    The specification does not define if results are present after an error: both are accepted.
 
     Raises:
-        NanonisError: Nanonis says that it could not.
-        BadReply: the body is not what the function replies.
+        NanonisError: Nanonis reports an error.
+        BadReply: the body does not fit the function.
     """
     try:
+        # The fields depend on the release: wrong ones leave bytes over, or need more than there are.
         found, status, text = _parsed(body, function(name).result_codes(release))
     except BadReply as whole:
         try:
@@ -148,7 +147,7 @@ def results(name: str, body: bytes | bytearray, release: int = NEWEST) -> tuple[
 
 
 def text_of(raw: bytes | bytearray | memoryview) -> str:
-    """A text of Nanonis: UTF-8, or in what Windows writes in the west (a µ in a name, an umlaut in a path)."""
+    """Decode a text: UTF-8, else the western Windows encoding (a µ in a name, an umlaut in a path)."""
     raw = bytes(raw)
     try:
         return raw.decode()
@@ -163,6 +162,7 @@ def _depends_on_release(name: str) -> bool:
 def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object, ...], int, str]:
     reader = _Reader(memoryview(body))
     found = tuple(_READERS[code](reader) for code in codes)
+    # The error block at the end of every reply: a status, and a text.
     status, text = reader.number("I"), reader.text()
     if reader.left:
         raise BadReply(f"it has {reader.left} bytes too many")
@@ -170,7 +170,7 @@ def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object
 
 
 class _Reader:
-    """Takes one field after the other out of a body; what it takes is never more than there is."""
+    """Reads one field after the other from a body, never beyond its end."""
 
     def __init__(self, body: memoryview) -> None:
         self._body = body
@@ -194,11 +194,11 @@ class _Reader:
         return text_of(self.take(self.number("i")))
 
     def texts(self) -> list[str]:
-        self.number("i")  # their size in bytes, which peers reckon in different ways
+        self.number("i")  # the size in bytes, which peers calculate differently
         return [self.text() for _ in range(self.count(4))]
 
     def count(self, at_least_bytes: int) -> int:
-        """A number of elements that can be there."""
+        """Return the number of elements. Raises BadReply: more than the body can contain."""
         count = int(self.number("i"))
         if not 0 <= count <= self.left // at_least_bytes:
             raise BadReply(f"{count} elements in {self.left} bytes")

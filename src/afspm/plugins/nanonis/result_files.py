@@ -1,4 +1,4 @@
-"""The results of measurements: Nanonis' file of it, or, where there is none, what it has in memory."""
+"""Results of measurements: Nanonis' files, or the data in its memory."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from afspm.translator.result_files import (
 )
 
 _PRECISION: Final = FilePrecision(part=2e-6, angle_rad=1e-3, positions=True)
-"""A file prints seven digits of a position, and degrees with three."""
+"""Files have seven digits of a position, and angles to 0.001 degrees."""
 
 Fetch = Callable[[Entry], Content]
 
 
 class NanonisFiles(ResultFiles):
-    """The measurement that is running or has just ended, and the results.
+    """The running or just ended measurement, and the results.
 
     Args:
-        session_dir: where the session folder of Nanonis' computer is seen from here; None: it is this computer.
-        own_folder: for what is fetched.
-        patience_s: how long a file may take before the data is fetched instead.
+        session_dir: local path of the session folder; None: Nanonis runs on this computer.
+        own_folder: folder for fetched data.
+        patience_s: longest wait for a file before the data is fetched, experiment time.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class NanonisFiles(ResultFiles):
         kept.setdefault("fetched", 0)
 
     def begin(self, what: str, session: str, taken: Mapping[str, object]) -> None:
-        """A measurement begins.
+        """Register the start of a measurement.
 
         Args:
             session: Nanonis' session folder.
@@ -63,37 +63,38 @@ class NanonisFiles(ResultFiles):
 
     @property
     def was_seen(self) -> bool:
-        """True if what is running was seen running: if not, what Nanonis has in memory is of the scan before."""
+        """True if the running measurement was seen running; else Nanonis' memory still holds the previous scan."""
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
-        """Note that what is running was seen running."""
+        """Note that the running measurement was seen running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
 
-    def end(self, now_ns: int, now_s: float, told: str | None = None) -> None:
-        """It has ended, or more is known of its end.
+    def end(self, now_ns: int, now_s: float, path: str | None = None) -> None:
+        """Register the end of the measurement, or its file.
 
         Args:
-            told: where Nanonis says that it saved it; empty: it did not; None: it has not said.
+            path: file path reported by Nanonis; empty: not saved; None: not reported.
         """
         running = self._kept["running"]
         if running is not None:
+            # Without access to the folder no file can appear: fetch at once.
             patience_s = self._patience_s if Path(running["folder"]).is_dir() else 0.0
-            self._ends({"told": told, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
+            self._ends({"reported": path, "end_ns": now_ns, "fetch_at_s": now_s + patience_s})
         ended = self._kept["ended"]
-        if ended is not None and told is not None:
-            ended["told"] = told
-            if not told:
+        if ended is not None and path is not None:
+            ended["reported"] = path
+            if not path:
                 ended["fetch_at_s"] = now_s
 
     def has_file(self) -> bool:
-        """Return True if a file of what is running has appeared."""
+        """Return True if a file of the running measurement has appeared."""
         running = self._kept["running"]
-        return running is not None and self._file({**running, "told": None}) is not None
+        return running is not None and self._file({**running, "reported": None}) is not None
 
     def next_s(self) -> float | None:
-        """Return when to look again at the latest."""
+        """Return the time of the next necessary look."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["fetch_at_s"])
 
@@ -101,7 +102,7 @@ class NanonisFiles(ResultFiles):
         """Return the last results, oldest first.
 
         Args:
-            fetch: gets from Nanonis what is in no file.
+            fetch: fetches data without a file from Nanonis.
         """
         self.broken_off = False
         ended = self._kept["ended"]
@@ -118,21 +119,22 @@ class NanonisFiles(ResultFiles):
         return _content(Path(entry["result"]), entry)
 
     def _fetch(self, fetch: Fetch, ended: Entry, file: Path | None) -> None:
-        missed = str(file or ended["told"] or f"in {ended['folder']}")
+        missed = str(file or ended["reported"] or f"in {ended['folder']}")
         try:
             if not ended.get("seen", True):
                 raise FileError("the controller never reported it as running")
             content = fetch(ended)
+            # A stopped scan stays in Nanonis' memory with NaN in the missing lines.
             if missing := lines_missing(content):
                 raise FileError(f"{missing} of its {content[0].values.shape[0]} lines were not scanned")
         except LOST:
-            self._kept["ended"] = dict(ended)  # once it is found again
+            self._kept["ended"] = dict(ended)  # to fetch after the next connection
             raise
         except AfspmError as error:
             self._log.error("the %s has no file (%s), and can't be fetched over TCP: %s", ended["what"], missed, error)
             self.broken_off = True
             return
-        if ended["told"] != "":
+        if ended["reported"] != "":
             self._log.warning("the %s has no complete file (%s); it was fetched over TCP", ended["what"], missed)
         self._kept["fetched"] += 1
         path = self._own_folder / f"nanonis-{self._kept['fetched']:04d}.nc"
@@ -147,17 +149,16 @@ class NanonisFiles(ResultFiles):
         try:
             content = _content(file, ended)
         except (AfspmError, OSError):
-            return None  # not yet
+            return None  # incomplete: Nanonis is still writing it
         return None if lines_missing(content) else content
 
     def _file(self, ended: Entry) -> Path | None:
-        """Return the file of what has ended, if it is there."""
-        if ended["told"]:
-            # whatever the other computer calls its folder, the name is the same
+        if ended["reported"]:
+            # the folder has another path on Nanonis' computer, but the file has the same name
             folder = self._session_dir
-            path = Path(ended["told"]) if folder is None else folder / PureWindowsPath(ended["told"]).name
+            path = Path(ended["reported"]) if folder is None else folder / PureWindowsPath(ended["reported"]).name
             return newest([path] if path.is_file() else [], ended["newest_ns"])[1]
-        if ended["told"] == "":
+        if ended["reported"] == "":
             return None
         return newest(_files(Path(ended["folder"]), ended["what"]), ended["newest_ns"])[1]
 

@@ -1,7 +1,7 @@
-"""Nanonis scans (.sxm): a text header, then big-endian float32, for each channel forward and backward.
+"""Nanonis scans (.sxm): a text header, then big-endian float32, forward and backward for each channel.
 
-Rows come as they were recorded (upwards: the lowest first), backward rows from right to left; SCAN_OFFSET is the
-centre, SCAN_ANGLE clockwise in degrees, SCAN_RANGE that of whole pixels; REC_DATE and REC_TIME are of the start.
+Rows are in recording order (upwards: the lowest first), backward rows from right to left; SCAN_OFFSET is the centre,
+SCAN_ANGLE clockwise in degrees, SCAN_RANGE from edge to edge of the pixels; REC_DATE and REC_TIME are the start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _DIRECTIONS = {"both": ("Forward", "Backward"), "forward": ("Forward",), "backwa
 
 
 def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
-    """All channels, named e.g. "Z Forward" and "Z Backward". Raises FileError and ValueError: broken."""
+    """Read all channels, named e.g. "Z Forward" and "Z Backward". Raises FileError, ValueError: damaged."""
     head, found, rest = path.read_bytes().partition(_END)
     start = rest.find(_DATA)
     if not found or start < 0:
@@ -47,13 +47,14 @@ def read_scan(path: Path, zone: tzinfo | None) -> FileContent:
     scans = []
     for (name, way, unit), image in zip(images, stack, strict=True):
         rows = image if upwards else image[::-1]
+        # In real files, forward and backward images agree only after mirroring one of them.
         pixels = rows[:, ::-1] if way == "Backward" else rows
         scans.append(Scan(region, f"{name} {way}", unit, pixels.astype(np.float64), end, str(path)))
     return FileContent(CONTROLLER, tuple(scans), header=header, start_ns=begun, end_ns=end, upwards=upwards)
 
 
 def _header(text: str) -> dict[str, str]:
-    """Fields `:NAME:` with what stands below each."""
+    # A field is a line `:NAME:` and the lines below it.
     found = re.findall(r"^:([^\r\n]+):\r?\n(.*?)(?=^:[^\r\n]+:\r?$|\Z)", text, re.MULTILINE | re.DOTALL)
     return {name: value.strip() for name, value in found}
 
@@ -65,7 +66,6 @@ def _field(header: dict[str, str], name: str) -> str:
 
 
 def _images(table: str) -> list[tuple[str, str, str]]:
-    """Name, way and unit of each image, in their order."""
     rows = [[column.strip() for column in line.strip().split("\t")] for line in table.splitlines() if line.strip()]
     return [(name, way, unit) for _, name, unit, ways, *_ in rows[1:] for way in _DIRECTIONS[ways]]
 

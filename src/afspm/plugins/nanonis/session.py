@@ -1,4 +1,4 @@
-"""Both connections to Nanonis: one for questions that are answered at once, one for calls that take their time."""
+"""Both connections to Nanonis: one for quick requests, one for blocking calls."""
 
 from __future__ import annotations
 
@@ -6,37 +6,79 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from queue import SimpleQueue
 from threading import Thread
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from afspm.basics.errors import AfspmError
-from afspm.plugins.nanonis.link import Link
+from afspm.plugins.nanonis import protocol
 from afspm.plugins.nanonis.protocol import BadReply, NanonisError
 from afspm.translator.driver import Driver
 from afspm.translator.driver_base import ControllerLost
+from afspm.translator.tcp import Receiver, TcpConnection
 
 MODULES: Final = {"IV": "BiasSpectr", "force": "ZSpectr"}
 APPROACH: Final = "AutoApproach"
 _WITHOUT_VERSION: Final = 10862
-"""The release to take where the software can't tell its own."""
+"""The release to assume if the software can't report its own: it lacks Util.VersionGet."""
 _WAIT_MS: Final = 1000
 _LONGEST_CURVE_S: Final = 24 * 3600.0
+_HINTS: Final = (
+    "is Nanonis running, with its TCP programming interface on this port (File > Settings > TCP)?",
+    "Nanonis is silent while a dialog waits for an answer on its screen",
+)
+
+
+class Link:
+    """A TCP connection to Nanonis; the arguments are those of `TcpConnection`.
+
+    Attributes:
+        release: release of the controller's software, set once known.
+    """
+
+    def __init__(
+        self,
+        address: tuple[str, int],
+        timeout_s: float,
+        monotonic_s: Callable[[], float],
+        release: int = protocol.NEWEST,
+    ) -> None:
+        self.release = release
+        self._tcp = TcpConnection(address, timeout_s, monotonic_s, _HINTS)
+        self.close = self._tcp.close
+
+    def ask(self, name: str, *arguments: object, longer_s: float = 0.0) -> tuple[Any, ...]:
+        """Call a function of Nanonis.
+
+        Args:
+            longer_s: additional wait for the answer, real time.
+
+        Raises:
+            NanonisError: Nanonis reports an error. InvalidValue: the arguments can't be sent.
+            ControllerLost, BadReply: no answer, or an untrustworthy one; the connection is closed.
+        """
+
+        def read(receiver: Receiver) -> tuple[object, ...]:
+            # A reply may exceed one segment of TCP: 128 names of signals, or a scan, do.
+            size = protocol.body_bytes(bytes(receiver.exactly(protocol.HEADER_BYTES)), name)
+            return protocol.results(name, receiver.exactly(size), self.release)
+
+        return self._tcp.ask(name, protocol.request(name, arguments, self.release), read, longer_s=longer_s)
 
 
 class Session:
-    """Two connections to Nanonis, proved and with all modules open.
+    """Two connections to Nanonis, proved, with all available modules open.
 
     Args:
-        driver: that they are for.
-        addresses: of both; the same one only where a port serves several clients.
-        timeout_s: for an answer, in real time.
-        release: None: Nanonis is asked for it.
+        driver: the driver that uses them.
+        addresses: addresses of both; equal only if a port serves several clients.
+        timeout_s: longest wait for an answer, real time.
+        release: release of the software; None: ask Nanonis.
 
     Attributes:
-        controller: its name and version, for a person.
-        opened: the modules that can be used: Nanonis has those that were bought, and they answer once they are open.
-        listener: on the second connection.
+        controller: name and version, for people.
+        opened: available modules: Nanonis has the bought ones, which answer only once open.
+        listener: user of the second connection.
 
     Raises:
         ControllerLost.
@@ -47,10 +89,13 @@ class Session:
         self._link = Link(addresses[0], timeout_s, driver.clock.monotonic_s)
         self.ask = self._link.ask
         self._listener: Listener | None = None
+        # each port of Nanonis serves one client, one call at a time: a blocking call needs a port of its own
         try:
             driver.prove()
             self.controller = f"Nanonis, release {release}"
+            # The fields of requests and replies depend on the release.
             self._link.release = release or self._found_release()
+            # The spectroscopy modules of the real software answer only after their Open.
             self.opened = {module for module in (*MODULES.values(), APPROACH) if self._open(module)}
             second = Link(addresses[-1], timeout_s, driver.clock.monotonic_s, self._link.release)
             self._listener = self.listener = Listener(second, driver.wake)
@@ -60,7 +105,6 @@ class Session:
             raise
 
     def close(self) -> None:
-        """End both connections."""
         if self._listener is not None:
             self._listener.close()
         self._link.close()
@@ -87,10 +131,10 @@ class Session:
 
 @dataclass(frozen=True)
 class ScanEnded:
-    """A scan came to its end, or was broken off.
+    """A scan was completed or stopped.
 
     Attributes:
-        path: where Nanonis saved it, as its own computer calls it; empty if it did not.
+        path: file path on Nanonis' computer; empty: not saved.
     """
 
     path: str
@@ -98,10 +142,10 @@ class ScanEnded:
 
 @dataclass(frozen=True)
 class CurveEnded:
-    """A spectrum came to its end.
+    """A spectrum was completed.
 
     Attributes:
-        names: of the channels, with units.
+        names: channel names with units.
         values: [channels, points].
     """
 
@@ -109,45 +153,45 @@ class CurveEnded:
     values: np.ndarray
 
 
-Heard = ScanEnded | CurveEnded | AfspmError
-"""An error: what was waited for can't be waited for."""
+ListenerEvent = ScanEnded | CurveEnded | AfspmError
+"""An error means that the wait failed."""
 
 
 class Listener:
-    """Waits in a thread of its own for one thing at a time, on the second connection.
+    """Thread for blocking calls on the second connection, one at a time.
 
     Args:
-        wake: called from that thread when there is something in `heard`.
+        wake: called from that thread when `events` has something new.
     """
 
     def __init__(self, link: Link, wake: Callable[[], None]) -> None:
         self._link = link
         self._wake = wake
-        self._jobs: SimpleQueue[Callable[[], Heard | None] | None] = SimpleQueue()
-        self._heard: SimpleQueue[Heard] = SimpleQueue()
+        self._jobs: SimpleQueue[Callable[[], ListenerEvent | None] | None] = SimpleQueue()
+        self._events: SimpleQueue[ListenerEvent] = SimpleQueue()
         self._for_scan = self._closed = False
         Thread(target=self._work, name="Nanonis' second connection", daemon=True).start()
 
     def scan(self) -> None:
-        """Wait for the end of a scan, if that is not being done already."""
+        """Wait for the end of a scan, unless already waiting for it."""
         if not self._for_scan:
             self._for_scan = True
             self._jobs.put(self._next_end_of_scan)
 
     def curve(self, module: str, base_name: str) -> None:
-        """Take a spectrum with a module and wait for its data."""
+        """Take a spectrum with a module, and wait for its data."""
         self._for_scan = False
         self._jobs.put(lambda: self._curve(module, base_name))
 
-    def heard(self) -> list[Heard]:
-        """Return what has come since the last time."""
+    def events(self) -> list[ListenerEvent]:
+        """Return the events since the last call."""
         found = []
-        while not self._heard.empty():
-            found.append(self._heard.get())
+        while not self._events.empty():
+            found.append(self._events.get())
         return found
 
     def close(self) -> None:
-        """End the thread, whatever it waits for."""
+        """End the thread at once."""
         self._closed = True
         self._link.close()
         self._jobs.put(None)
@@ -158,23 +202,23 @@ class Listener:
             if self._closed:
                 return
             if result is not None:
-                self._heard.put(result)
+                self._events.put(result)
                 self._wake()
             if isinstance(result, ControllerLost):
                 return
 
-    def _done(self, job: Callable[[], Heard | None]) -> Heard | None:
+    def _done(self, job: Callable[[], ListenerEvent | None]) -> ListenerEvent | None:
         try:
             return job()
         except AfspmError as error:
             self._for_scan = False
             return error
-        except Exception as error:  # whatever it says, this connection goes on being listened to, or is made anew
+        except Exception as error:  # a malformed reply can raise any error: the thread must report it, not die
             self._for_scan = False
             return BadReply(f"Nanonis sent an unreadable message on a measurement: {error!r}")
 
-    def _next_end_of_scan(self) -> Heard | None:
-        """Ask again and again: so a connection that has died is noticed, and a spectrum gets its turn."""
+    def _next_end_of_scan(self) -> ListenerEvent | None:
+        # Short waits in a loop: a dead connection is noticed, and a spectrum gets its turn.
         while self._for_scan and not self._closed:
             timed_out, path = self._link.ask("Scan.WaitEndOfScan", _WAIT_MS, longer_s=_WAIT_MS / 1000)
             if not timed_out:
@@ -182,7 +226,8 @@ class Listener:
                 return ScanEnded(path)
         return None
 
-    def _curve(self, module: str, base_name: str) -> Heard:
+    def _curve(self, module: str, base_name: str) -> ListenerEvent:
         with_data = 1
+        # With data requested, Start replies at the end of the spectrum, and blocks this connection until then.
         names, values, _ = self._link.ask(f"{module}.Start", with_data, base_name, longer_s=_LONGEST_CURVE_S)
         return CurveEnded(tuple(names), values)

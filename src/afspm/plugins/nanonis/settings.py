@@ -1,7 +1,7 @@
-"""Generic parameters that Nanonis has in other groupings, units or directions than a table could say.
+"""Parameters that Nanonis groups, scales or signs in ways that a table can't express.
 
-A group is read by one question and written by one command, by generic names, in SI. What a `…Get` replies is never put
-into a `…Set` as it is where the two count differently (the table of `protocol`, "Traps" in the README).
+A group is read by one request and written by one command, by generic names, in SI. Values of a `…Get` are never passed
+to a `…Set` as they are where both count differently (the table of `protocol`, "Traps" in the README).
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ DRIFT_RATE_X: Final = "x-drift-rate-x"
 DRIFT_RATE_Y: Final = "x-drift-rate-y"
 
 _PIXELS_AT_ONCE: Final = 16
-_DIGITS: Final = 1e-6  # of float32
+_DIGITS: Final = 1e-6  # relative precision of float32, with a margin
 _ADDED_UP: Final = frozenset(FRAME) - {names.SCAN_ANGLE, names.SCAN_RESOLUTION_X, names.SCAN_RESOLUTION_Y}
-"""Made of a centre and a size: the error of each is that of the largest."""
+"""Parameters calculated from centre and size: their absolute error is the largest one's."""
 _ON, _OFF = 1, 2
-"""In what is set; in what is got they are 1 and 0."""
+"""In `…Set`; `…Get` returns 1 and 0 instead."""
 
 
 class Group(SettingsGroup):
-    """Parameters that Nanonis is asked for by one question, and told by one command."""
+    """Parameters read by one request and written by one command."""
 
     def __init__(self, ask: Ask) -> None:
         self._ask = ask
@@ -40,20 +40,20 @@ class Group(SettingsGroup):
 
 
 def numbers(ask: Ask, name: str, *arguments: Any) -> tuple[Any, ...]:
-    """The numbers that a function replies.
+    """Return the numbers that a function replies.
 
     Raises:
-        BadReply: one is not finite: nothing can be set by it.
+        BadReply: a number is not finite, so that nothing can be set by it.
     """
     found = ask(name, *arguments)
     for value in found:
         if isinstance(value, float) and not math.isfinite(value):
-            raise BadReply(f"Nanonis says {value} in reply to {name}")
+            raise BadReply(f"Nanonis returned {value} in reply to {name}")
     return found
 
 
 class ScanFrame(Group):
-    """Nanonis has the centre, a clockwise angle in degrees, and the range of whole pixels: N pixels of range / N."""
+    """The scan frame: Nanonis has the centre, a clockwise angle in degrees, and the range of N pixels of range / N."""
 
     names = FRAME
 
@@ -61,12 +61,15 @@ class ScanFrame(Group):
         _, columns, rows = self._ask("Scan.BufferGet")
         x, y, width, height, clockwise_deg = self._numbers("Scan.FrameGet")
         if min(columns, rows) < 1 or min(width, height) <= 0.0:
-            raise BadReply(f"Nanonis says that the frame is {width} m x {height} m of {columns} x {rows} pixels")
+            raise BadReply(
+                f"Nanonis returned a frame of {lengths_text((width, height), ' x ')} with {columns} x {rows} pixels"
+            )
         size_m = (width * _share(columns), height * _share(rows))
         return frame_values(Region((x, y), size_m, 0.0 - math.radians(clockwise_deg)), (rows, columns))
 
     def write(self, values: Mapping[str, Value]) -> None:
         region, (rows, columns) = frame(self.merged(values))
+        # Nanonis would round the number of pixels without a word
         if columns % _PIXELS_AT_ONCE:
             below = max(columns // _PIXELS_AT_ONCE, 1) * _PIXELS_AT_ONCE
             raise refuse_value(
@@ -87,12 +90,12 @@ class ScanFrame(Group):
 
 
 def _share(pixels: int) -> float:
-    """Of the range, what lies between the first and the last pixel."""
+    # Nanonis' range goes from edge to edge of the pixels, afspm's from centre to centre.
     return (pixels - 1) / pixels if pixels > 1 else 1.0
 
 
 class ScanSpeed(Group):
-    """The speed forward; that backward keeps its ratio, and the speeds are what is kept when the frame changes."""
+    """The scan speed forward. The backward speed keeps its ratio; the speeds are kept when the frame changes."""
 
     names = (names.SCAN_SPEED,)
 
@@ -106,20 +109,21 @@ class ScanSpeed(Group):
         backward_m_s = forward_m_s * ratio
         if min(forward_m_s, backward_m_s) <= 0.0:
             raise refuse_value(
-                names.SCAN_SPEED, f"{forward_m_s} m/s forward and {ratio} times that backward are not above 0"
+                names.SCAN_SPEED,
+                f"the speeds forward and backward must be above 0, not {forward_m_s:g} and {backward_m_s:g} m/s",
             )
-        keep_speed = 1  # 0 in what SpeedGet replies
+        keep_speed = 1  # SpeedGet returns 0 for it
         times_s = width_m / forward_m_s, width_m / backward_m_s
         self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, keep_speed, ratio)
 
 
 class Gains(Group):
-    """Nanonis has P, the time constant T and I = P / T."""
+    """The gains of the z controller: Nanonis has P, the time constant T, and I = P / T."""
 
     names = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
 
     def read(self) -> dict[str, Value]:
-        proportional, _, integral = self._ask("ZCtrl.GainGet")  # T is infinite where there is no I
+        proportional, _, integral = self._ask("ZCtrl.GainGet")  # not `_numbers`: T is infinite without I
         return {names.ZCTRL_PGAIN: proportional, names.ZCTRL_IGAIN: integral}
 
     def write(self, values: Mapping[str, Value]) -> None:
@@ -132,10 +136,10 @@ class Gains(Group):
 
 
 class FeedbackOn(Group):
-    """The z controller, on or off, as its real-time part says; it follows with a delay.
+    """The switch of the z controller, as its real-time part reports it, with a delay.
 
     Args:
-        wait_for: waits until a condition holds, but not for ever.
+        wait_for: waits for a condition, up to a time limit.
     """
 
     names = (FEEDBACK_ON,)
@@ -150,15 +154,17 @@ class FeedbackOn(Group):
     def write(self, values: Mapping[str, Value]) -> None:
         wanted = bool(values[FEEDBACK_ON])
         self._ask("ZCtrl.OnOffSet", int(wanted))
+        # OnOffGet reports the real-time controller, which follows with a delay.
         self._wait_for(lambda: self.read()[FEEDBACK_ON] is wanted)
 
 
 class MoveSpeed(Group):
-    """Of the tip outside of scans: a speed of its own, not that of scans."""
+    """The speed of the tip between scans, independent of the scan speed."""
 
     names = (names.MOVE_SPEED,)
 
     def read(self) -> dict[str, Value]:
+        # Without a speed of its own, the tip moves at the scan speed between scans, too.
         speed_m_s, own = self._numbers("FolMe.SpeedGet")
         return {names.MOVE_SPEED: speed_m_s if own else self._numbers("Scan.SpeedGet")[0]}
 
@@ -168,7 +174,7 @@ class MoveSpeed(Group):
 
 
 class Slope(Group):
-    """The compensation of the sample's tilt, which Nanonis has as angles."""
+    """The compensation of the sample's tilt, as slopes; Nanonis has angles."""
 
     names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
 
@@ -182,7 +188,7 @@ class Slope(Group):
 
 
 class DriftRate(Group):
-    """The speed at which the controller follows the sample by itself; off when both are 0. That in z stays."""
+    """The controller's own drift compensation, off if all velocities are 0. The z velocity is kept."""
 
     names = (DRIFT_RATE_X, DRIFT_RATE_Y)
     _usual_limit_percent: ClassVar[float] = 10.0
@@ -195,23 +201,24 @@ class DriftRate(Group):
         on, _, _, up_m_s, _, _, _, *limit = self._numbers("Piezo.DriftCompGet")
         x, y = (float(self.merged(values)[name]) for name in self.names)
         follows = bool(x or y or (on and up_m_s))
+        # Release 2021 has no limit.
         limit_percent = limit[0] if limit else self._usual_limit_percent
         self._ask("Piezo.DriftCompSet", _ON if follows else _OFF, x, y, up_m_s, limit_percent)
 
 
 class Probe(Group):
-    """The place of the tip: the goal while it is on its way, the place before while a scan leads it.
+    """The position of the tip: the goal during a move, the position before during a scan.
 
     Args:
-        now_s: experiment time.
+        now_s: returns experiment time.
 
     Attributes:
-        arrives_s: when it should be where it was sent, experiment time.
+        arrives_s: expected arrival, experiment time.
     """
 
     names = POSITION
     _finest_part: ClassVar[float] = 2e-6
-    """Of the scanner's range: the least difference that its converters tell."""
+    """Resolution of the converters, as a share of the scanner's range."""
 
     def __init__(self, ask: Ask, now_s: Callable[[], float]) -> None:
         super().__init__(ask)
@@ -222,11 +229,12 @@ class Probe(Group):
         self._range_m: tuple[float, ...] = (math.inf, math.inf)
 
     def xy_m(self) -> tuple[float, float]:
-        """Return where the tip is, (x, y) in m."""
+        """Return the position of the tip, (x, y) in m."""
         if self._goal_m is not None:
             return self._goal_m
         if self._seen_m is not None and self._ask("Scan.StatusGet")[0]:
             return self._seen_m
+        # A difference below the converters' resolution does not count as a move.
         x, y = self._numbers("FolMe.XYPosGet", 0)
         if self._seen_m is None or not self._near((x, y), self._seen_m):
             self._seen_m = (x, y)
@@ -239,6 +247,7 @@ class Probe(Group):
         before_m = self.xy_m()
         x, y = (float(values.get(name, was)) for name, was in zip(self.names, before_m, strict=True))
         self._range_m = self._numbers("Piezo.RangeGet")[:2]
+        # Nanonis would clip the position to the range without an error.
         for name, value, whole in zip(self.names, (x, y), self._range_m, strict=True):
             if abs(value) > whole / 2:
                 raise refuse_value(
@@ -252,7 +261,7 @@ class Probe(Group):
         self.arrives_s = self._now_s() + (math.dist(before_m, (x, y)) / speed_m_s if speed_m_s > 0.0 else 0.0)
 
     def arrived(self) -> bool:
-        """Return True if the tip is where it was sent; it then counts as being there exactly."""
+        """Return True if the tip has reached its goal, which then counts as its exact position."""
         if self._goal_m is None:
             return True
         if not self._near(self._numbers("FolMe.XYPosGet", 0), self._goal_m):
@@ -261,7 +270,7 @@ class Probe(Group):
         return True
 
     def give_up(self) -> None:
-        """It does not get there: the place where it is counts."""
+        """Give up the goal: the measured position counts."""
         self._goal_m = self._seen_m = None
 
     def _near(self, a: tuple[Any, ...], b: tuple[float, float]) -> bool:
@@ -275,18 +284,19 @@ TRANSLATED: Final = (
     *(*ScanFrame.names, *ScanSpeed.names, *Gains.names, *MoveSpeed.names, *Slope.names, *DriftRate.names),
     *(*Probe.names, *FeedbackOn.names),
 )
-"""Of all parameters that a group here translates."""
+"""Names of all parameters that a group here translates."""
 
 
 def same_float32(name: str, got: Value, other: Value, among: Mapping[str, Value]) -> bool:
-    """Return True if a value that was got is another one, for a controller that keeps most as float32.
+    """Return True if two values are equal for a controller that stores most values as float32.
 
     Args:
-        among: what was got with it: of a frame, all.
+        among: values read together with it: for a frame, all of its values.
     """
     if not (isinstance(got, float) and isinstance(other, float)):
         return got == other
-    if name == names.SCAN_ANGLE:  # 350 degrees may come back as -10
+    if name == names.SCAN_ANGLE:  # a controller may return 350 degrees as -10
         return abs(math.remainder(got - other, math.tau)) <= _DIGITS * math.tau
+    # A corner is centre minus half the size: its rounding error is relative to the larger of them.
     largest = max(abs(float(among[part])) for part in _ADDED_UP & among.keys()) if name in _ADDED_UP else 0.0
     return math.isclose(got, other, rel_tol=_DIGITS, abs_tol=_DIGITS * largest)

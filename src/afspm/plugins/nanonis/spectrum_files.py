@@ -1,4 +1,4 @@
-"""Nanonis spectra (.dat): lines `name<tab>value`, then `[DATA]` and a table, its columns named with their units."""
+"""Nanonis spectra (.dat): lines `name<tab>value`, then `[DATA]` and a table with units in the column names."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _LAYOUT = "%d.%m.%Y %H:%M:%S"
 
 
 def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
-    """The curve with all its sweeps, each a column; `kind` is Nanonis' own, e.g. "bias spectroscopy".
+    """Read a spectrum with all sweeps, a column each; `kind` is Nanonis' own, e.g. "bias spectroscopy".
 
-    A file that was cut off between two lines can't be told from a shorter one.
+    A file truncated between two lines can't be distinguished from a shorter one.
 
     Raises:
-        FileError, ValueError: no spectrum, or broken.
+        FileError, ValueError: another format, or damaged.
     """
     text = path.read_bytes().decode("latin-1").replace("\r\n", "\n")
     head, found, table = text.partition(f"\n{_TABLE}\n")
@@ -47,7 +47,6 @@ def read_spectrum(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _position_m(header: dict[str, str]) -> tuple[float, float] | None:
-    """Where the tip was; None if that is not said, or is no place."""
     x, y = (float(header.get(f"{axis} (m)", "nan")) for axis in "XY")
     return (x, y) if math.isfinite(x) and math.isfinite(y) else None
 

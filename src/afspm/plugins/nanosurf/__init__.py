@@ -1,4 +1,14 @@
-"""Nanosurf, over the scripting interface of Nanosurf Studio. See the README beside this."""
+"""Driver of Nanosurf microscopes, over the scripting interface of Nanosurf Studio. See the README in this folder.
+
+**Theory of operation.** Every request is a Lua script, and its value the reply (`link`, `lua_values`). Quick scripts
+share the first connection; each long command (approach, withdrawal, curve) has a connection of its own (`session`).
+
+    comes in      values of scripts; new .nhf files in Studio's gallery
+    state         the running and the ended measurement (persistent), the running long command (`activity`)
+    goes out      scripts (`commands`); scans and force curves from files; lines from a low-level buffer
+    always holds  all commands and units are checked before the first is used; values are set all or none; a stop that
+                  may have overtaken its start is repeated
+"""
 
 from __future__ import annotations
 
@@ -10,10 +20,10 @@ from afspm.basics.errors import ConfigError, Refused
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ControlResponse, Region, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.plugins.nanosurf import commands, lines
+from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.activity import FORCE, NanosurfFiles, StudioActivity
 from afspm.plugins.nanosurf.link import Link, StudioError
-from afspm.plugins.nanosurf.session import Session
+from afspm.plugins.nanosurf.session import Session, new_lines
 from afspm.plugins.nanosurf.settings import DIRECTION, UNITS, FrameSettings, Slopes, TipPlace, direction
 from afspm.translator.driver import Driver
 from afspm.translator.driver_base import action, connected
@@ -31,12 +41,12 @@ class Nanosurf(Driver):
 
     Args:
         address: "host:port" of its scripting interface.
-        release: of Studio (Help > About): 17 or later. A command that it does not have is not called.
-        session: name of the measurement session, such as "91-21-004"; left out: the only one that is open.
-        gallery_dir: where Studio's gallery folder is seen from here; left out: Studio runs on this computer.
-        image_buffer: number of the low-level buffer that has the running scan, for its lines; left out: none is read.
-        reply_timeout_s: how long a reply may take, in real time.
-        poll_period_s, common: as for every microscope.
+        release: release of Studio (Help > About), 17 or later, which decides the commands to use.
+        session: name of the measurement session, such as "91-21-004". Default: the only open one.
+        gallery_dir: local path of Studio's gallery folder. Default: Studio runs on this computer.
+        image_buffer: number of the low-level buffer with the running scan, for its lines. Default: no lines are read.
+        reply_timeout_s: longest wait for a reply, real time.
+        poll_period_s, common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -60,7 +70,7 @@ class Nanosurf(Driver):
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
         self.controller_at = address
-        self._level = max(commands.level(release), 0 if image_buffer is None else lines.LEVEL)
+        self._level = max(commands.level(release), 0 if image_buffer is None else commands.BUFFER_LEVEL)
         self._release, self._session_name = release, session
         self._gallery_dir, self._image_buffer = gallery_dir, image_buffer
         self._reply_timeout_s = reply_timeout_s
@@ -104,7 +114,7 @@ class Nanosurf(Driver):
         self._studio().put(values)
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the table, all by one question."""
+        """Return values of the parameter table, all with one request."""
         rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
         values = self._studio().values([row.vendor for row in rows]) if rows else {}
         found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
@@ -117,18 +127,18 @@ class Nanosurf(Driver):
         return self._files.load(result)
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """From the buffer `image_buffer`."""
+        """Return new lines of the running scan, from the buffer `image_buffer`."""
         if self._image_buffer is None:
             return ()
         region, shape = frame(self.in_force(FRAME))
         upwards = self._studio().values([DIRECTION])[DIRECTION] != direction(names.DOWN)
-        return lines.new_lines(self._studio(), self._image_buffer, region, shape, start, upwards=upwards)
+        return new_lines(self._studio(), self._image_buffer, region, shape, start, upwards=upwards)
 
     # --- actions ---
 
     @action(names.START_SCAN)
     def start_scan(self) -> None:
-        """Scan the frame once, in the direction of `x-scan-direction`."""
+        """Scan the frame once, in the direction `x-scan-direction`."""
         wanted = direction(str(self._kept[names.SCAN_DIRECTION]))
         self._studio().put({DIRECTION: wanted, "imaging.scan_mode": _ONE_FRAME})
         self._doing.start_scan()
@@ -140,7 +150,7 @@ class Nanosurf(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve where the tip was sent, by the cycle that is selected in Studio."""
+        """Take a force curve where the tip was sent, with the cycle selected in Studio."""
         self._doing.start_curve()
 
     @action(names.STOP_SPEC)
@@ -150,12 +160,12 @@ class Nanosurf(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Withdraw the tip, whatever is going on."""
+        """Stop everything and withdraw the tip."""
         self._doing.withdraw()
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample, by the approach that is selected in Studio."""
+        """Bring the tip to the sample, with the approach selected in Studio."""
         self._doing.approach()
 
     def command(self, text: str) -> None:
@@ -181,33 +191,33 @@ class Nanosurf(Driver):
         return frame(self.in_force(FRAME))[0]
 
     def _folder(self) -> Path:
-        """The folder of Studio's files, as seen from here."""
         path = f"{_STORAGE}.gallery_directory"
         return Path(self._gallery_dir or str(self._studio().values([path])[path]))
 
     def _save_files(self, session: Session) -> None:
-        """Have every measurement saved to a file of its own. Raises ConfigError: its folder can't be seen."""
         wanted: dict[str, Value] = {
             f"{_STORAGE}.nhf_backend_enabled": True,
             f"{_STORAGE}.nhf_auto_store_mode": _NEW_FILE,
         }
+        # The other modes append to the current file or save nothing, and results are recognised by new files.
         if session.values(list(wanted)) != wanted:
             self.log.warning("Studio did not save each measurement to a new .nhf file; it does from now on")
             session.put(wanted)
         folder = self._folder()
         if not folder.is_dir():
-            told = f"Studio's gallery {folder} does not exist on this computer"
-            raise ConfigError(told, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
+            problem = f"Studio's gallery {folder} does not exist on this computer"
+            raise ConfigError(problem, where="gallery_dir", hint='gallery_dir = "/where/it/is/mounted"')
 
     def _check_table(self, session: Session) -> None:
-        """Check that Studio has what the table names, and counts as it says. Raises ConfigError."""
         rows = {row.vendor: row for row in self.table.values() if "." in row.vendor}
+        # The tree differs between releases and licences: a missing path would fail in the middle of a night.
         for path in session.missing(rows):
             raise ConfigError(f"Studio has no {path}", where=rows[path].name, hint="a path below root.workflow")
         expected = {**UNITS, **{path: (row.unit,) for path, row in rows.items() if row.type == "float"}}
+        # A value in another unit would be converted by a wrong factor: refuse at the start.
         for path, unit in session.units(expected).items():
             if unit not in expected[path]:
-                told = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
+                problem = f"Studio has {path} in {unit or 'no unit'}, not in {expected[path][0] or 'none'}"
                 name = rows[path].name if path in rows else ""
                 hint = f'[microscope.parameters.{name}] unit = "{unit}", with a range' if name else "report it"
-                raise ConfigError(told, where=name or path, hint=hint)
+                raise ConfigError(problem, where=name or path, hint=hint)

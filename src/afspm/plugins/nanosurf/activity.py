@@ -1,4 +1,4 @@
-"""The state of Studio, and what is awaited of it."""
+"""State of Studio, and the measurements that wait for their end."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class NanosurfFiles(FolderFiles):
 
 
 class StudioActivity(Activity):
-    """The measurement or move that runs, begun by a request or at Studio's panel.
+    """The running measurement or move, started by a request or at Studio's panel.
 
     Args:
-        folder: gives the folder of Studio's files as seen from here.
-        frame_in_force: as it was set.
+        folder: returns the local path of Studio's files.
+        frame_in_force: returns the frame as it was set.
     """
 
     program: ClassVar[str] = "Studio"
@@ -58,13 +58,15 @@ class StudioActivity(Activity):
         self._folder, self._frame_in_force = folder, frame_in_force
 
     def status(self) -> ScopeStatus:
-        """Return what it is doing now; what has ended is awaited from here on."""
+        """Return the present state; register measurements that have ended, whose files are then awaited."""
         scanning = self._session.scanning().running
         call = self._running_call()
         curve = call is not None and call.what == FORCE
         if self._stopping and curve:
             with suppress(Refused):
-                self._session.do(commands.STOP_CURVE)  # the first may have overtaken the start: see `Session.begin`
+                self._session.do(
+                    commands.STOP_CURVE
+                )  # again: the first stop may have overtaken the start, on another connection
         self.follow(SCAN if scanning else FORCE if curve else "")
         if scanning:
             return ScopeStatus(ScopeState.SCANNING)
@@ -86,7 +88,8 @@ class StudioActivity(Activity):
         self._files.end(self._clock.now_ns())
 
     def start_scan(self) -> None:
-        """Scan the frame. Raises Refused: Studio does not."""
+        """Scan the frame. Raises Refused: Studio reports an error, or no scan is seen."""
+        # A short scan may be over before the next poll: then the count of started scans has risen.
         before = self._session.scanning().started
 
         def is_seen() -> bool:
@@ -96,13 +99,13 @@ class StudioActivity(Activity):
         self.started(SCAN, lambda: self._session.do(commands.START), is_seen)
 
     def start_curve(self) -> None:
-        """Take a force curve where the tip was sent: after a scan, it goes there first. Raises Refused."""
+        """Take a force curve where the tip was sent; the tip moves there first, as a scan moves it. Raises Refused."""
         self._stopping = False
         self._place.go()
         self.curve_awaited = FORCE
 
     def _take_curve(self) -> None:
-        """Take one curve where the tip is: Studio takes those of its grid, wherever that is on the panel."""
+        # Studio takes the curves of its grid, at the grid's place on the panel: a grid of one curve is put at the tip.
         try:
             self._session.put(dict(zip(commands.GRID, (*self._place.xy_m(), 1, 1), strict=True)))
         except Refused as refused:
@@ -113,21 +116,20 @@ class StudioActivity(Activity):
         self.watch(self._session.begin(FORCE, commands.TAKE_CURVE))
 
     def approach(self) -> None:
-        """Bring the tip to the sample."""
         self.watch(self._session.begin("approach", commands.APPROACH))
 
     def withdraw(self) -> None:
-        """Take the tip away, whatever is going on."""
+        """Stop everything and withdraw the tip."""
         self.stopped()
         self.close()
         try:
             self.call = self._session.begin("withdrawal", commands.WITHDRAW, commands.STOP_ALL)
         except ControllerLost as lost:
+            # A Studio may serve one client only; the first connection then waits for the end of the withdrawal.
             self._log.warning("there is no further connection (%s): the tip is withdrawn by the first", lost)
             self._session.run(f"{commands.STOP_ALL} {commands.WORKFLOW}.{commands.WITHDRAW}() return 0")
 
     def _running_call(self) -> LongCall | None:
-        """Return what takes long while it does; its last words are logged. Raises ControllerLost."""
         call = self.call
         if (running := self.watched_call()) is not None or call is None:
             return running

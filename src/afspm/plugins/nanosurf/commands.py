@@ -1,6 +1,6 @@
-"""The commands of Nanosurf Studio that the driver uses, and in which releases they are.
+"""Commands of Nanosurf Studio that the driver uses, and the releases that have them.
 
-From the tree that nanosurf-core 2.0.7 (MIT) has of Studio. What is marked with (!) in the README is not known.
+From the command tree in nanosurf-core 2.0.7 (MIT). Items marked (!) in the README are unconfirmed.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from afspm.basics.errors import ConfigError
 
 FIRST_RELEASE: Final = 17
 _WITHOUT_OLD: Final = 19
-"""Release from which the commands of before 17 are gone."""
+"""First release without the commands from before 17."""
 
 WORKFLOW: Final = "root.workflow"
 START, STOP = "imaging.start", "imaging.stop"
@@ -21,7 +21,7 @@ APPROACH, WITHDRAW = "approach.approach", "approach.withdraw"
 TAKE_CURVE, STOP_CURVE = "spectroscopy.acquire", "spectroscopy.stop"
 MOVE: Final = "scanner.move_to_target_offsets"
 GRID: Final = tuple(f"spectroscopy.grid_{name}" for name in ("center_offset_x", "center_offset_y", "columns", "rows"))
-"""Of the curves that are taken: where its centre is, and how many there are."""
+"""Values of the grid of curves: centre, columns and rows."""
 
 _ALWAYS: Final = (START, STOP, APPROACH, WITHDRAW, TAKE_CURVE, STOP_CURVE, MOVE, *GRID)
 _SIGNALS: Final = (f"{STARTED}.connect", f"{STARTED}.empty", f"{FINISHED}.connect")
@@ -37,7 +37,7 @@ if not afspm_seen then
 end
 return {WORKFLOW}.{STARTED}.empty()
 """
-"""Has Studio note when scans begin and end; it returns whether it has not taken notice."""
+"""Connects handlers that count scans; returns true if Studio has not connected them."""
 
 MISSING: Final = """
 local missing = {}
@@ -48,7 +48,7 @@ for _, path in ipairs({%s}) do
 end
 return missing
 """
-"""Returns those of a list of paths that the tree does not have."""
+"""Returns the paths of a list that the tree lacks."""
 
 
 UNITS: Final = """
@@ -76,32 +76,44 @@ if not fine then
 end
 return 0
 """
-"""Sets values; if Studio refuses one, puts back those that were set."""
+"""Sets values; if Studio refuses one, restores the ones set before."""
+
+BUFFER_LEVEL: Final = 2
+"""The level of a session from which on the low-level buffers are there."""
+BUFFER_LINES: Final = """
+local found, acquisition, buffer = {}, root.core.acquisition, %d
+acquisition.synchronize_lu_data_buffer(buffer)
+if acquisition.lu_data_buffer_state(buffer) ~= 3 then return found end
+for channel = 0, acquisition.lu_data_buffer_channel_count(buffer) - 1 do
+  found[#found + 1] = {
+    acquisition.lu_data_buffer_channel_name(buffer, channel), acquisition.lu_data_buffer_channel_unit(buffer, channel),
+    acquisition.lu_data_buffer_channel_range(buffer, channel), acquisition.lu_data_buffer_channel_data(buffer, channel),
+  }
+end
+return found
+"""
+"""Returns name, unit, range and values of each channel of a low-level buffer; nothing if it is not synchronized."""
 
 STOP_ALL: Final = f"""
 local imaging, spectroscopy, approach = {WORKFLOW}.imaging, {WORKFLOW}.spectroscopy, {WORKFLOW}.approach
 pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
 """
-"""Stops what is going on, as far as that can be stopped."""
+"""Stops everything that can be stopped."""
 
 
 def has_old_commands(release: int) -> bool:
-    """Return whether a release has the commands of before 17, too.
-
-    Raises:
-        ConfigError: it is older than 17.
-    """
+    """Return True if a release still has the commands from before 17. Raises ConfigError: it is older than 17."""
     if release < FIRST_RELEASE:
         hint = f"{FIRST_RELEASE} or later"
-        raise ConfigError(f"afspm does not speak to Nanosurf Studio {release}", where="release", hint=hint)
+        raise ConfigError(f"Nanosurf Studio {release} is too old for afspm", where="release", hint=hint)
     return release < _WITHOUT_OLD
 
 
 def used(release: int) -> tuple[str, ...]:
-    """Return the paths of all commands that are used with a release."""
+    """Return the paths of all commands used with a release."""
     return (*_ALWAYS, *((IS_SCANNING,) if has_old_commands(release) else _SIGNALS))
 
 
 def level(release: int) -> int:
-    """Return the level of the session that is needed: the old commands are in the highest alone (!)."""
+    """Return the lowest session level with the used commands: the old ones need the highest level (!)."""
     return 5 if has_old_commands(release) else 1

@@ -1,8 +1,8 @@
-"""Nanosurf Studio's files (.nhf): HDF5 of format 1 (since 2023) and 2, with images and curves.
+"""Nanosurf Studio's files (.nhf): HDF5 of formats 1 (since 2023) and 2, with images and curves.
 
-From a file of the maker's own examples and from its reader (nanosurf-utils, MIT): rows and columns ascend, backward
-segments are not mirrored, integers are scaled to a range. The sense of a rotation and its unit, taken as
-counter-clockwise and degrees, are not known (!).
+From a file of the maker's examples and its reader (nanosurf-utils, MIT): rows and columns ascend, backward segments are
+not mirrored, integers are scaled to a range. Sense and unit of a rotation, taken as counter-clockwise in degrees, are
+unconfirmed (!).
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 CONTROLLER: Final = "Nanosurf Studio"
 _TYPES: Final = {0: "int32", 1: "uint8", 2: "uint16", 3: "uint32", 4: "uint64", 5: "int16", 6: "int64", 7: "double"}
-"""Of format 1, which numbers the types that format 2 names."""
+"""Types by number, in format 1; format 2 names them."""
 _SPECTROSCOPY: Final = ("spectroscopy", "spectroscopy_grid")
 _MEASUREMENTS: Final = (*_SPECTROSCOPY, "image_line_based", "wavemode_nma")
-"""Kinds of groups; a file of format 2 has others, such as one of calibrations."""
+"""Kinds of groups with measurements; format 2 has others, such as calibrations."""
 
 Array = NDArray[np.float64]
 
 
 def read_nhf(path: Path, zone: tzinfo | None) -> FileContent:
-    """All images and curves of a file. Raises FileError: another format, or broken."""
+    """Read all images and curves of a file. Raises FileError: another format, or damaged."""
     with hdf5.opened(path) as file:
         version = int(file.attrs.get("nsf_file_version_major", 0))
         if version not in (1, 2):
@@ -66,7 +66,7 @@ def _kind(group: h5py.Group) -> str:
 
 
 def _scans(group: h5py.Group) -> Iterator[Scan]:
-    """Every channel that fits the image; maps with more values in a pixel are left out."""
+    # Maps with several values in a pixel are left out.
     if _kind(group) in _SPECTROSCOPY:
         return
     for segment in _segments(group):
@@ -78,6 +78,7 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
             if min(rows, columns) < 2:
                 raise FileError(f"holds an image of {columns} x {rows} pixels")
             values = _values(dataset).reshape(rows, columns)
+            # A stopped image: the remaining lines were not scanned.
             if acquired < rows:
                 upwards = hdf5.text(group.attrs.get("image_scan_direction", "up")) == "up"
                 values[slice(acquired, None) if upwards else slice(rows - acquired)] = np.nan
@@ -85,7 +86,8 @@ def _scans(group: h5py.Group) -> Iterator[Scan]:
 
 
 def _curves(group: h5py.Group) -> Iterator[Spectrum]:
-    """The segments of a curve one after the other, as far as all have the channel; positions are not told (!)."""
+    # The segments of a curve are joined, for channels that all of them have. Positions of curves are not in the file
+    # (!).
     parts = [_blocks(segment) for segment in _segments(group)]
     shared = [name for name in parts[0] if all(name in part for part in parts)] if parts else []
     count = min((len(part[name][1]) for part in parts for name in shared), default=0)
@@ -98,7 +100,6 @@ def _curves(group: h5py.Group) -> Iterator[Spectrum]:
 
 
 def _blocks(segment: h5py.Group) -> dict[str, tuple[str, list[Array]]]:
-    """Channel -> (unit, the values of each curve)."""
     found = {}
     for name, unit, dataset in _channels(segment):
         sizes = _block_sizes(segment, dataset)
@@ -109,12 +110,12 @@ def _blocks(segment: h5py.Group) -> dict[str, tuple[str, list[Array]]]:
 
 
 def _block_sizes(segment: h5py.Group, dataset: h5py.Dataset) -> NDArray[np.int64]:
-    """How many values each curve has: told by a dataset beside it."""
+    # Another dataset of the segment has the number of values of each curve.
     source = dataset.attrs.get("dataset_block_size_source")
     for other in segment.values():
         named = hdf5.text(other.attrs.get("name", "")) == "number_of_datapoints_acquired"
-        told = source is not None and other.attrs.get("dataset_block_size_id") == source
-        if named or told:
+        referenced = source is not None and other.attrs.get("dataset_block_size_id") == source
+        if named or referenced:
             return hdf5.array(other).astype(np.int64).ravel()
     return np.array([dataset.size])
 
@@ -128,7 +129,6 @@ def _segment_name(segment: h5py.Group) -> str:
 
 
 def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
-    """The datasets that are signals: name, unit, dataset."""
     for _, dataset in sorted(segment.items()):
         attributes = dataset.attrs
         prefix = "signal" if "signal_name" in attributes else "base"
@@ -139,18 +139,19 @@ def _channels(segment: h5py.Group) -> Iterator[tuple[str, str, h5py.Dataset]]:
 
 
 def _values(dataset: h5py.Dataset) -> Array:
-    """The values in their unit: integers lie in a range of the type, and in format 2 one of them means none."""
+    # Integers span the range of their type; in format 2 one of them means no value.
     raw = hdf5.array(dataset)
     attributes = dataset.attrs
     prefix = "signal" if "signal_name" in attributes else "base"
     kind = attributes.get("dataset_element_type", 7)
     kind = hdf5.text(kind) if isinstance(kind, str | bytes) else _TYPES.get(int(kind), "double")
+    # Floating-point values are stored in their unit.
     if kind == "double" or f"{prefix}_calibration_max" not in attributes:
         return raw
     low, high = (float(attributes[f"{prefix}_calibration_{end}"]) for end in ("min", "max"))
     limits = np.iinfo(kind)
     smallest, largest = float(limits.min), float(limits.max)
-    if prefix == "signal":  # format 2 keeps one number back
+    if prefix == "signal":  # format 2 reserves one number for missing values
         missing = raw == float(dataset.fillvalue)
         smallest, largest = (smallest + 1.0, largest) if limits.min else (smallest, largest - 1.0)
         raw = np.where(missing, np.nan, raw)
@@ -158,7 +159,6 @@ def _values(dataset: h5py.Dataset) -> Array:
 
 
 def _frame(attributes: PlainMapping) -> tuple[Region, tuple[int, int]]:
-    """The frame and its (rows, columns)."""
     if "rect_axis_size" in attributes:
         rows, columns = (int(number) for number in attributes["rect_axis_size"])
         height, width = (float(length) for length in attributes["rect_axis_range"])
@@ -175,5 +175,5 @@ def _plain(value: Any) -> Any:
 
 
 def _time_ns(text: object) -> int | None:
-    """A time with its zone, "2023-07-18T15:26:38.320Z"; None: there is none."""
+    # Times have a zone: "2023-07-18T15:26:38.320Z".
     return None if not text else round(datetime.fromisoformat(str(text)).timestamp() * 1e6) * 1000

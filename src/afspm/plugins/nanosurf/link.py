@@ -1,4 +1,4 @@
-"""The connections to Nanosurf Studio: one for short questions, one for each command that takes its time."""
+"""Connections to Nanosurf Studio: one for quick scripts, one for each long command."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from afspm.plugins.nanosurf.lua_values import BadLua, parse
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.tcp import Receiver, TcpConnection, host_and_port
 
+# Length of a script or reply in bytes, least significant byte first.
 _LENGTH: Final = struct.Struct("<I")
 _LONGEST_REPLY: Final = 1 << 28
 _SHOWN: Final = 60
@@ -21,33 +22,35 @@ _HINTS: Final = (
 
 
 class StudioError(AfspmError):
-    """Studio could not run a script: its own words."""
+    """Studio reports an error of a script, with its own text."""
 
     code = "nanosurf-error"
 
 
 class Link:
-    """One connection. Raises ControllerLost: nobody listens there. ConfigError: it is no address."""
+    """One connection. Raises ControllerLost: the port does not accept connections. ConfigError: malformed address."""
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._connection = TcpConnection(host_and_port(address), timeout_s, monotonic_s, _HINTS)
 
     def run(self, script: str) -> list[Any]:
-        """Run a script, and return the values that it returns.
+        """Run a script; return the values that it returns.
 
         Raises:
-            StudioError: it failed. ControllerLost: no reply, or none to be trusted; the connection is closed.
+            StudioError: the script failed.
+            ControllerLost: no reply, or an untrustworthy one; the connection is closed.
         """
         self.begin(script)
         return self._values(_shown(script))
 
     def begin(self, script: str) -> None:
-        """Have a script run, whose `reply` is to come before the next. Raises ControllerLost."""
+        """Start a script; `reply` must be received before the next one. Raises ControllerLost."""
         raw = script.encode()
+        # Studio executes one script at a time on a connection, and replies at its end.
         self._connection.send(_shown(script), _LENGTH.pack(len(raw)) + raw)
 
     def reply(self, what: str) -> tuple[bool, list[Any]]:
-        """Return whether a reply has come to what was begun, and the values in it. Raises as `run` does."""
+        """Return whether the reply has arrived, and its values. Raises: see `run`."""
         return (True, self._values(what)) if self._connection.has_answer() else (False, [])
 
     def _values(self, what: str) -> list[Any]:
@@ -61,7 +64,6 @@ class Link:
 
 
 def _read(receiver: Receiver) -> tuple[Any, dict[Any, Any]]:
-    """Read "{status,{values}}". Raises ControllerLost: it is something else."""
     (size,) = _LENGTH.unpack(receiver.exactly(_LENGTH.size))
     if size > _LONGEST_REPLY:
         raise ControllerLost(f"a reply of {size} bytes was announced")
@@ -70,12 +72,12 @@ def _read(receiver: Receiver) -> tuple[Any, dict[Any, Any]]:
         reply = parse(text)
     except BadLua as error:
         raise ControllerLost(f"a reply that is not Lua: {error}") from error
+    # {0,{values…}} after success, {1,{text}} after an error.
     if not (isinstance(reply, dict) and reply.get(1) in (0, 1) and isinstance(reply.get(2), dict)):
         raise ControllerLost(f"a reply without a status: {text[:60]!r}")
     return reply[1], reply[2]
 
 
 def _shown(script: str) -> str:
-    """Return the beginning of a script, for messages."""
     first = " ".join(script.split())
     return first if len(first) <= _SHOWN else f"{first[:_SHOWN]}…"

@@ -1,4 +1,4 @@
-"""What Studio replies, as Lua writes it: tables, texts, numbers, booleans and nil. Pure."""
+"""Lua values in Studio's replies: tables, texts, numbers, booleans and nil. Pure."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _DEEPEST: Final = 50
 
 
 class BadLua(AfspmError):
-    """A text that is not a value."""
+    """The text is not a Lua value."""
 
     code = "bad-reply"
 
 
 def parse(text: str) -> object:
-    """Return a value: a table as a dictionary, where what has no key is numbered from 1. Raises BadLua."""
+    """Parse a value; a table becomes a dictionary, with items without a key numbered from 1. Raises BadLua."""
     reader = _Reader(text)
     value = reader.value(0)
     if reader.token() != ("", ""):
@@ -88,7 +88,6 @@ class _Reader:
                 raise BadLua(f"{text!r} within a table")
 
     def _key(self, depth: int) -> object:
-        """Take `[key]=` or `key=`; None: there is none."""
         before = self._at
         kind, text = self.token()
         if (kind, text) == ("mark", "["):
@@ -109,6 +108,7 @@ def _unescaped(found: re.Match[str]) -> str:
 
 
 def _special(text: str) -> float:
+    # The text of NaN and infinity depends on Lua's C library.
     if "huge" in text or "inf" in text or "1e9999" in text:
         return -math.inf if text.lstrip("(").startswith("-") else math.inf
     return math.nan
@@ -121,7 +121,7 @@ def _number(text: str) -> int | float:
 
 
 def written(value: bool | float | str) -> str:
-    """Return a value as Lua reads it."""
+    """Return a value in Lua's syntax."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):

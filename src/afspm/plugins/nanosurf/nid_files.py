@@ -1,8 +1,8 @@
-"""Files of Nanosurf's older programs (.nid): a header of sections like an .ini, "#!", and the values of each channel.
+"""Files of Nanosurf's older programs (.nid): a header with sections like an .ini, "#!", and the values of each channel.
 
-From ten files of the maker's examples (NSFopen, MIT), and against Gwyddion: rows ascend, backward lines are not
-mirrored, integers lie in a range. The sense of a rotation is taken as counter-clockwise (!). A map of curves does not
-say which is where, so curves have no position.
+From ten files of the maker's examples (NSFopen, MIT), compared with Gwyddion: rows ascend, backward lines are not
+mirrored, integers are scaled to a range. A rotation is taken as counter-clockwise (!). A map of curves does not say
+which curve is where, so curves have no position.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 
 def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
-    """All images and curves of a file. Raises FileError: not whole, or not of this format."""
+    """Read all images and curves of a file. Raises FileError: another format, or damaged."""
     head, found, data = path.read_bytes().partition(_DATA)
     sections = _sections(head.decode("utf-8", "replace"))
     if not found or "DataSet" not in sections:
@@ -54,7 +54,6 @@ def read_nid(path: Path, zone: tzinfo | None) -> FileContent:
 
 
 def _sections(text: str) -> dict[str, Section]:
-    """ "[name]" and its lines "key=value"."""
     found: dict[str, Section] = {}
     section: Section = {}
     for line in text.splitlines():
@@ -67,9 +66,9 @@ def _sections(text: str) -> dict[str, Section]:
 
 
 def _channels(sections: Mapping[str, Section], data: bytes) -> Iterator[tuple[Section, Array]]:
-    """The channels in the order in which their values lie in the file, with all values [line, point]."""
     dataset, at = sections["DataSet"], 0
     listed = ((_CHANNEL.fullmatch(key), name) for key, name in dataset.items())
+    # The values of channels follow each other in the order of their group and channel numbers.
     for _, name in sorted((tuple(map(int, key.groups())), name) for key, name in listed if key is not None):
         channel = sections[name]
         kind = np.dtype(_BITS[int(channel["SaveBits"])])
@@ -81,6 +80,7 @@ def _channels(sections: Mapping[str, Section], data: bytes) -> Iterator[tuple[Se
             raise FileError(f"ends within {name}")
         raw = np.frombuffer(data, kind, shape[0] * shape[1], at).reshape(shape)
         at += size
+        # Signed integers span the range Dim2Min to Dim2Min + Dim2Range.
         steps = 2.0 ** (8 * kind.itemsize)
         yield channel, (raw / steps + 0.5) * float(channel["Dim2Range"]) + float(channel["Dim2Min"])
 
@@ -90,7 +90,7 @@ def _is_image(channel: Section) -> bool:
 
 
 def _scan(channel: Section, values: Array, frame: Region | None) -> Scan:
-    """One channel, "Z-Axis forward"; the frame is told by the parameters, in files that have them."""
+    # Only some files have parameters with the frame's centre and angle.
     if min(values.shape) < 2:
         raise FileError("holds an image of less than two lines or columns")
     width, height = float(channel["Dim0Range"]), float(channel["Dim1Range"])
@@ -100,7 +100,7 @@ def _scan(channel: Section, values: Array, frame: Region | None) -> Scan:
 
 
 def _frame(sections: Mapping[str, Section]) -> Region | None:
-    """Centre and angle: `ScanOffset=V[0,0,0]*[m,m,m]`, `ScanRotation=V[0,0,45]*[°,°,°]`."""
+    # `ScanOffset=V[0,0,0]*[m,m,m]`, `ScanRotation=V[0,0,45]*[°,°,°]`.
     imaging = sections.get("DataSet\\Parameters\\Imaging")
     if imaging is None:
         return None
@@ -115,7 +115,6 @@ def _vector(text: str) -> list[float]:
 
 
 def _curves(channels: list[tuple[Section, Array]]) -> Iterator[Spectrum]:
-    """Curves: forward and then backward, over the axis that was swept."""
     ways = sorted({channel["Frame"] for channel, _ in channels}, key=lambda way: "forward" not in way)
     parts = [{channel["Dim2Name"]: (channel, values) for channel, values in channels if channel["Frame"] == way}
              for way in ways]  # fmt: skip
@@ -132,7 +131,7 @@ def _curves(channels: list[tuple[Section, Array]]) -> Iterator[Spectrum]:
 
 
 def _swept(channel: Section, line: int) -> Array:
-    """The values of the axis of a curve, which may differ from curve to curve."""
+    # The axis may differ from curve to curve.
     prefix = f"LineDim{line}" if f"LineDim{line}Min" in channel else "Dim0"
     low, width = float(channel[f"{prefix}Min"]), float(channel[f"{prefix}Range"])
     return np.linspace(low, low + width, _points(channel, line))
@@ -143,6 +142,7 @@ def _taken(channel: Section, values: Array, line: int) -> Array:
 
 
 def _points(channel: Section, line: int) -> int:
+    # A curve may have fewer points than its line in the file.
     most = int(channel["Points"])
     points = int(channel.get(f"LineDim{line}Points", most))
     if not 0 <= points <= most:

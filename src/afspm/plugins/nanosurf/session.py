@@ -1,4 +1,4 @@
-"""A connected Nanosurf Studio: its values, its commands, and whether it scans."""
+"""A connected Nanosurf Studio: its values, its commands, and the state of its scan."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Final
 
+import numpy as np
+
 from afspm.basics.errors import ConfigError, Refused
-from afspm.model import ControlResponse
+from afspm.model import ControlResponse, Region, ScanLines
 from afspm.plugins.nanosurf import commands
 from afspm.plugins.nanosurf.commands import WORKFLOW
 from afspm.plugins.nanosurf.link import Link, StudioError
@@ -18,16 +20,17 @@ from afspm.translator.long_call import LongCall
 from afspm.translator.parameters import Value
 
 ENUMS: Final = frozenset({"imaging.scan_mode", "imaging.slow_axis_scan_direction", "data.storage.nhf_auto_store_mode"})
-"""Paths whose value is a number that stands for a choice."""
+"""Paths of choices, whose value is a number."""
+_LARGEST_BUFFERED: Final = 2**31 - 1
 
 
 @dataclass(frozen=True)
 class Scanning:
-    """What is known of scans.
+    """The state of scans.
 
     Attributes:
-        running: a scan runs.
-        started: how many have begun since Studio takes note; 0: this release does not count them.
+        running: True while a scan runs.
+        started: number of started scans since the handlers were connected; 0 if this release does not count them.
     """
 
     running: bool
@@ -35,16 +38,16 @@ class Scanning:
 
 
 class Session:
-    """A measurement session of Studio. For one thread.
+    """A measurement session of Studio, for one thread.
 
     Args:
-        open_link: gives a new connection.
-        release: of Studio.
-        name: of the session; empty: the only one that is open.
-        level: of its commands; None: the lowest that is needed.
+        open_link: opens a new connection.
+        release: release of Studio.
+        name: name of the session; empty: the only open one.
+        level: level of its commands; None: the lowest sufficient one.
 
     Raises:
-        ControllerLost. ConfigError: it is another release, or lacks commands.
+        ControllerLost. ConfigError: another release, or missing commands.
     """
 
     def __init__(self, open_link: Callable[[], Link], release: int, name: str, level: int | None = None) -> None:
@@ -56,29 +59,30 @@ class Session:
             self._name = self._checked_name(name)
             self._select(self._link)
             self._check()
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             self._link.close()
             raise
 
     def run(self, script: str) -> list[Any]:
-        """Run a script. Raises StudioError, ControllerLost."""
+        """Run a script; return the values that it returns. Raises StudioError, ControllerLost."""
         return self._link.run(script)
 
     def do(self, command: str) -> None:
-        """Call a command. Raises Refused: Studio would not."""
+        """Call a command. Raises Refused: Studio reports an error."""
         try:
             self.run(f"{WORKFLOW}.{command}() return 0")
         except StudioError as error:
             raise Refused(ControlResponse.ACTION_ERROR, f"Studio refused {command}: {error}") from error
 
     def values(self, paths: Sequence[str]) -> dict[str, Value]:
-        """Return values of panels by their paths.
+        """Return values of panels by path.
 
         Raises:
-            ControllerLost: there is none, or a number is not finite: such a reply is not to be trusted.
+            ControllerLost: a value is missing or not finite, so that the reply can't be trusted.
         """
+        # One request for all values: they belong to the same moment, and a poll stays short.
         script = ", ".join(f"{WORKFLOW}.{path}.{_field(path)}_get()" for path in paths)
-        found = dict(zip(paths, self._told(script), strict=False))
+        found = dict(zip(paths, self._returned(script), strict=False))
         for path in paths:
             value = found.get(path)
             if not isinstance(value, bool | int | float | str) or (isinstance(value, float) and not isfinite(value)):
@@ -86,7 +90,7 @@ class Session:
         return found
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values of panels, all or none. Raises Refused: Studio does not take one."""
+        """Set values of panels, all or none. Raises Refused: Studio rejects one of them."""
         puts = " ".join(
             f"put({WORKFLOW}.{path}, {written(_field(path))}, {written(value)})" for path, value in values.items()
         )
@@ -96,78 +100,103 @@ class Session:
             raise Refused(ControlResponse.PARAM_ERROR, f"Studio refused {', '.join(values)}: {error}") from error
 
     def units(self, paths: Iterable[str]) -> dict[str, str]:
-        """Return the units that Studio says its values are in; empty: it says none."""
+        """Return Studio's units of values by path; empty: none."""
         paths = list(paths)
-        told = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
-        return {path: str(told.get(number, "")) for number, path in enumerate(paths, 1)}
+        found = self.run(commands.UNITS % ", ".join(map(written, paths)))[0]
+        return {path: str(found.get(number, "")) for number, path in enumerate(paths, 1)}
 
     def missing(self, paths: Iterable[str]) -> list[str]:
-        """Return those paths that Studio does not have."""
+        """Return the paths that Studio lacks."""
         return [str(one) for one in self.run(commands.MISSING % ", ".join(map(written, paths)))[0].values()]
 
     def scanning(self) -> Scanning:
-        """Return whether a scan runs."""
+        """Return whether a scan runs, and how many were started. Raises ControllerLost."""
+        # Newer releases have no is_scanning: handlers of their signals count scans instead.
         script = f"{WORKFLOW}.{commands.IS_SCANNING}(), 0" if self._old else "afspm_seen.scanning, afspm_seen.started"
-        told = self._told(script)
-        if len(told) != 2 or not isinstance(told[0], bool) or not isinstance(told[1], int):
-            raise ControllerLost(f"Studio replied {told} to whether it scans")
-        return Scanning(*told)
+        found = self._returned(script)
+        if len(found) != 2 or not isinstance(found[0], bool) or not isinstance(found[1], int):
+            raise ControllerLost(f"Studio replied {found} when asked if it scans")
+        return Scanning(*found)
 
     def begin(self, what: str, command: str, first: str = "") -> LongCall:
-        """Begin what takes long, after the script `first`, on a connection of its own. Raises ControllerLost."""
+        """Start a long command on a connection of its own, after the script `first`. Raises ControllerLost."""
         link = self._open_link()
         try:
             self._select(link)
+            # A long command blocks its connection: the first one stays free for polls and stops.
             link.begin(f"{first} return {WORKFLOW}.{command}()")
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
         return LongCall(what, link)
 
     def close(self) -> None:
-        """Let go of it."""
         self._link.close()
 
     # --- inside ---
 
-    def _told(self, script: str) -> list[Any]:
-        """Return the values of a script that any session runs. Raises ControllerLost: this one does not any more."""
+    def _returned(self, script: str) -> list[Any]:
+        # Any session can run these scripts: an error means that this one was closed or replaced.
         try:
             return self.run(f"return {script}")
         except StudioError as error:
             raise ControllerLost(f"Studio's session is not what it was: {error}") from error
 
     def _checked_name(self, name: str) -> str:
-        """Return the name of the session to select. Raises ConfigError: Studio is of another release."""
         self._link.run("return root.session.select_main(0)")
         major, full, listed = self._link.run("return root.version.major(), root.version.full(), root.session.list()")
         self.controller = f"Nanosurf Studio {full}"
         if major != self._release:
-            told = f"Studio is of release {major}, not {self._release}"
-            raise ConfigError(told, where="release", hint=f"release = {major}")
+            problem = f"Studio is release {major}, not {self._release}"
+            raise ConfigError(problem, where="release", hint=f"release = {major}")
         found = [str(one) for one in listed.values()] if isinstance(listed, dict) else []
         if name in found or (not name and len(found) == 1):
             return name or found[0]
-        hint = f"open one, or set session to one of {', '.join(found) or 'those that are open'}"
+        hint = f"open one, or set session to one of {', '.join(found) or 'the open ones'}"
         raise ControllerLost(f"Studio has no single measurement session {name}", hint=hint)
 
     def _select(self, link: Link) -> None:
         try:
+            # The selection of a session belongs to a connection: each one needs its own.
             link.run(f"return root.session.select({written(self._name)}, {self._level})")
         except StudioError as error:
             raise ControllerLost(f"Studio's session {self._name!r} can't be selected: {error}") from error
 
     def _check(self) -> None:
-        """Check that the release has what is used of it, and takes note of scans."""
         missing = self.missing(commands.used(self._release))
         if missing:
             names = ", ".join(missing)
             hint = "name its release (Help > About) in the setting release, and look at the level of its licence"
             raise ConfigError(f"{self.controller} has no {names}", where="release", hint=hint)
         if not self._old and self.run(commands.WATCH)[0]:
-            told = f"{self.controller} does not tell scripts when scans begin and end"
-            raise ConfigError(told, where="release", hint="report it, with the release, to the project of afspm")
+            problem = f"{self.controller} does not report the start and end of scans to scripts"
+            raise ConfigError(problem, where="release", hint="report it, with the release, to the afspm project")
 
 
 def _field(path: str) -> str:
     return "value_raw" if path in ENUMS else "value"
+
+
+def new_lines(
+    session: Session, buffer: int, region: Region, shape: tuple[int, int], start: int, *, upwards: bool
+) -> list[ScanLines]:
+    """Return the complete lines beyond the first `start` that all channels have, in scanning order."""
+    # (!) which buffer holds the image, and that its values are the lines as they were scanned, is not known
+    found = session.run(commands.BUFFER_LINES % buffer)[0]
+    channels = [_buffered_channel(one, shape[1]) for one in found.values()]
+    done = min((len(values) for _, _, values in channels), default=0)
+    if done <= start:
+        return []
+    first = start if upwards else shape[0] - done
+    lines = []
+    for name, unit, values in channels:
+        rows = values[start:done] if upwards else values[start:done][::-1]
+        lines.append(ScanLines(region, shape, name, unit, first, np.ascontiguousarray(rows)))
+    return lines
+
+
+def _buffered_channel(found: dict[int, Any], columns: int) -> tuple[str, str, np.ndarray]:
+    name, unit, span, raw = (found[number] for number in (1, 2, 3, 4))
+    values = np.array(list(raw.values()), dtype=np.float64) / _LARGEST_BUFFERED * float(span)
+    rows = len(values) // columns
+    return str(name), str(unit), values[: rows * columns].reshape(rows, columns)

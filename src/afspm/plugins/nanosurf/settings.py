@@ -1,6 +1,6 @@
-"""The frame, the speed and the place of the tip as Studio has them, and as everybody else.
+"""Frame, speed and tip position: conversion between Studio's values and generic parameters.
 
-Studio has the centre of a frame, its angle, and lines per second; a line is there and back (!).
+Studio has the centre of a frame, its angle, and lines per second; a line is forward and backward (!).
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ UNITS: Final[dict[str, tuple[str, ...]]] = {
     **dict.fromkeys((_ANGLE, *_SLOPES), ("°", "deg")),
     _RATE: ("Hz", "1/s"),
 }
-"""The units that the translation of these values is right for."""
+"""Accepted units of Studio's values: the conversions here are right for these only."""
 SPEED_PATH: Final = 2.0
-"""Widths of the frame that the tip travels in a line."""
+"""Path of the tip in a line, in widths of the frame: forward and backward (!)."""
 
 
 class FrameSettings(SettingsGroup):
-    """The frame and the speed, which are set together as the speed is told by lines per second."""
+    """Frame and speed, set together since the speed depends on the width and the line rate."""
 
     names = frozenset({*FRAME, names.SCAN_SPEED})
 
@@ -57,7 +57,7 @@ class FrameSettings(SettingsGroup):
         region, (rows, columns) = frame(wanted)
         speed_m_s = float(wanted[names.SCAN_SPEED])
         if speed_m_s <= 0.0:
-            raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+            raise InvalidValue(f"the scan speed must be above 0, not {speed_m_s:g} m/s")
         (x, y), (width, height) = region.center_m, region.size_m
         rate = speed_m_s / (SPEED_PATH * width)
         angle_deg = math.degrees(region.angle_rad)
@@ -65,7 +65,7 @@ class FrameSettings(SettingsGroup):
 
 
 class Slopes(SettingsGroup):
-    """The compensation of the sample's tilt, which Studio has as angles; their sense is not known (!)."""
+    """The compensation of the sample's tilt, as slopes; Studio has angles, whose sign is unconfirmed (!)."""
 
     names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
 
@@ -83,7 +83,7 @@ class Slopes(SettingsGroup):
 
 
 class TipPlace(SettingsGroup):
-    """The place to which the tip was sent."""
+    """The position where the tip was sent."""
 
     names = POSITION
 
@@ -100,17 +100,17 @@ class TipPlace(SettingsGroup):
         self.go()
 
     def xy_m(self) -> tuple[float, float]:
-        """Return where the tip was sent."""
+        """Return the position where the tip was sent, (x, y) in m."""
         x, y = (float(value) for value in self._session().values(_TARGET).values())
         return x, y
 
     def go(self) -> None:
-        """Send the tip there. Raises Refused."""
+        """Move the tip to the target. Raises Refused."""
         self._session().do(commands.MOVE)
         self._moving = True
 
     def arrived(self) -> bool:
-        """Return True if the tip is where it was sent, within a nanometre or a thousandth of the distance."""
+        """Return True if the tip has reached the target, within 1 nm or 0.1 % of its distance from the origin."""
         if self._moving:
             x, y, to_x, to_y = (float(value) for value in self._session().values((*_PLACE, *_TARGET)).values())
             self._moving = math.dist((x, y), (to_x, to_y)) > max(1e-9, 1e-3 * math.hypot(to_x, to_y))
@@ -118,5 +118,5 @@ class TipPlace(SettingsGroup):
 
 
 def direction(name: str) -> int:
-    """Return what Studio calls "up" or "down"."""
+    """Return Studio's number for "up" or "down"."""
     return _UPWARD if name == names.UP else _DOWNWARD

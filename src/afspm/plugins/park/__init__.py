@@ -1,4 +1,15 @@
-"""Park, over SmartScan's SmartRemote. See the README beside this."""
+"""Driver of Park microscopes, over SmartScan's SmartRemote. See the README in this folder.
+
+**Theory of operation.** Every request is a JavaScript expression in JSON-RPC over ZeroMQ (`link`), wrapped so that it
+returns its own error. Each long script has a connection of its own (`session`). Several answers of SmartScan are
+unconfirmed: the driver accepts each plausible form, and refuses unknown words instead of guessing.
+
+    comes in      replies; new TIFF files below SmartScan's base folder, one for each channel and direction
+    state         the running and the ended measurement, the position where the tip was sent: persistent; the running
+                  long script (`activity`)
+    goes out      expressions; scans and curves from files
+    always holds  a reply of unknown form ends the connection; the files of a scan are taken once no more appear
+"""
 
 from __future__ import annotations
 
@@ -7,6 +18,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Final
 
 from afspm.basics.errors import ConfigError, Refused
+from afspm.basics.formatting import lengths_text
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, Length, PollPeriod
 from afspm.model import ControlResponse, Region, Scan, ScopeState, ScopeStatus, Spectrum, names
@@ -31,12 +43,12 @@ class Park(Driver):
     """The microscope behind SmartScan.
 
     Args:
-        address: of SmartRemote, e.g. "tcp://192.168.0.10:5581".
-        data_dir: where SmartScan's base folder of data is seen from here; left out: SmartScan runs on this computer.
-        lift: how far the stage moves away from the sample after the scanner has, to withdraw the tip; 0: not at all.
-        scanning_words, idle_words: further words by which SmartScan says whether it scans.
-        reply_timeout_s: how long a reply may take, in real time.
-        poll_period_s, common: as for every microscope.
+        address: address of SmartRemote, e.g. "tcp://192.168.0.10:5581".
+        data_dir: local path of SmartScan's base folder of data. Default: SmartScan runs on this computer.
+        lift: distance that the stage withdraws after the scanner in `x-retract`; 0: the stage does not move.
+        scanning_words, idle_words: further words in SmartScan's answers for scanning and idle.
+        reply_timeout_s: longest wait for a reply, real time.
+        poll_period_s, common: settings of every driver.
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
@@ -60,14 +72,20 @@ class Park(Driver):
     ) -> None:
         super().__init__(poll_period_s=poll_period_s, **common)
         if lift < 0.0:
-            raise ConfigError(f"{lift} m would move the tip to the sample", where="lift", hint="0 or more")
+            raise ConfigError(
+                f"a lift of {lengths_text([lift])} would move the tip to the sample", where="lift", hint="0 or more"
+            )
         self.controller_at = address
         self._data_dir, self._lift_m, self._reply_timeout_s = data_dir, lift, reply_timeout_s
         self._scanning = _SCANNING | {word.casefold() for word in scanning_words}
         self._idle = _IDLE | {word.casefold() for word in idle_words}
         both = self._scanning & self._idle
         if both:
-            raise ConfigError(f"{', '.join(sorted(both))} would mean both", where="idle_words", hint="take one away")
+            raise ConfigError(
+                f"{', '.join(sorted(both))} would mean both scanning and idle",
+                where="idle_words",
+                hint="remove them from one list",
+            )
         self._session: Session | None = None
         self._activity: SmartScanActivity | None = None
         self._place = TipPlace(self._smartscan, self._begun)
@@ -84,16 +102,17 @@ class Park(Driver):
         self.close()
         session = self._session = Session(self._open_link, self._scanning, self._idle)
         self.prove()
+        # Another SmartScan may answer after a reconnection: start from the complete table.
         self.table = self._whole_table
-        if not self._gains.are_told():
-            self.log.warning("SmartScan does not tell the gains of its feedback: they are not supported")
+        if not self._gains.are_reported():
+            self.log.warning("SmartScan does not report the gains of its feedback: they are not supported")
             self.table = self.table.without(Gains.names)
         for group in (self._kept, self._place):
             group.kept_in(self.memory)
         folder = self._folder()
         if not folder.is_dir():
-            told = f"SmartScan's folder of data {folder} does not exist on this computer"
-            raise ConfigError(told, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
+            problem = f"SmartScan's folder of data {folder} does not exist on this computer"
+            raise ConfigError(problem, where="data_dir", hint='data_dir = "/where/it/is/mounted"')
         self._files = ParkFiles(self.memory, self.log, self.clock.monotonic_s)
         self._activity = SmartScanActivity(
             session, self._files, self._folder, self._frame_in_force, self.clock, self.log
@@ -117,7 +136,7 @@ class Park(Driver):
         self._smartscan().put(values)
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return values of the table, all by one question."""
+        """Return values of the parameter table, all with one request."""
         rows = [self.table[name] for name in wanted if name != names.CONTROLLER]
         values = self._smartscan().values([row.vendor for row in rows]) if rows else {}
         found = {row.name: row.from_vendor(values[row.vendor]) for row in rows}
@@ -143,7 +162,7 @@ class Park(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a curve of the kind `x-spec-kind` where the tip was sent, as it is set in SmartScan."""
+        """Take a curve of the kind `x-spec-kind` where the tip was sent, with SmartScan's settings."""
         self._doing.start_curve(str(self._kept[names.SPEC_KIND]), self._place.xy_m())
 
     @action(names.STOP_SPEC)
@@ -153,16 +172,16 @@ class Park(Driver):
 
     @action(names.RETRACT, state=ScopeState.COARSE_MOTOR)
     def retract(self) -> None:
-        """Withdraw the tip, whatever is going on: the scanner, and then the stage by `lift`, if one is set."""
+        """Stop everything and withdraw the tip: by the scanner, then by the stage if `lift` is set."""
         self._doing.withdraw(self._lift_m / MICROMETRE)
 
     @action(names.ENGAGE, state=ScopeState.COARSE_MOTOR)
     def engage(self) -> None:
-        """Bring the tip to the sample: SmartScan's quick and safe approach."""
+        """Bring the tip to the sample by SmartScan's quick and safe approach."""
         self._doing.approach()
 
     def command(self, text: str) -> None:
-        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`; one that takes long keeps it busy."""
+        """Evaluate an expression, e.g. `spm.ncm.sweepAutoFullRange()`. A long one keeps the microscope busy."""
         try:
             self._doing.evaluate(text)
         except SmartScanError as error:
@@ -187,5 +206,4 @@ class Park(Driver):
         return frame(self.in_force(FRAME))[0]
 
     def _folder(self) -> Path:
-        """The folder of SmartScan's files, as seen from here."""
         return Path(self._data_dir or str(self._smartscan().values([_FOLDER])[_FOLDER]))

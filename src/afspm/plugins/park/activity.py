@@ -1,4 +1,4 @@
-"""The state of SmartScan, and what is awaited of it."""
+"""State of SmartScan, and the measurements that wait for their end."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from afspm.translator.result_files import SCAN, XY, as_list
 
 START, STOP, STOP_CURVE = "scan.triggerImageScan()", "scan.stop()", "spect.stop()"
 CURVES: Final = {"force": "fd", "IV": "iv"}
-"""Kinds of curves, and what SmartScan calls them."""
+"""Kinds of curves, with SmartScan's names."""
 APPROACH: Final = '(spm.approach.start("q+s"), 0)'
 _ENDED_FIRST: Final = ("scan.stop", "spect.stop", "approach.stop")
 _STATES: Final = {MOVE: ScopeState.MOVING, **dict.fromkeys(CURVES, ScopeState.SPEC)}
 _ANSWERS_S: Final = 0.5
-"""So long, in real time, an expression may take before it counts as one that takes long: an error has come by then."""
+"""Real time after which an expression counts as a long one; an error arrives earlier."""
 
 
 class SmartScanActivity(Activity):
-    """The measurement or move that runs, begun by a request or at SmartScan's panel.
+    """The running measurement or move, started by a request or at SmartScan's panel.
 
     Args:
-        folder: gives the folder of SmartScan's files as seen from here.
-        frame_in_force: as it was set.
+        folder: returns the local path of SmartScan's files.
+        frame_in_force: returns the frame as it was set.
     """
 
     program: ClassVar[str] = "SmartScan"
@@ -56,13 +56,15 @@ class SmartScanActivity(Activity):
         self._curve_at: XY = (0.0, 0.0)
 
     def status(self) -> ScopeStatus:
-        """Return what it is doing now; what has ended is awaited from here on."""
+        """Return the present state; register measurements that have ended, whose files are then awaited."""
         call = self._running_call()
-        curve = call is not None and call.what in CURVES  # it may count as a scan, too (!)
+        curve = call is not None and call.what in CURVES  # scan_query may report a curve as a scan (!)
         scanning = not curve and self._session.scanning()
         if self._stopping and curve:
             with suppress(Refused):
-                self._session.do(STOP_CURVE)  # the first may have overtaken the script, which has another connection
+                self._session.do(
+                    STOP_CURVE
+                )  # again: the first stop may have overtaken the start, on another connection
         if scanning:
             self.follow(self._files.what or SCAN)
             return ScopeStatus(ScopeState.SCANNING)
@@ -80,25 +82,25 @@ class SmartScanActivity(Activity):
         self._files.end(self._clock.now_ns())
 
     def start_scan(self) -> None:
-        """Scan the frame. Raises Refused: SmartScan does not."""
+        """Scan the frame. Raises Refused: SmartScan reports an error, or no scan is seen."""
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
 
     def start_curve(self, kind: str, place_m: XY) -> None:
-        """Take a curve where the tip was sent: after a scan, it goes there first."""
+        """Take a curve where the tip was sent; the tip moves there first, as a scan moves it."""
         self._stopping = False
+        # The scanner is where the scan has left it: the curve needs a move first.
         self.watch(self._session.begin(kind, way_to(place_m)))
         self.curve_awaited, self._curve_at = kind, place_m
 
     def approach(self) -> None:
-        """Bring the tip to the sample."""
         self.watch(self._session.begin("approach", APPROACH))
 
     def evaluate(self, expression: str) -> None:
-        """Evaluate an expression; one that has no value soon keeps the microscope busy. Raises SmartScanError."""
+        """Evaluate an expression; one without a value after 0.5 s keeps the microscope busy. Raises SmartScanError."""
         call = self._session.begin("command", f"({expression}, 0)", _ANSWERS_S)
         try:
             goes_on = call.running()
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             call.close()
             raise
         if goes_on:
@@ -107,7 +109,7 @@ class SmartScanActivity(Activity):
             call.close()
 
     def withdraw(self, lift_um: float) -> None:
-        """Take the tip away, whatever is going on: the scanner first, and then the stage."""
+        """Stop everything and withdraw the tip: by the scanner, then by the stage."""
         self.stopped()
         self.close()
         ended = " ".join(f"try {{ spm.{one}(); }} catch (ignored) {{}}" for one in _ENDED_FIRST)
@@ -119,15 +121,16 @@ class SmartScanActivity(Activity):
         super().watch(call)
 
     def stopped(self) -> None:
-        """Note that a request has stopped what is running: nothing comes of it, but a tip on its way goes on."""
+        """Register a stop: the running measurement has no result. A move of the tip continues."""
         if self.call is not None and self.curve_awaited:
+            # The script of a move can't be stopped: the tip is busy until it arrives.
             self.call.what = MOVE
         super().stopped()
 
     # --- inside ---
 
     def _running_call(self) -> LongCall | None:
-        """Return the script that takes long, while it does; the curve follows the way to it. Raises ControllerLost."""
+        # The move to a curve and the curve are two scripts: the curve starts when the move has ended.
         call = self.watched_call()
         if call is None and self.curve_awaited:
             kind, self.curve_awaited = self.curve_awaited, ""

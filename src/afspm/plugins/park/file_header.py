@@ -1,6 +1,6 @@
-"""The layout of Park's TIFF files: private tags, and in them a header of an image, and one of curves.
+"""Layout of Park's TIFF files: private tags that contain a header of an image, or of curves.
 
-From pspylib 0.1.2, the maker's own reader; that of images against Gwyddion, too, and that of curves against AtomicJ.
+From pspylib 0.1.2, the maker's own reader; images were compared with Gwyddion, curves with AtomicJ.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 MAGIC: Final = 0x0E031301
 VERSIONS: Final = {0x1000001: 356, 0x1000002: 580}
-"""The shortest header of each version."""
+"""Shortest header by version, in bytes."""
 MAGIC_TAG, VERSION_TAG, DATA_TAG, HEADER_TAG = 50432, 50433, 50434, 50435
 CURVES_TAG, CURVES_DATA_TAG = 50438, 50439
 DATE_TAG: Final = 306
@@ -35,7 +35,7 @@ HEADER: Final = np.dtype(
     + [("z_gain", "<f8"), ("z_range", "<f8"), ("xy_voltage", "V16"), ("z_voltage", "V16"), ("xy_servo", "V16")]
     + [("numbers", "<u4")]
 )
-"""The beginning of a header; the first version ends before `z_gain`, and its numbers are of the first kind."""
+"""Beginning of a header. The first version ends before `z_gain`, and its numbers are <i2."""
 
 CHANNELS: Final = 8
 CURVE_KINDS: Final = {1: "indentation", 2: "force", 3: "IV", 4: "indentation", 5: "photo-current"} | {
@@ -44,7 +44,7 @@ CURVE_KINDS: Final = {1: "indentation", 2: "force", 3: "IV", 4: "indentation", 5
     8: "AD",
     9: "PE",
 }
-"""By number; 0 is force and IV in older files."""
+"""Kinds of curves by number; older files have 0 for force and IV."""
 _CHANNEL: Final = np.dtype([("name", "V64"), ("unit", "V16"), ("gain", "<f8"), ("is_x", "<i4"), ("is_y", "<i4")])
 CURVES: Final = np.dtype(
     [("channels", _CHANNEL, CHANNELS), ("channel_count", "<i4"), ("average", "<i4"), ("numbers_each", "<i4")]
@@ -59,16 +59,16 @@ CURVES: Final = np.dtype(
     + [("of_kind", "<f4", 13), ("numbers", "<i4"), ("setpoint", "<f4"), ("setpoint_unit", "<f4"), ("unused", "<i4", 22)]
 )
 OLD_CURVES: Final = CURVES.fields["grid_columns"][1] if CURVES.fields else 0
-"""So long is an older header of curves at least; the points follow the newer."""
+"""Shortest header of curves, in older files, in bytes; points follow the newer header only."""
 POINT: Final = np.dtype([("x_um", "<f4"), ("y_um", "<f4"), ("time_s", "<f4")])
 
 
 def text(raw: np.void) -> str:
-    """Return a text of a header: two bytes a character, and zeros behind it."""
+    """Return a text of a header: two bytes a character, padded with zeros."""
     return raw.tobytes().decode("utf-16-le", "replace").partition("\0")[0].strip()
 
 
 def in_si(unit: str) -> tuple[str, float]:
-    """Return the unit without its prefix, and what to multiply with."""
+    """Return the unit without its prefix, and the prefix as a factor."""
     found = _UNIT.fullmatch(unit)
     return (found[2], _PREFIX[found[1]]) if found else (unit, 1.0)

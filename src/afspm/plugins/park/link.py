@@ -1,4 +1,4 @@
-"""The connection to SmartScan: JSON-RPC over ZeroMQ, and scripts whose outcome is told in a form of our own."""
+"""Connection to SmartScan: JSON-RPC over ZeroMQ, with scripts that return their outcome in a form of afspm's own."""
 
 from __future__ import annotations
 
@@ -31,46 +31,47 @@ OK, ERROR = "ok", "error"
 
 
 class SmartScanError(AfspmError):
-    """SmartScan could not run a script: its own words."""
+    """SmartScan reports an error of a script, with its own text."""
 
     code = "park-error"
 
 
 class Link:
-    """One connection. For one thread. Raises ControllerLost: nobody listens there. ConfigError: it is no address."""
+    """One connection for one thread. Raises ControllerLost: no connection. ConfigError: malformed address."""
 
     def __init__(self, address: str, timeout_s: float, monotonic_s: Callable[[], float]) -> None:
         self._address = address
         self._connection = ZmqConnection(address, timeout_s, monotonic_s, _HINTS)
 
     def ask(self, method: str) -> Any:
-        """Return the result of a method without parameters. Raises SmartScanError, ControllerLost."""
+        """Call a method without parameters; return its result. Raises SmartScanError, ControllerLost."""
         return self._connection.ask(method, _request(method, _NO_PARAMETERS), _fields)["result"]
 
     def run(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript.
+        """Evaluate a JavaScript expression; return its value.
 
         Raises:
-            SmartScanError: it failed. ControllerLost: no reply, or none to be trusted; the connection is closed.
+            SmartScanError: it failed. ControllerLost: no reply, or an untrustworthy one; the connection is closed.
         """
         reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
+        # `wrapped` always returns a text: without one the script did not run to its end.
         if not reply.get("value"):
             raise self._bad(f"SmartScan gave no value of {shown(expression)}")
         return self._outcome(reply)
 
     def begin(self, expression: str) -> None:
-        """Have a script run that takes its time. Raises ControllerLost."""
+        """Start a long script. Raises ControllerLost."""
         self._connection.begin(shown(expression), _request(RUN_SCRIPT, wrapped(expression)))
 
     def wait(self, within_s: float) -> None:
-        """Wait for the reply to `begin`, in real time. Raises ControllerLost."""
+        """Wait for the reply to `begin`, at most `within_s` of real time. Raises ControllerLost."""
         self._connection.wait(within_s)
 
     def reply(self, what: str) -> tuple[bool, Any]:
-        """Return whether a reply has come to what was begun, and the value in it, None if it has none.
+        """Return whether the reply has arrived, and its value, None without one.
 
         Raises:
-            SmartScanError: it failed. ControllerLost.
+            SmartScanError: the script failed. ControllerLost.
         """
         raw = self._connection.reply(what)
         if raw is None:
@@ -79,28 +80,29 @@ class Link:
         return True, self._outcome(reply) if reply.get("value") else None
 
     def close(self) -> None:
-        """Let go of it."""
         self._connection.close()
 
     def _outcome(self, reply: Plain) -> Any:
         value = reply.get("value")
         try:
-            told = json.loads(value) if isinstance(value, str) else value
+            outcome = json.loads(value) if isinstance(value, str) else value
         except ValueError:
-            told = None
-        if not isinstance(told, dict) or len(told) != 1 or not told.keys() & {OK, ERROR}:
+            outcome = None
+        if not isinstance(outcome, dict) or len(outcome) != 1 or not outcome.keys() & {OK, ERROR}:
             raise self._bad(f"SmartScan replied {reply} to a script")
-        if ERROR in told:
-            raise SmartScanError(str(told[ERROR]))
-        return told[OK]
+        if ERROR in outcome:
+            raise SmartScanError(str(outcome[ERROR]))
+        return outcome[OK]
 
-    def _bad(self, told: str) -> ControllerLost:
+    def _bad(self, problem: str) -> ControllerLost:
         self.close()
-        return ControllerLost(told, where=self._address, hint="afspm does not understand it: report it, with a trace")
+        return ControllerLost(
+            problem, where=self._address, hint="afspm does not understand it: report it, with a trace"
+        )
 
 
 def wrapped(expression: str) -> str:
-    """Return a line whose value says whether the expression failed: SmartScan's own way to say so is not known."""
+    """Return a script whose value reports if the expression failed: SmartScan's own form of errors is unconfirmed."""
     ok, error = f'JSON.stringify({{"{OK}": ({expression})}})', f'JSON.stringify({{"{ERROR}": String(e)}})'
     return f"(function() {{ try {{ return {ok}; }} catch (e) {{ return {error}; }} }})()"
 
@@ -110,15 +112,15 @@ def shown(script: str) -> str:
     return script if len(script) <= _SHOWN else f"{script[:_SHOWN]}…"
 
 
-def numbers(told: object, count: int) -> list[float]:
-    """Return so many finite numbers, of a list or of a text with commas. Raises ControllerLost."""
-    parts = told.split(",") if isinstance(told, str) else told
+def numbers(reply: object, count: int) -> list[float]:
+    """Return `count` finite numbers of a list, or of a text with commas. Raises ControllerLost."""
+    parts = reply.split(",") if isinstance(reply, str) else reply
     try:
         found = [float(one) for one in parts] if isinstance(parts, list) else []
     except (TypeError, ValueError):
         found = []
     if len(found) != count or not all(map(math.isfinite, found)):
-        raise ControllerLost(f"SmartScan replied {told!r} instead of {count} numbers")
+        raise ControllerLost(f"SmartScan replied {reply!r} instead of {count} numbers")
     return found
 
 
@@ -127,7 +129,6 @@ def _request(method: str, parameters: str) -> bytes:
 
 
 def _fields(raw: bytes) -> Plain:
-    """Return a reply. Raises SmartScanError: it is an error. ControllerLost: it is none."""
     try:
         reply = json.loads(raw)
     except ValueError as error:
@@ -135,8 +136,8 @@ def _fields(raw: bytes) -> Plain:
     if not isinstance(reply, dict):
         raise ControllerLost(f"a reply that is not JSON-RPC: {raw[:_SHOWN]!r}")
     if reply.get("error"):
-        told = reply["error"]
-        raise SmartScanError(str(told.get("message", told) if isinstance(told, dict) else told))
+        failure = reply["error"]
+        raise SmartScanError(str(failure.get("message", failure) if isinstance(failure, dict) else failure))
     if "result" not in reply:
         raise ControllerLost(f"a reply without a result: {raw[:_SHOWN]!r}")
     return reply

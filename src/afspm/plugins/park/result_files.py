@@ -1,4 +1,4 @@
-"""SmartScan's files: of one scan, a TIFF for each channel and direction; of a curve, one."""
+"""SmartScan's files: a TIFF for each channel and direction of a scan, one for a curve."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from afspm.translator.folder_files import FolderFiles
 from afspm.translator.result_files import Entry, FilePrecision, modified_ns
 
 SETTLE_S: Final = 1.0
-"""So long, in real time, no other file may have come before a scan's are taken: how many there will be is not known."""
+"""Real time without a new file before a scan counts as complete: the number of its files is unknown."""
 
 
 class ParkFiles(FolderFiles):
-    """The files of the measurement that is running or has just ended, and the results.
+    """The files of the running or just ended measurement, and the results.
 
     Args:
-        monotonic_s: real time.
+        monotonic_s: returns real time.
     """
 
     pattern = "**/*.tif*"
@@ -31,8 +31,9 @@ class ParkFiles(FolderFiles):
         self._seen: tuple[list[tuple[str, int]], float] = ([], 0.0)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return all new files, once no more come."""
+        """Return all new files once no more appear; before that an empty list."""
         listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
+        # By time and not by name: SmartScan's names can be chosen freely.
         files = sorted(one for one in listed if one[1] > measured["newest_ns"])
         now_s = self._monotonic_s()
         if files != self._seen[0]:

@@ -1,9 +1,10 @@
-"""Park's TIFF files: one channel of a scan in one direction each, or curves.
+"""Park's TIFF files: each has one channel of a scan in one direction, or curves.
 
-Of images, rows ascend, lengths are in micrometres, and a value is gain · (number · scale + offset) in a unit of its
-own. Offsets are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored
-(!). Of curves, the numbers lie channel by channel, in each both ways one after the other; a value is gain · number, as
-pspylib and AtomicJ have it. Places are taken as those of the scanner, in micrometres (!).
+Images: rows ascend, lengths are in µm, and a value is gain · (number · scale + offset) in a unit of its own. Offsets
+are taken as the centre of the frame, a rotation as counter-clockwise, and backward lines as not mirrored (!).
+
+Curves: the numbers of a channel follow each other, forward and then backward; a value is gain · number, as in pspylib
+and AtomicJ. Positions are taken as those of the scanner, in µm (!).
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ Tags = dict[int, Any]
 
 
 def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
-    """The image or the curves of a file. Raises FileError: not whole, or another kind of TIFF."""
+    """Read the image or the curves of a file. Raises FileError: damaged, or another kind of TIFF."""
     tags = _tags(path)
     version, raw = int(tags.get(VERSION_TAG, 0)), bytes(tags.get(HEADER_TAG, b""))
     if tags.get(MAGIC_TAG) != MAGIC:
@@ -61,13 +62,13 @@ def read_tiff(path: Path, zone: tzinfo | None) -> FileContent:
     if kind not in (IMAGE, SPECTROSCOPY):
         raise FileError("holds a line; afspm reads Park's images and curves")
     newer = version == max(VERSIONS)
-    told = {name: _plain(header[name]) for name in HEADER.names or ()}
+    fields = {name: _plain(header[name]) for name in HEADER.names or ()}
     date = str(tags.get(DATE_TAG, "")).strip("\0 ")
     return FileContent(
         f"Park {text(header['mode'])}".strip(),
         scans=(_scan(header, tags, path, newer=newer),) if kind == IMAGE else (),
         spectra=_curves(tags, path, newer=newer) if kind == SPECTROSCOPY else (),
-        header=told,
+        header=fields,
         start_ns=local_ns(date, _DATE, zone) if date else None,
         upwards=bool(header["upwards"]) if kind == IMAGE else None,
     )
@@ -83,6 +84,7 @@ def _tags(path: Path) -> Tags:
             tags = dict(image.tag_v2)
     except UnidentifiedImageError as error:
         raise FileError("is not a TIFF") from error
+    # Pillow reads the tags only, and does not notice a truncated picture.
     ends = [at + size for at, size in zip(tags.get(STRIPS, ()), tags.get(STRIP_SIZES, ()), strict=True)]
     if max(ends, default=0) > path.stat().st_size:
         raise FileError("ends within the picture")
@@ -95,6 +97,7 @@ def _scan(header: np.void, tags: Tags, path: Path, *, newer: bool) -> Scan:
     shape = int(header["rows"]), int(header["columns"])
     numbers = _numbers(tags, DATA_TAG, header, shape, newer=newer)
     unit, factor = in_si(text(header["unit"]) or "um")
+    # A scale of 0 is unset.
     scale = float(header["scale"]) or 1.0
     values = factor * float(header["gain"]) * (numbers * scale + float(header["offset"]))
     size = (abs(float(header["width_um"])) * MICROMETRE, abs(float(header["height_um"])) * MICROMETRE)
@@ -128,7 +131,7 @@ def _curves(tags: Tags, path: Path, *, newer: bool) -> tuple[Spectrum, ...]:
 
 
 def _places(raw: bytes, count: int) -> list[XY | None]:
-    """Return where each curve was taken; None: that is not told."""
+    # Files may lack the positions of their curves.
     if len(raw) < count * POINT.itemsize:
         return [None] * count
     points = np.frombuffer(raw, POINT, count)
@@ -139,6 +142,7 @@ def _places(raw: bytes, count: int) -> list[XY | None]:
 def _numbers(
     tags: Tags, tag: int, header: np.void, shape: tuple[int, ...], *, newer: bool
 ) -> np.ndarray[Any, np.dtype[np.float64]]:
+    # The first version of the format has 16-bit integers only.
     data, number = bytes(tags.get(tag, b"")), int(header["numbers"]) if newer else 0
     if number not in NUMBERS:
         raise FileError(f"has numbers of kind {number}, which afspm does not know")

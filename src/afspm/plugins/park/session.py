@@ -1,4 +1,4 @@
-"""A connected SmartScan: its values, its commands, and whether it scans."""
+"""A connected SmartScan: its values, its commands, and the state of its scan."""
 
 from __future__ import annotations
 
@@ -27,35 +27,36 @@ _GEOMETRY: Final = ("pixelHeight", "pixelWidth", "width", "height", "offsetX", "
 
 
 class Session:
-    """SmartScan over one connection; what takes long has another. For one thread.
+    """SmartScan over one connection, with a further one for each long script; for one thread.
 
     Args:
-        open_link: gives a new connection.
-        scanning, idle: the words of `scan_query`, in small letters.
+        open_link: opens a new connection.
+        scanning, idle: words of `scan_query`, in lower case.
     """
 
     def __init__(self, open_link: Callable[[], Link], scanning: Collection[str], idle: Collection[str]) -> None:
         self._open_link, self._scanning, self._idle = open_link, scanning, idle
         self._link = open_link()
         try:
+            # An unknown word in an answer must show now, not during the first scan.
             self._link.ask(IS_CONNECTED)
             self.scanning()
         except SmartScanError as error:
             self._link.close()
             raise ControllerLost(f"SmartScan is not ready: {error}") from error
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             self._link.close()
             raise
 
     def values(self, paths: Sequence[str]) -> dict[str, Value]:
-        """Return values by their paths below `spm`. Raises Refused: there is none. ControllerLost: one is no value."""
+        """Return values by path below `spm`. Raises Refused: unknown path. ControllerLost: not a plain value."""
         try:
-            told = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
+            found = self._link.run(f"[{', '.join(f'spm.{path}' for path in paths)}]")
         except SmartScanError as error:
             raise Refused(ControlResponse.PARAM_ERROR, f"SmartScan refused {', '.join(paths)}: {error}") from error
-        if not isinstance(told, list) or len(told) != len(paths) or not all(map(_is_value, told)):
-            raise ControllerLost(f"SmartScan replied {told} for {', '.join(paths)}")
-        return dict(zip(paths, told, strict=True))
+        if not isinstance(found, list) or len(found) != len(paths) or not all(map(_is_value, found)):
+            raise ControllerLost(f"SmartScan replied {found} for {', '.join(paths)}")
+        return dict(zip(paths, found, strict=True))
 
     def is_number(self, path: str) -> bool:
         """Return True if there is a number at a path below `spm`. Raises ControllerLost."""
@@ -65,58 +66,59 @@ class Session:
             return False
 
     def put(self, values: Mapping[str, Value]) -> None:
-        """Set values by their paths below `spm`. Raises Refused: SmartScan does not take one."""
+        """Set values by path below `spm`. Raises Refused: SmartScan rejects one of them."""
         given = ", ".join(f"spm.{path} = {json.dumps(value)}" for path, value in values.items())
         self._do(given, ", ".join(values), ControlResponse.PARAM_ERROR)
 
     def put_members(self, path: str, members: Mapping[str, Value]) -> None:
-        """Set members of a value that is an object, which is set as a whole only. Raises Refused."""
+        """Set members of an object, which SmartScan accepts only as a whole. Raises Refused."""
+        # SmartScan's gains are one object: setting a member alone has no effect.
         given = "".join(f"all[{json.dumps(name)}] = {json.dumps(value)}; " for name, value in members.items())
         changed = f"spm.{path} = (function (all) {{ {given}return all; }})(spm.{path})"
         self._do(changed, path, ControlResponse.PARAM_ERROR)
 
     def do(self, command: str) -> None:
-        """Call a command, e.g. "scan.stop()". Raises Refused: SmartScan would not."""
+        """Call a command, e.g. "scan.stop()". Raises Refused: SmartScan reports an error."""
         self._do(f"spm.{command}", command, ControlResponse.ACTION_ERROR)
 
     def run(self, expression: str) -> object:
-        """Return the value of an expression. Raises SmartScanError, ControllerLost."""
+        """Evaluate an expression; return its value. Raises SmartScanError, ControllerLost."""
         return self._link.run(expression)
 
     def geometry(self) -> dict[str, float]:
-        """Return the frame, in micrometres and degrees. Raises ControllerLost."""
+        """Return the frame, in µm and degrees. Raises ControllerLost."""
         return dict(zip(_GEOMETRY, numbers(self._asked(GEOMETRY), len(_GEOMETRY)), strict=True))
 
     def set_geometry(self, wanted: Mapping[str, float]) -> None:
-        """Set the frame. Raises Refused."""
+        """Set the frame, in µm and degrees. Raises Refused."""
         self._do(f"spm.scan.setScanGeometry({json.dumps(dict(wanted))})", "the frame", ControlResponse.PARAM_ERROR)
 
     def scanning(self) -> bool:
-        """Return whether a scan runs. Raises ControllerLost: SmartScan says neither."""
-        hint = "watch what it says while it scans and while it does not, and set scanning_words and idle_words"
+        """Return True while a scan runs. Raises ControllerLost: unknown word in the answer."""
+        hint = "note its answers during a scan and without one, and set scanning_words and idle_words"
         return self._word(SCAN_STATUS, self._scanning, self._idle, hint)
 
     def script_runs(self) -> bool:
-        """Return whether a script runs. Raises ControllerLost: SmartScan says neither."""
+        """Return True while a script runs. Raises ControllerLost: unknown word in the answer."""
         return self._word(SCRIPT_RUNS, TRUE, FALSE, "report it, with a trace")
 
     def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
-        """Begin what takes long, on a connection of its own, and wait a little for a reply. Raises ControllerLost.
+        """Start a long script on a connection of its own; wait up to `wait_s` for its reply. Raises ControllerLost.
 
-        Whether its reply comes at its end, or at once and without a value, is not known: in the second case SmartScan
-        is asked whether a script runs.
+        It is unconfirmed if a reply arrives at the end of a script, or at once and without a value. In the second case
+        SmartScan is polled for the end.
         """
         link = self._open_link()
         try:
             link.begin(expression)
             link.wait(wait_s)
-        except BaseException:
+        except BaseException:  # Ctrl-C, too: nothing else closes this connection
             link.close()
             raise
+        # A value of None means that SmartScan has replied before the end of the script.
         return LongCall(what, link, lambda value: value is None and self.script_runs())
 
     def close(self) -> None:
-        """Let go of it."""
         self._link.close()
 
     # --- inside ---
@@ -134,12 +136,12 @@ class Session:
             raise ControllerLost(f"SmartScan does not answer {method}: {error}") from error
 
     def _word(self, method: str, yes: Collection[str], no: Collection[str], hint: str) -> bool:
-        told = str(self._asked(method)).strip().casefold()
-        if told not in yes and told not in no:
+        found = str(self._asked(method)).strip().casefold()
+        if found not in yes and found not in no:
             known = ", ".join(sorted({*yes, *no}))
-            raise ControllerLost(f"SmartScan replied {told!r} to {method}, and not one of {known}", hint=hint)
-        return told in yes
+            raise ControllerLost(f"SmartScan replied {found!r} to {method}, and not one of {known}", hint=hint)
+        return found in yes
 
 
-def _is_value(told: object) -> bool:
-    return isinstance(told, bool | int | str) or (isinstance(told, float) and math.isfinite(told))
+def _is_value(found: object) -> bool:
+    return isinstance(found, bool | int | str) or (isinstance(found, float) and math.isfinite(found))

@@ -1,7 +1,7 @@
-"""The frame, the speed, the gains and the place of the tip as SmartScan has them, and as everybody else.
+"""Frame, speed, gains and tip position: conversion between SmartScan's values and generic parameters.
 
-SmartScan has the centre of a frame in micrometres, its angle in degrees, and lines per second; a line is there and
-back (!).
+SmartScan has the centre of a frame in µm, its angle in degrees, and lines per second; a line is forward and backward
+(!).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _RATE: Final = "scan.rate"
 _GAIN: Final = "zservo.gain"
 _GAINS: Final = {names.ZCTRL_PGAIN: f"{_GAIN}.p", names.ZCTRL_IGAIN: f"{_GAIN}.i"}
 _SPEED_PATH: Final = 2.0
-"""Widths of the frame that the tip travels in a line."""
+"""Path of the tip in a line, in widths of the frame: forward and backward (!)."""
 
 
 class FrameSettings(SettingsGroup):
-    """The frame and the speed, which are set together as the speed is told by lines per second."""
+    """Frame and speed, set together since the speed depends on the width and the line rate."""
 
     names = frozenset({*FRAME, names.SCAN_SPEED})
 
@@ -49,7 +49,7 @@ class FrameSettings(SettingsGroup):
         region, (rows, columns) = frame(wanted)
         speed_m_s = float(wanted[names.SCAN_SPEED])
         if speed_m_s <= 0.0:
-            raise InvalidValue(f"a scan at {speed_m_s} m/s never ends")
+            raise InvalidValue(f"the scan speed must be above 0, not {speed_m_s:g} m/s")
         (x, y), (width, height) = region.center_m, region.size_m
         self._session().set_geometry(
             {
@@ -62,11 +62,12 @@ class FrameSettings(SettingsGroup):
                 "rotation": math.degrees(region.angle_rad),
             }
         )
+        # The line rate is not part of the geometry.
         self._session().put({_RATE: speed_m_s / (_SPEED_PATH * width)})
 
 
 class Gains(SettingsGroup):
-    """The gains of the feedback: two of the four members of one value, which may not be one to be read (!)."""
+    """The gains of the feedback: two of the four members of an object, which may be write-only (!)."""
 
     names = tuple(_GAINS)
 
@@ -74,11 +75,11 @@ class Gains(SettingsGroup):
         self._session = session
 
     def read(self) -> dict[str, Value]:
-        told = self._session().values(list(_GAINS.values()))
-        return {name: float(told[path]) for name, path in _GAINS.items()}
+        found = self._session().values(list(_GAINS.values()))
+        return {name: float(found[path]) for name, path in _GAINS.items()}
 
-    def are_told(self) -> bool:
-        """Return True if SmartScan tells them. Raises ControllerLost."""
+    def are_reported(self) -> bool:
+        """Return True if SmartScan reports the gains. Raises ControllerLost."""
         return all(map(self._session().is_number, _GAINS.values()))
 
     def write(self, values: Mapping[str, Value]) -> None:
@@ -88,7 +89,7 @@ class Gains(SettingsGroup):
 
 
 class TipPlace(KeptSettings):
-    """The place to which the tip was sent: SmartScan tells that of its stage alone (!)."""
+    """The position where the tip was sent: SmartScan reports its stage's position only (!)."""
 
     def __init__(self, session: Callable[[], Session], begun: Callable[[LongCall], None]) -> None:
         super().__init__(dict.fromkeys(POSITION, 0.0))
@@ -100,12 +101,12 @@ class TipPlace(KeptSettings):
         super().write(values)
 
     def xy_m(self) -> XY:
-        """Return where the tip was sent."""
+        """Return the position where the tip was sent, (x, y) in m."""
         x, y = map(self.number, POSITION)
         return x, y
 
 
 def way_to(place_m: XY) -> str:
-    """Return the script that leads the tip to a place."""
+    """Return the script that moves the tip to a position."""
     x, y = (length / MICROMETRE for length in place_m)
     return f"(spm.xyscanner.moveTo({x!r}, {y!r}), 0)"

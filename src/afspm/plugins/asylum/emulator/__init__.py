@@ -1,4 +1,4 @@
-"""An emulated Asylum Research microscope: Igor Pro with ZeroMQ-XOP and Asylum's functions, with simulated physics."""
+"""Emulated Asylum Research microscope: Igor Pro with ZeroMQ-XOP, Asylum's functions and simulated physics."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NOT_COMPILED, _ABORTED, _UNKNOWN = 100, 107, 1
 
 @dataclass(frozen=True)
 class DelayedMessage:
-    """A reply that is sent at a time."""
+    """A reply with the time at which it is sent."""
 
     client: bytes
     payload: bytes
@@ -35,16 +35,16 @@ class AsylumEmulator(Emulator):
     """The emulated microscope.
 
     Args:
-        idle_s: how often Igor gets round to what was asked, in real time; one call each time. 0: at once.
-        start_s: how long the ramp to the first line takes, experiment time.
-        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
-        save_path: what Igor calls the folder of the files, "C:Users:Me:Data:"; left out: what it is called here.
-        base_name: of the files.
-        procedures: what the user has included: "afspm" (afspm.ipf), "spots" (what an older afspm needs) or "none".
-        has_status: whether this release has ARGetStatus.
-        image_open: whether a window shows an image, on which spots are.
-        saves_partial: whether an image is saved that was broken off.
-        seed, faults, and all of the simulated world: as of every emulator.
+        idle_s: real seconds between two idle moments of Igor; one call is executed at each. 0: at once.
+        start_s: duration of the ramp to the first line, experiment time.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        save_path: Igor's name of the data folder, "C:Users:Me:Data:". Default: the folder's own path.
+        base_name: base name of the files.
+        procedures: included procedure files: "afspm" (afspm.ipf), "spots" (those of the published afspm) or "none".
+        has_status: True if this release has the function ARGetStatus.
+        image_open: True if a window shows an image with spots.
+        saves_partial: True if stopped images are saved.
+        seed, faults, and the simulated world: settings of every emulator.
     """
 
     vendor = "Asylum"
@@ -85,15 +85,14 @@ class AsylumEmulator(Emulator):
     ) -> None:
         super().__init__(**settings)
         if procedures not in PROCEDURES:
-            raise ConfigError(f"{procedures!r}", where="procedures", hint=" or ".join(PROCEDURES))
+            raise ConfigError(f"unknown procedures: {procedures!r}", where="procedures", hint=" or ".join(PROCEDURES))
         self._settings = AsylumSettings(
             idle_s, start_s, file_s, save_path, base_name, procedures, has_status, image_open, saves_partial
         )
 
     def open(self) -> str:
-        """Bind the XOP's socket."""
         self._server = XopServer(self.port, self.woken, self.log)
-        # "C:Users:Me:"; where there are no drives it begins with a colon
+        # Igor's form "C:Users:Me:"; on a system without drive letters the path starts with a colon
         path = self._settings.save_path or f"{self.folder.drive.rstrip(':')}:{':'.join(self.folder.parts[1:])}:"
         texts = {"SaveImage": path, "SaveForce": path, "BaseName": self._settings.base_name}
         values = IgorValues(texts)
@@ -110,11 +109,11 @@ class AsylumEmulator(Emulator):
         return f"tcp://{LOOPBACK}:{self._server.port}"
 
     def functions(self) -> dict[str, wire.IgorFunction]:
-        """Return the functions that a client may call, by name in lower case."""
+        """Return the callable functions by lower-case name, since Igor ignores case."""
         return AsylumFunctions(self.controller, self.clock.now_s, self._settings).table()
 
     def serve(self, timeout_s: float) -> None:
-        """Take requests, and do one of what was asked if Igor is idle."""
+        """Receive requests; execute one queued call if Igor is idle."""
         if self._server.queue and not self._busy():
             timeout_s = min(timeout_s, max(0.0, self._idle_at_s - self.clock.monotonic_s()))
         self._server.poll(timeout_s, locked=self._locked())
@@ -124,9 +123,8 @@ class AsylumEmulator(Emulator):
             self.controller.advance(self.clock.now_s())
 
     def tick(self, now_s: float) -> float | None:
-        """Advance Asylum's software, and send delayed replies."""
         if not self._locked():
-            self.take_button_away()  # of a dialog that lasted for a while
+            self.take_button_away()  # the dialog's time is over
         while self._delayed and self._delayed[0].at_s <= now_s:
             delayed = self._delayed.popleft()
             self._server.send(delayed.client, delayed.payload)
@@ -143,12 +141,11 @@ class AsylumEmulator(Emulator):
         return min((at_s for at_s in times if at_s is not None and at_s > now_s), default=None)
 
     def abandon(self) -> None:
-        """Give up the scan or curve, too, that the software thinks is running."""
+        """Also stop the scan or curve whose state Asylum's panels show as running."""
         super().abandon()
         self.controller.abandon()
 
     def close(self) -> None:
-        """Listen no more."""
         if hasattr(self, "_server"):
             self._server.close()
 
@@ -161,7 +158,6 @@ class AsylumEmulator(Emulator):
         return self._locked() or self.faults.lasts("busy", self.clock.now_s())
 
     def _carry_out(self, queued: QueuedCall) -> None:
-        """Call the function, and reply."""
         now_s = self.clock.now_s()
         if self.faults.strikes("crash", now_s):
             raise Crashed(f"at {queued.call.name}")
@@ -197,7 +193,7 @@ class AsylumEmulator(Emulator):
         except DialogOpen as dialog:
             self._open_dialog(str(dialog), math.inf)
             given = dialog.result
-        except Exception as error:  # whatever a client asks for, Igor stays
+        except Exception as error:  # any error of a function aborts the call only: Igor goes on
             if not isinstance(error, AfspmError):
                 self.log.exception("%s was aborted", call.name)
             raise wire.CallFailed(_ABORTED, f"While executing {call.name} an error occurred: {error}") from error
@@ -205,19 +201,17 @@ class AsylumEmulator(Emulator):
             given += "\udcb0"
         return wire.success(function, given, call.message_id)
 
-    def _open_dialog(self, says: str, lasts_s: float) -> None:
-        """Do nothing more until OK is pressed, or for so long."""
+    def _open_dialog(self, text: str, lasts_s: float) -> None:
+        # A modal dialog stops Igor's main thread: queued calls wait until OK is pressed, or for `lasts_s`.
         self._locked_until_s = self.clock.now_s() + lasts_s
-        self.show_button("press-OK", f"a dialog waits for OK: {says}", self._close_dialog)
+        self.show_button("press-OK", f"a dialog waits for OK: {text}", self._close_dialog)
 
     def _close_dialog(self) -> None:
-        """Reply to the call that has opened the dialog, and go on."""
         opened, now_s = self._locked_until_s, self.clock.now_s()
         self._locked_until_s = now_s
         self._delayed = deque(replace(one, at_s=now_s) if one.at_s == opened else one for one in self._delayed)
 
     def _reply(self, queued: QueuedCall, payload: bytes, now_s: float) -> None:
-        """A reply, or what goes wrong with it."""
         before, self._last_id = self._last_id, queued.call.message_id
         if self.faults.strikes("no-reply", now_s):
             return

@@ -1,4 +1,4 @@
-"""Asylum's software: what it does when its functions are called, and what goes on by itself meanwhile."""
+"""Asylum's software: the effects of its functions, and the scans and curves that go on meanwhile."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ _SCANNING, _ENGAGED, _FORCE = 0x1, 0x2, 0x10
 _MOST_POINTS: Final = 8192
 _PULSE_S: Final = 60.0
 _INDENTS_M: Final = 1e-6
-"""A force curve that goes further than this does not only touch the sample."""
+"""A longer force curve drives the tip into the sample."""
 _REACH_M: Final = 1e-3
-"""No scanner goes further."""
+"""Limit of all distances: far beyond any scanner."""
 _LONGEST_NAME: Final = 17
 _INTEGRAL_GAIN: Final = 150.0
-"""What Asylum's gain of 1 is to the simulated feedback, in 1/s."""
+"""Simulated integral gain, in 1/s, for a gain of 1 in Asylum's units."""
 
 
 @dataclass(frozen=True)
 class AsylumSettings:
-    """The settings of the emulated software, as `AsylumEmulator` takes them."""
+    """Settings of the emulated software; the arguments of `AsylumEmulator`."""
 
     idle_s: float
     start_s: float
@@ -58,10 +58,10 @@ class AsylumSettings:
 
 
 class AsylumController:
-    """The software.
+    """The emulated software.
 
     Args:
-        folder: that files go to, whatever the texts call it.
+        folder: destination of files, independent of the folder name in Igor's texts.
     """
 
     def __init__(
@@ -83,13 +83,13 @@ class AsylumController:
         self._starts_at_s = math.inf
         self._bias_since_s = -math.inf
         self._curve_running = self._engages = False
-        # somebody has scanned once, and left the image open; the first spot is in its middle
+        # as after a scan whose image is still open: the first spot is in its middle
         self._image = self._frame()
         fast, slow = values.size()
         self.spots_m: list[tuple[float, float]] = [(fast / 2, slow / 2)]
 
     def put(self, names: str, value: float, now_s: float) -> None:
-        """PV; a bias that was in force for a short while has been a pulse."""
+        """Execute PV. A bias voltage in force for less than a minute counts as a bias pulse."""
         before_v = self.values.get("TipVoltage")
         self.values.put(names, value)
         if self.values.get("TipVoltage") == before_v:
@@ -121,11 +121,9 @@ class AsylumController:
 
     @property
     def scanning(self) -> bool:
-        """True while the panels show a running scan."""
         return bool(self.values.get("ScanStatus"))
 
     def status(self, now_s: float) -> int:
-        """The bits of ARGetStatus."""
         scanning = self.scanning or self.faults.lasts("status-stuck", now_s)
         bits = (_SCANNING if scanning else 0) | (_ENGAGED if self.rig.engaged or self._engages else 0)
         return bits | (_FORCE if self._curve_running else 0)
@@ -133,7 +131,7 @@ class AsylumController:
     # --- scans ---
 
     def scan(self, now_s: float, down: bool | None) -> None:
-        """Begin to scan, in a direction or in that of before; what was going on ends."""
+        """Start a scan, downwards, upwards or in the previous direction (None); a running scan ends."""
         if self.faults.strikes("scan-refused", now_s):
             return
         if self.scanning:
@@ -142,14 +140,16 @@ class AsylumController:
             self.values.put("ScanDown", float(down))
         if self.faults.strikes("keeps-scanning", now_s):
             self.values.put("LastScan", 0)
+        # the real software sets ScanStatus at once, and starts the scan after a ramp
         self.values.put("ScanStatus", 1)
         self.values.settle()
         self.rig.stop_spectrum(now_s)
         self.rig.engaged = True
         self._starts_at_s = now_s + self._settings.start_s
 
+    # StopScan of the real software also stops the feedback and withdraws the tip.
     def stop(self, now_s: float) -> None:
-        """Stop everything, the feedback too, and withdraw the tip."""
+        """Stop everything, including the feedback, and withdraw the tip."""
         if self.scanning:
             self._leave_image(now_s)
         self.values.put("ScanStatus;FMapStatus;DelayUpdate", 0)
@@ -157,22 +157,22 @@ class AsylumController:
         self.rig.withdraw(now_s)
 
     def engage(self) -> None:
-        """Bring the tip to the sample, once it has finished going away."""
+        """Bring the tip to the sample after a running withdrawal."""
         self._engages = True
         self.rig.setup.feedback = replace(self.rig.setup.feedback, on=True)
 
     def feedback_off(self) -> None:
-        """The tip stays where it is."""
+        """Hold the tip at its present height."""
         self.rig.setup.feedback = replace(self.rig.setup.feedback, on=False)
 
     def abandon(self) -> None:
-        """Stop whatever goes on, as an error that nobody foresaw ended it."""
+        """Stop scan and curve after an unexpected error."""
         self._starts_at_s = math.inf
         self._curve_running = self._engages = False
         self.values.put("ScanStatus;FMapStatus", 0)
 
     def _start_or_interrupt(self, now_s: float) -> None:
-        """Begin the image; with values that no scan can be taken with, it ends as if somebody had stopped it."""
+        # A scan with impossible parameters ends like one stopped at the panel.
         try:
             if not self._can_be_scanned():
                 raise InvalidValue("no scan is possible with these parameters")
@@ -182,7 +182,7 @@ class AsylumController:
             self._leave_image(now_s)
 
     def _can_be_scanned(self) -> bool:
-        """PV puts any number; the scan itself needs some that are finite and positive."""
+        # PV accepts any number without a range check.
         values = self.values
         positive = ("ScanSize", "FastRatio", "SlowRatio", "ScanRate", "ScanLines", "ScanPoints", "IntegralGain")
         near = ("ScanSize", "XOffset", "YOffset")
@@ -219,6 +219,7 @@ class AsylumController:
         scan = self.rig.scan
         if scan is not None:
             self._save("SaveImage", now_s, lambda name: files.image(name, scan, self.values, now_s))
+        # LastScan 0: the next frame follows in the other direction, until a person stops it
         if not self.values.get("LastScan"):
             self.scan(now_s, not self.values.get("ScanDown"))
             return
@@ -238,7 +239,7 @@ class AsylumController:
     # --- force curves ---
 
     def curve(self, now_s: float) -> bool:
-        """Take a force curve where the tip is: whether it does."""
+        """Take a force curve at the tip's place; return False if refused."""
         if self.scanning or self.rig.busy(now_s) or self.faults.strikes("force-refused", now_s):
             return False
         try:
@@ -254,18 +255,18 @@ class AsylumController:
         depth_m, speed_m_s = self.values.get("ForceDist"), self.values.get("Velocity")
         if depth_m > _INDENTS_M:
             self.rig.crash(min(depth_m, _REACH_M), speed_m_s, now_s)
-            self.rig.abandon(now_s)  # the curve itself takes the time
+            self.rig.abandon(now_s)  # the curve itself takes the time, not the crash
 
     def stop_curve(self, now_s: float) -> None:
-        """Stop the force curve at once."""
         self._curve_running = False
         self.rig.stop_spectrum(now_s)
 
     def go_to_spot(self, now_s: float) -> None:
-        """Send the tip to the spot that ForceSpotNumber says, on the last image.
+        """Send the tip to the spot ForceSpotNumber of the last image.
 
         Raises:
-            InvalidValue: there is no such spot, or it is nowhere. InstrumentBusy.
+            InvalidValue: there is no such spot, or it is not a finite place.
+            InstrumentBusy: something is running.
         """
         number = self._whole("ForceSpotNumber")
         if not 0 <= number < len(self.spots_m) or not all(abs(along) < _REACH_M for along in self.spots_m[number]):
@@ -284,7 +285,7 @@ class AsylumController:
     # --- files ---
 
     def check_suffix(self) -> None:
-        """The next number of which there is no file."""
+        """Raise BaseSuffix to the next number without a file."""
         base, suffix = self._base_name(), self._suffix()
         while (self._folder / f"{base}{suffix:04d}.ibw").exists():
             suffix += 1
@@ -293,7 +294,7 @@ class AsylumController:
     def _save(self, where: str, now_s: float, made: files.Made) -> None:
         faults = self.faults
         if faults.strikes("other-name", now_s):
-            self.values.put_text("BaseName", "Somebody")
+            self.values.put_text("BaseName", "Panel")
         if not self._whole(where) & 2 or faults.strikes("no-file", now_s):
             return
         suffix = self._suffix()
@@ -308,7 +309,7 @@ class AsylumController:
         self.values.put("BaseSuffix", suffix + 1)
 
     def _base_name(self) -> str:
-        """A name that Igor allows: a letter, then letters, digits and "_". A file never leaves its folder."""
+        # Igor allows a letter, then letters, digits and "_"; anything else could also lead out of the data folder.
         kept = re.sub(r"[^A-Za-z0-9_]", "", self.values.text("BaseName")).lstrip("0123456789_")
         return kept[:_LONGEST_NAME] or "Image"
 
@@ -316,6 +317,5 @@ class AsylumController:
         return min(max(0, self._whole("BaseSuffix")), 9999)
 
     def _whole(self, name: str) -> int:
-        """A number that is used as a whole one; 0 for what is none."""
         value = self.values.get(name)
         return int(value) if math.isfinite(value) else 0

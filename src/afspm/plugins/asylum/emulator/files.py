@@ -1,40 +1,45 @@
-"""The files of scans and force curves: made as Asylum makes them, and written late and in parts."""
+"""Files of scans and force curves: Igor binary waves of version 5, little endian, with a note."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import struct
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
-from afspm.plugins.asylum.emulator import ibw
 from afspm.plugins.asylum.emulator.values import IgorValues
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 
 AMPLITUDE_M_PER_V = 1e-7
+_SINCE_1904_S: Final = 2_082_844_800
+_LABEL: Final = 32
+_FLOAT32: Final = 2
 
 Entries = Mapping[str, float | str]
 Made = Callable[[str], bytes]
-"""The content of a file, given the name of its wave."""
+"""Encodes a file, given the name of its wave."""
 
 
 def image(name: str, scan: ScanActivity, values: IgorValues, now_s: float) -> bytes:
-    """The file of a scan; lines that were not scanned are NaN."""
+    """Encode the file of a scan; lines not scanned are NaN."""
     channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
     layers, labels = [], []
     for channel, (unit, found) in channels.items():
         quantity, _, back = channel.partition(" ")
         labels.append(f"{quantity.replace(' ', '')}{back or 'Trace'}")
-        # an amplitude is noted as a length
+        # real files have amplitudes as lengths
         layers.append((found * AMPLITUDE_M_PER_V if (quantity, unit) == ("Amplitude", "V") else found).T)
     rows, columns = scan.shape
     width, height = scan.region.size_m
     steps = [(width / (columns - 1), "m"), (height / (rows - 1), "m")]
-    return ibw.wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
+    return igor_wave(name, np.stack(layers, axis=2), "m", steps, labels, _note(values, now_s), now_s)
 
 
 def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: float) -> bytes:
-    """The file of a force curve: towards the sample and back, over time."""
+    """Encode the file of a force curve: approach, then retract, over time."""
     table = dict(zip(spectrum.names, spectrum.values.T, strict=True))
     extension = table["Z"].max() - table["Z"]
     there_and_back: Sequence[np.ndarray] = [
@@ -44,11 +49,10 @@ def curve(name: str, spectrum: SpectrumActivity, values: IgorValues, now_s: floa
     columns = np.column_stack([*there_and_back, there_and_back[0]])
     step_s = (spectrum.end_s - spectrum.start_s) / len(columns)
     noted = _of_curve(spectrum, float(np.ptp(extension)), columns.shape[0], values)
-    return ibw.wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
+    return igor_wave(name, columns, "m", [(step_s, "s")], ["Raw", "Defl", "ZSnsr"], _note(values, now_s, noted), now_s)
 
 
 def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values: IgorValues) -> Entries:
-    """Return the entries of a force curve's note that describe its acquisition."""
     duration_s = spectrum.end_s - spectrum.start_s
     velocity_m_s = distance_m / (duration_s / 2)
     place = zip(("XLVDT", "YLVDT"), spectrum.position_m, strict=True)
@@ -69,16 +73,70 @@ def _of_curve(spectrum: SpectrumActivity, distance_m: float, points: int, values
 
 
 def _note(values: IgorValues, now_s: float, more: Entries = MappingProxyType({})) -> bytes:
-    local, seconds = ibw.moment(now_s)
+    local, seconds = igor_moment(now_s)
     texts = {
+        # not UTF-8 once encoded: readers that assume it fail at real notes, too
         "StartHeadTemp": "32.125 °C",
         "Date": f"{local:%Y-%m-%d}",
         "Time": f"{local:%H:%M:%S}",
         "Seconds": f"{seconds:.3f}",
-        "SaveImage": values.text("SaveImage"),  # the second of this name, as in real notes
+        "SaveImage": values.text("SaveImage"),  # twice in a note, as in real ones: number and text
         "MicroscopeModel": "afspm SIMULATED",
         "Version": "15.09.112",
         "BaseName": values.text("BaseName"),
     }
     numbers = ((name, value) for name, value in values.noted() if name not in more)
-    return ibw.note([*numbers, *more.items(), *texts.items()])
+    return igor_note([*numbers, *more.items(), *texts.items()])
+
+
+def igor_moment(time_s: float) -> tuple[datetime, float]:
+    """Return local time of the controller's computer, and Igor's time: local seconds since 1904."""
+    local = datetime.fromtimestamp(time_s, UTC).astimezone()
+    offset = local.utcoffset()
+    return local, time_s + _SINCE_1904_S + (offset.total_seconds() if offset else 0.0)
+
+
+def igor_note(entries: Iterable[tuple[str, float | str]]) -> bytes:
+    """Encode a note: numbers with five digits, lines end with CR, Latin-1 instead of Unicode."""
+    lines = (f"{key}: {value if isinstance(value, str) else _printed(value)}" for key, value in entries)
+    return "".join(f"{line}\r" for line in lines).encode("latin-1", "replace")
+
+
+def igor_wave(
+    name: str,
+    values: np.ndarray,
+    unit: str,
+    steps: Sequence[tuple[float, str]],
+    labels: Sequence[str],
+    note: bytes,
+    time_s: float,
+) -> bytes:
+    """Encode a wave as an .ibw file.
+
+    Args:
+        values: the last dimension is channels, the others are axes.
+        steps: increment and unit of each axis.
+        labels: names of the channels.
+        time_s: time of saving, experiment time.
+    """
+    body = np.asarray(values, dtype="<f4").tobytes(order="F")
+    text = b"".join(label.encode("latin-1", "replace")[: _LABEL - 1].ljust(_LABEL, b"\0") for label in ("", *labels))
+    channels = values.ndim - 1
+    label_sizes = [len(text) if axis == channels else 0 for axis in range(4)]
+    binary = struct.pack("<3i 4x 16x 4i 12x", 320 + len(body), 0, len(note), *label_sizes)
+    seconds = round(igor_moment(time_s)[1]) & 0xFFFFFFFF
+    units = [unit, *(axis_unit for _, axis_unit in steps)]
+    wave_header = struct.pack(
+        "<4x 2I i h 8x h 32s 8x 4i 4d 32x",
+        seconds, seconds, values.size, _FLOAT32, 1, name.encode("latin-1", "replace")[: _LABEL - 1],
+        *[*values.shape, 0, 0, 0][:4], *[*(step for step, _ in steps), 1.0, 1.0, 1.0, 1.0][:4],
+    )  # fmt: skip
+    wave_header += b"".join(one.encode().ljust(4, b"\0") for one in [*units, "", "", "", ""][:5])
+    header = bytearray(struct.pack("<hH", 5, 0) + binary + wave_header.ljust(320, b"\0"))
+    struct.pack_into("<H", header, 2, -int(np.frombuffer(header, "<i2").sum(dtype=np.int64)) & 0xFFFF)
+    return bytes(header) + body + note + text
+
+
+def _printed(value: float) -> str:
+    # Igor's format: 5e-06, 3.7407e+05, and whole numbers of up to five digits in full.
+    return f"{value:.5g}"

@@ -1,4 +1,4 @@
-"""The functions that can be called: Asylum's own, and those of the procedures that a user includes."""
+"""Igor functions that a client can call: Asylum's own, and those of included procedures."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from afspm.plugins.asylum.emulator.wire import CallFailed, IgorFunction
 
 ABORTED: Final = 107
 _NOTHING: Final = math.nan
-"""What a function without a return gives."""
+"""Result of an Igor function without a return statement."""
 
 
 class DialogOpen(Exception):
-    """A window waits for somebody to press OK; the function gives `result` then."""
+    """A modal dialog blocks Igor; the function returns `result` after OK."""
 
     def __init__(self, text: str, result: float) -> None:
         super().__init__(text)
@@ -31,7 +31,7 @@ class AsylumFunctions:
         self._settings = settings
 
     def table(self) -> dict[str, IgorFunction]:
-        """Return the functions by name in lower case, since Igor ignores case."""
+        """Return the functions by lower-case name, since Igor ignores case."""
         values = self._controller.values
         table = {
             "GV": IgorFunction(self._get, "s"),
@@ -98,10 +98,10 @@ class AsylumFunctions:
     def _status(self) -> float:
         return float(self._controller.status(self._now_s()))
 
-    # --- what is done ---
+    # --- actions ---
 
     def _do_scan(self, button: str) -> float:
-        """The command is cut out of the name of a button."""
+        # Asylum's own code cuts the command out of the name of the pressed button, at the last "_" and at "Button".
         name = button[: button.rfind("_")] if "_" in button else button
         name = name[: name.rfind("Button")] if "Button" in name else name
         now_s = self._now_s()
@@ -115,6 +115,7 @@ class AsylumFunctions:
 
     def _do_force(self, button: str) -> float:
         name = button.partition("Force")[0]
+        # the real function has no return after a start, and returns 0 for a refusal: the reverse of the others
         if name == "Single":
             return _NOTHING if self._controller.curve(self._now_s()) else 0.0
         if name == "Go":

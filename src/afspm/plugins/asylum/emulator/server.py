@@ -1,7 +1,6 @@
-"""ZeroMQ-XOP as a process within Igor: its socket, what it answers by itself, and the queue of what Igor is to do.
+"""ZeroMQ-XOP as a process within Igor: its socket, its immediate replies, and the queue of calls for Igor.
 
-Requests that are wrong in themselves are answered at once by a thread of the XOP's; what is right waits until Igor is
-idle. Times are real seconds.
+A thread of the XOP answers malformed requests at once; valid ones wait until Igor is idle. Times are real seconds.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from afspm.simulation.emulation.emulator import LOOPBACK
 
 @dataclass(frozen=True)
 class QueuedCall:
-    """A call that waits for Igor."""
+    """A call that waits for Igor's next idle moment."""
 
     client: bytes
     call: FunctionCall
 
 
 class XopServer:
-    """The socket and the queue.
+    """The XOP's socket and queue.
 
     Args:
-        port: 0: any free one.
-        wakes: something with a `fileno` that ends `poll`.
+        port: 0: any free port.
+        wakes: object with a `fileno` that ends `poll`.
     """
 
     def __init__(self, port: int, wakes: object, log: logging.Logger) -> None:
@@ -44,8 +43,9 @@ class XopServer:
         self.bind()
 
     def bind(self) -> None:
-        """Begin to listen (zeromq_server_bind)."""
+        """Start listening (zeromq_server_bind)."""
         socket = self._context.socket(zmq.ROUTER)
+        # the options of the real XOP; a longer request makes libzmq drop the connection without a reply
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SNDTIMEO, 0)
         socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
@@ -56,7 +56,7 @@ class XopServer:
         self._socket = socket
 
     def unbind(self) -> None:
-        """Listen no more, and forget what was asked (zeromq_stop)."""
+        """Stop listening and discard queued calls (zeromq_stop)."""
         if self._socket is not None:
             self._socket.close(linger=0)
             self._socket = None
@@ -68,18 +68,18 @@ class XopServer:
         return self._socket is not None
 
     def poll(self, timeout_s: float, *, locked: bool) -> None:
-        """Wait for requests, and take what has come.
+        """Wait for requests and receive them.
 
         Args:
-            locked: a function that was called waits for somebody: the queue takes nothing more, and the thread that
-                wanted to put something there takes no more requests.
+            locked: a called function waits for a person: the queue is locked, and the receiving thread blocks with the
+                request that it wanted to queue.
         """
         poller = zmq.Poller()
         poller.register(self._wakes, zmq.POLLIN)
         if self._held is not None and not locked:
             self.queue.append(self._held)
             self._held = None
-            timeout_s = 0.0  # Igor can do it at once
+            timeout_s = 0.0  # the held call can be executed at once
         if self._socket is not None and self._held is None:
             poller.register(self._socket, zmq.POLLIN)
         ready = dict(poller.poll(max(0, round(timeout_s * 1000))))
@@ -93,7 +93,7 @@ class XopServer:
             self._take(frames, locked=locked)
 
     def send(self, client: bytes, *payload: bytes) -> None:
-        """A reply, to whoever is still there. One frame, of a server that works."""
+        """Send a reply if the client is still connected. A working server sends one frame of payload."""
         if self._socket is not None:
             try:
                 self._socket.send_multipart([client, b"", *payload], zmq.NOBLOCK)
@@ -101,11 +101,11 @@ class XopServer:
                 self._log.debug("a reply could not be sent: %s", error)
 
     def close(self) -> None:
-        """Let go of all."""
         self.unbind()
         self._context.destroy(linger=0)
 
     def _take(self, frames: list[bytes], *, locked: bool) -> None:
+        # the real XOP throws and never replies: to REQ_CORRELATE, or a DEALER without an empty frame
         if len(frames) != 3 or frames[1]:
             self._log.warning("received %d frames, which are not a request; it gets no reply", len(frames))
             return

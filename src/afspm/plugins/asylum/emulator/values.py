@@ -1,4 +1,4 @@
-"""The numbers and texts that Asylum's software goes by, as its panels and its notes have them."""
+"""Numbers and texts of Asylum's software, as in its panels and its notes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ NUMBERS: Final[dict[str, float]] = {
 
 
 class IgorValues:
-    """Igor does not tell upper from lower case.
+    """Igor's values by name; case is ignored.
 
     Args:
-        texts: GS and PS.
+        texts: initial values for GS and PS.
     """
 
     def __init__(self, texts: Mapping[str, str]) -> None:
@@ -32,11 +32,11 @@ class IgorValues:
         self._texts = {name.lower(): value for name, value in texts.items()}
 
     def get(self, name: str) -> float:
-        """NaN for a name that is not there."""
+        """Return a number; NaN for an unknown name."""
         return self._numbers.get(name.lower(), math.nan)
 
     def put(self, names: str, value: float) -> None:
-        """Set one name or a list "A;B;", without checks and without the side effects of a panel."""
+        """Set one name or a list "A;B;", without range checks and without the side effects of a panel."""
         for name in names.split(";"):
             if name.lower() in self._numbers:
                 self._numbers[name.lower()] = value
@@ -49,7 +49,7 @@ class IgorValues:
             self._texts[name.lower()] = value
 
     def size(self) -> tuple[float, float]:
-        """(fast, slow): ScanSize is the longer side, the ratios say how much shorter the other one is."""
+        """Return (fast, slow) in m: ScanSize is the longer side, and the ratios scale the other one."""
         longer, fast, slow = self.get("ScanSize"), self.get("FastRatio"), self.get("SlowRatio")
         ratio = slow / fast if fast else math.nan
         return (longer / ratio, longer) if ratio > 1.0 else (longer, longer * ratio)
@@ -62,5 +62,5 @@ class IgorValues:
         self.put("ScanSpeed", 2.5 * fast * self.get("ScanRate"))
 
     def noted(self) -> Iterator[tuple[str, float]]:
-        """The numbers by the names that a note has."""
+        """Return the numbers by their names in a note."""
         return ((name, self._numbers[name.lower()]) for name in NUMBERS)

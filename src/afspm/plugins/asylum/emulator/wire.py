@@ -1,7 +1,7 @@
-"""ZeroMQ-XOP's side of its protocol: what a request asks for, and the bytes of a reply. Pure.
+"""Server side of the ZeroMQ-XOP protocol: requests from bytes, replies to bytes. Pure.
 
-After the source and specification of ZeroMQ-XOP, first version of the interface; written apart from the
-translator's, so that each is a check of the other.
+After the source and specification of ZeroMQ-XOP, first version of the interface. Independent of the translator's code,
+so that each checks the other.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ _HEXADECIMAL: Final = r"0x([0-9a-f]+\.?[0-9a-f]*|\.[0-9a-f]+)(p[+-]?\d+)?"
 _NUMBER: Final = re.compile(
     rf"[ \t\n\v\f\r]*[+-]?({_HEXADECIMAL}|{_DECIMAL}|inf(inity)?|nan(\(\w*\))?)", re.IGNORECASE | re.ASCII
 )
-"""A number as C's strtod reads it to the end of the text."""
+"""Numbers that C's strtod parses completely."""
 
 Value = float | str | Mapping[str, object] | None
 
 
 class CallFailed(Exception):
-    """A request that is answered with an error.
+    """A request answered with an error.
 
     Attributes:
-        number: of ZeroMQ-XOP's errors.
-        history: what Igor printed meanwhile.
+        number: error number of ZeroMQ-XOP.
+        history: text that Igor printed meanwhile.
     """
 
     def __init__(self, number: int, history: str = "") -> None:
@@ -69,15 +69,15 @@ class FunctionCall:
 
 @dataclass(frozen=True)
 class IgorFunction:
-    """A function of Igor's.
+    """An Igor function.
 
     Attributes:
-        do: it; gives its result, those of several as a tuple, and where something is passed by reference a tuple of
-            that and of what becomes of the latter.
-        takes: a letter for each parameter: v(ariable), s(tring), d(ata folder), in upper case by reference; anything
-            else can't be passed.
-        gives: a letter for each result: v, s, d, w(ave); anything else can't be passed.
-        listed: it is declared by Igor's syntax for several results, which it may use for one, too.
+        do: implementation. Returns the result, a tuple for several results; with parameters by reference a tuple of the
+            result and of the new values of these parameters.
+        takes: a letter for each parameter: v(ariable), s(tring), d(ata folder), upper case by reference; any other type
+            can't be passed.
+        gives: a letter for each result: v, s, d, w(ave); any other type can't be passed.
+        listed: True if declared with Igor's syntax for several results, which a function with one result may also use.
     """
 
     do: Callable[..., object]
@@ -87,10 +87,10 @@ class IgorFunction:
 
 
 def call(payload: bytes) -> FunctionCall:
-    """The call that a request makes.
+    """Parse a request.
 
     Raises:
-        CallFailed: 3 to 7 or 106: the request itself is wrong.
+        CallFailed: 3 to 7 or 106: the request is malformed.
     """
     content = _parsed(payload)
     fields = content if isinstance(content, dict) else {}
@@ -106,18 +106,17 @@ def call(payload: bytes) -> FunctionCall:
 
 
 def _parsed(payload: bytes) -> object:
-    """The JSON, which may begin with a byte order mark and ends at the first NUL."""
+    # Like the XOP's JSON library: a byte order mark is skipped, and the text ends at the first NUL.
     text = payload.removeprefix(b"\xef\xbb\xbf").partition(b"\0")[0]
     try:
         content = json.loads(text.decode("utf-8"), parse_constant=_no_constant, parse_int=_integer, parse_float=_finite)
-        json.dumps(content, ensure_ascii=False).encode("utf-8")  # half a surrogate pair is no text
+        json.dumps(content, ensure_ascii=False).encode("utf-8")  # raises for lone surrogates
     except (ValueError, RecursionError):
         raise CallFailed(3) from None
     return content
 
 
 def _function_call(wanted: Plain) -> tuple[str, tuple[str, ...]]:
-    """The name of the function, and its parameters."""
     name, given = wanted.get("name"), wanted.get("params", [])
     if len(wanted) > 2 or not isinstance(name, str):
         raise CallFailed(6)
@@ -131,10 +130,10 @@ def _function_call(wanted: Plain) -> tuple[str, tuple[str, ...]]:
 
 
 def arguments(function: IgorFunction | None, parameters: Sequence[str]) -> list[float | str]:
-    """Return the arguments for a function.
+    """Convert the parameters for a function.
 
     Raises:
-        CallFailed: 101 to 106: it is not there, or can't be called so.
+        CallFailed: 101 to 106: unknown function, or wrong parameters.
     """
     if function is None:
         raise CallFailed(101)
@@ -149,10 +148,10 @@ def arguments(function: IgorFunction | None, parameters: Sequence[str]) -> list[
 
 
 def success(function: IgorFunction, given_back: Any, message_id: str | None) -> bytes:
-    """The reply with what a function gave.
+    """Encode the reply with a function's result.
 
     Raises:
-        UnicodeEncodeError: a text that is not UTF-8: the real one swallows this, and never replies.
+        UnicodeEncodeError: text that is not UTF-8. The real XOP swallows this error and never replies.
     """
     by_reference = [kind.lower() for kind in function.takes if kind.isupper()]
     results, passed = given_back if by_reference else (given_back, ())
@@ -165,7 +164,7 @@ def success(function: IgorFunction, given_back: Any, message_id: str | None) -> 
 
 
 def failure(failed: CallFailed, message_id: str | None) -> bytes:
-    """The reply with an error."""
+    """Encode the reply with an error."""
     content: dict[str, object] = {"errorCode": {"value": failed.number, "msg": str(failed)}}
     if failed.history:
         content["history"] = failed.history
@@ -173,7 +172,7 @@ def failure(failed: CallFailed, message_id: str | None) -> bytes:
 
 
 def wave(values: Sequence[float], **more: object) -> dict[str, object]:
-    """A wave of one dimension as it is replied."""
+    """Return a one-dimensional wave in its JSON form."""
     raw = [_variable(value) for value in values]
     return {
         "type": "NT_FP64",
@@ -196,7 +195,7 @@ def _value(kind: str, value: Value) -> dict[str, object]:
 
 
 def _variable(value: float) -> object:
-    """As "%.15g" prints it: 3.0 is 3."""
+    # "%.15g": 3.0 arrives as the JSON integer 3. NaN and infinities are texts, since JSON has no such numbers.
     if not math.isfinite(value):
         return "nan" if math.isnan(value) else "inf" if value > 0 else "-inf"
     return json.loads(f"{value:.15g}")
@@ -233,7 +232,7 @@ def _from_hexadecimal(number: str) -> float:
 
 
 def _finite(text: str) -> float:
-    """A number with a point or an exponent, which has to be one that a double can hold."""
+    # A number beyond the range of a double is malformed JSON to the XOP.
     number = float(text)
     if math.isinf(number):
         raise ValueError(f"{text} is out of range")
@@ -241,7 +240,7 @@ def _finite(text: str) -> float:
 
 
 def _integer(text: str) -> int | float:
-    """A whole number; one of more than 64 bits is read as a double."""
+    # More than 64 bits: read as a double.
     is_short = len(text) <= 20 and -(2**63) <= int(text) < 2**64
     return int(text) if is_short else _finite(text)
 

@@ -1,5 +1,4 @@
-"""An emulated GXSM, version 3 or 4: the module `gxsm` that scripts and programs call it by, and its files, with
-simulated physics behind them."""
+"""Emulated GXSM, version 3 or 4: its module `gxsm` and its files, with simulated physics."""
 
 from __future__ import annotations
 
@@ -30,20 +29,20 @@ class GxsmEmulator(Emulator):
 
     Args:
         version: 3 or 4.
-        card: what its hardware is: "SRanger", "RPSPMC" or GXSM's own "simulator".
+        card: its hardware: "SRanger", "RPSPMC" or GXSM's own "simulator".
         transport: "bridge": a script runs in its console; "shm": the shared memory of Gxsm4, on Linux.
-        script: that runs in its console; left out: afspm's own.
-        block, process: what the shared memory and its process are called; left out: memory of a name of its own.
-        user_unit: of lengths on its panel: "Å", "nm" or "µm".
-        decimal_comma: it runs where 12,5 is written.
-        auto_save, probe_auto_save: what its panel has on.
-        feedback_actions: names of actions that switch the feedback on and off; left out: its hardware has none.
-        reach_m: of the scanner in x and y, from the centre.
-        seed, faults, and all of the simulated world: as of every emulator.
+        script: script to run in its console. Default: afspm's bridge.
+        block, process: names of the shared memory and of its process. Default: a unique name.
+        user_unit: unit of lengths on its panel: "Å", "nm" or "µm".
+        decimal_comma: True for a locale with decimal commas, 12,5.
+        auto_save, probe_auto_save: switches of its panel at the start.
+        feedback_actions: names of the actions that switch the feedback on and off. Default: none.
+        reach_m: reach of the scanner in x and y, from the centre.
+        seed, faults, and the simulated world: settings of every emulator.
 
     Attributes:
-        unanswered: calls that have come.
-        silent: it was asked something that blocks it for good.
+        unanswered: received calls.
+        silent: True after a call that blocks GXSM until it is restarted.
     """
 
     vendor = "GXSM"
@@ -83,7 +82,7 @@ class GxsmEmulator(Emulator):
             ("user_unit", user_unit, USER_UNITS),
         ):
             if value not in known:
-                raise ConfigError(f"{value!r}", where=name, hint=f"there are {', '.join(map(str, known))}")
+                raise ConfigError(f"unknown value {value!r}", where=name, hint=f"one of {', '.join(map(str, known))}")
         self._settings = program.GxsmSettings(
             version, card, user_unit, decimal_comma, auto_save, probe_auto_save, reach_m
         )
@@ -98,7 +97,6 @@ class GxsmEmulator(Emulator):
         self._block: SharedMemoryBlock | None = None
 
     def open(self) -> str:
-        """Run the script in the console, or open the shared memory."""
         files.prepare(self._settings.version)
         self.silent = False
         self.unanswered.clear()
@@ -112,7 +110,7 @@ class GxsmEmulator(Emulator):
         return self.run_script()
 
     def run_script(self) -> str:
-        """Run the script in the console, as a user does. Returns where it listens."""
+        """Run the script in the console, as a user does; return its address."""
         self.take_button_away()
         before = self._console
         if before is not None:
@@ -128,7 +126,7 @@ class GxsmEmulator(Emulator):
         return address
 
     def serve(self, timeout_s: float) -> None:
-        """Answer what has come."""
+        """Answer the received calls."""
         watched: list[Any] = [self.woken] if self._block is None else [self.woken, self._block]
         ready = select.select(watched, [], [], timeout_s)[0]
         if self._block is not None and self._block in ready:
@@ -137,24 +135,23 @@ class GxsmEmulator(Emulator):
         self._answer_all()
 
     def tick(self, now_s: float) -> float | None:
-        """Scans end, files are written, and what has waited is answered."""
+        """Advance scans and files, and answer waiting calls."""
         if self.faults.strikes("crash", now_s):
             if self._block is not None:
                 self._block.end(remains=True)
                 self._block = None
-            raise Crashed("as it was told to")
+            raise Crashed("an emulated crash")
         if self._console is not None and self._listens and not self._console.runs:
             self._listens = False
             self.listening("")
             self.show_button("run-the-script-again", "the script in the console has ended", self.run_script)
         if self.faults.strikes("script-stopped", now_s):
-            self.program.entries.put("script-control", 0.0)
+            self.program.entries.put(calls.SCRIPT_CONTROL, 0.0)
         next_s = self.program.advance(now_s)
         self._answer_all()
         return next_s
 
     def close(self) -> None:
-        """GXSM is closed."""
         if self._console is not None:
             self._console.end()
             self._console = None
@@ -169,7 +166,7 @@ class GxsmEmulator(Emulator):
     def _answer_all(self) -> None:
         while self.unanswered and not self.silent and not self.faults.lasts("wedge", self.clock.now_s()):
             call = self.unanswered.popleft()
-            self.program.advance(self.clock.now_s())  # GXSM does one thing after the other
+            self.program.advance(self.clock.now_s())  # GXSM's calls and its own work alternate in one thread
             try:
                 found = self._calls.answer(call.method, call.arguments)
             except NoAnswer:
@@ -177,9 +174,9 @@ class GxsmEmulator(Emulator):
                 return
             except WrongArguments as error:
                 found = SystemError(str(error)) if self._block is None else error.value
-            except (NameError, SystemError) as error:  # what a script of the user's is to see
+            except (NameError, SystemError) as error:  # errors of the real module, for the script
                 found = error
-            except Exception as error:
+            except Exception as error:  # an error of the emulator must not end it: the script sees one, too
                 self.log.exception("%s failed", call.method)
                 found = SystemError(str(error))
             call.answered(found)

@@ -1,4 +1,4 @@
-"""The other end of Gxsm4's shared memory: what programs of its users write there reaches the emulator."""
+"""Gxsm4's shared memory, from GXSM's side: passes the calls of other programs to the emulator."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from afspm.simulation.faults import Faults
 FAULT_KINDS: Final[Mapping[str, str]] = {
     "bad-pickle": "shared memory: the result is not a pickle",
     "evil-pickle": "shared memory: the result would run a program if it were unpickled",
-    "code": "shared memory: the status says that the result can't be passed on",
+    "code": "shared memory: the status -1, as for a result that can't be passed on",
     "huge": "shared memory: a result that is longer than the memory",
 }
 NAME_BYTES: Final = 64
@@ -31,13 +31,13 @@ _NO_SUCH_FUNCTION, _NOT_PASSED_ON = -4, -1
 
 
 class SharedMemoryBlock:
-    """The shared memory and the process that has it.
+    """The shared memory and its process.
 
     Args:
-        name: of the memory.
-        process: what the process calls itself.
-        folder: in which it was started.
-        post: takes the calls; `take` must be called when `fileno` is readable.
+        name: name of the memory.
+        process: name that the process gives itself.
+        folder: folder in which the process starts.
+        post: receives the calls. `take` must be called when `fileno` is readable.
     """
 
     def __init__(
@@ -54,11 +54,11 @@ class SharedMemoryBlock:
         self._name, self._faults, self._now_s, self._post = name, faults, now_s, post
         command = [sys.executable, "-I", "-S", str(Path(__file__).with_name("signalled.py")), name, process]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder)
-        self._frame()  # it is ready
+        self._frame()  # the first frame: the process is ready for signals
 
     @property
     def pid(self) -> int:
-        """Process id to send the signal to."""
+        """Id of the process that receives the signals."""
         return self._process.pid
 
     def fileno(self) -> int:
@@ -66,7 +66,7 @@ class SharedMemoryBlock:
         return self._process.stdout.fileno()
 
     def take(self) -> None:
-        """Post one call that has come. Raises Crashed: somebody has killed the process."""
+        """Post one received call. Raises Crashed: the process was killed."""
         frame = self._frame()
         if not frame:
             raise Crashed("its process is gone")
@@ -79,10 +79,10 @@ class SharedMemoryBlock:
         self._post(ScriptCall(method, arguments if isinstance(arguments, tuple) else (arguments,), self._answer))
 
     def end(self, *, remains: bool = False) -> None:
-        """GXSM is closed.
+        """End the process.
 
         Args:
-            remains: the memory stays, as it does when the real one has ended.
+            remains: True leaves the memory in place, as the real program does.
         """
         self._process.kill()
         self._process.wait()
@@ -110,7 +110,7 @@ class SharedMemoryBlock:
         else:
             try:
                 content = pickle.dumps(found, 4)
-            except Exception:
+            except Exception:  # pickle raises any error of an object's own code
                 status = _NOT_PASSED_ON
         if len(content) > SIZE - CONTENT:
             status, content = _NOT_PASSED_ON, b""
@@ -128,13 +128,13 @@ class SharedMemoryBlock:
 
     def _write(self, answer: bytes) -> None:
         assert self._process.stdin is not None
-        with contextlib.suppress(OSError):  # it was killed
+        with contextlib.suppress(OSError):  # the process was killed
             self._process.stdin.write(struct.pack(">I", len(answer)) + answer)
             self._process.stdin.flush()
 
 
 class _MaliciousPickle:
-    """Makes a folder called `evil` where it is unpickled."""
+    """A pickle that makes a folder `evil` when a careless reader loads it."""
 
     def __reduce__(self) -> tuple[object, ...]:
         return os.mkdir, ("evil",)

@@ -1,4 +1,4 @@
-"""GXSM's Python console: it runs a script of its user in a thread, whose calls of `gxsm` GXSM answers one by one."""
+"""GXSM's Python console: runs a user's script in a thread, whose calls of `gxsm` GXSM answers one at a time."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from pathlib import Path
 from typing import Final
 
 SCRIPT: Final = Path(__file__).parents[1] / "bridge.py"
-"""What is run if nothing else is said: the file that a user runs, not a module of ours."""
+"""The default script: the file that a user runs, which is not imported as a module."""
 _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
 
 class ConsoleClosed(BaseException):
-    """GXSM is no more, nor is what runs in it."""
+    """GXSM was closed while a script ran."""
 
 
 @dataclass(frozen=True, eq=False)
 class ScriptCall:
-    """A call of a function of GXSM.
+    """A call of a GXSM function.
 
     Attributes:
-        answered: told what it returned, or the exception that it raised.
+        answered: receives the result, or the exception to raise.
     """
 
     method: str
@@ -33,7 +33,7 @@ class ScriptCall:
 
 
 class GxsmModule:
-    """The module `gxsm`, as a script sees it."""
+    """The module `gxsm` as a script sees it."""
 
     def __init__(self, post: Callable[[ScriptCall], None]) -> None:
         self._post = post
@@ -56,7 +56,7 @@ class GxsmModule:
         return call
 
     def end(self) -> None:
-        """End every thread that waits for an answer, or asks again."""
+        """End every thread that waits for an answer or makes another call."""
         self._gone = True
         for answer in list(self._waiting):
             if not answer.done():
@@ -64,48 +64,42 @@ class GxsmModule:
 
 
 class ScriptConsole:
-    """A console in which a script runs.
+    """A console that runs a script.
 
     Args:
-        script: that listens at a port, and says so.
-        folder: in which GXSM was started.
-        post: takes its calls, from its own thread.
-        ended: called from that thread when the script has ended.
+        script: listens at a port, and prints the address.
+        folder: folder in which GXSM was started.
+        post: receives its calls, from the script's thread.
+        ended: called from the script's thread at its end.
     """
 
     def __init__(
         self, script: Path, port: int, folder: Path, post: Callable[[ScriptCall], None], ended: Callable[[], None]
     ) -> None:
         self._module = GxsmModule(post)
-        self._said: Future[str] = Future()
+        self._address: Future[str] = Future()
         self._script, self._port, self._folder, self._ended = script, port, folder, ended
         self._runs = True
         self._thread = threading.Thread(target=self._run, daemon=True, name="GXSM's console")
         self._thread.start()
 
     def poll(self) -> str | None:
-        """Return the address of the script once it listens.
-
-        Raises:
-            whatever ended it before.
-        """
-        return self._said.result() if self._said.done() else None
+        """Return the script's address once it listens. Raises the exception that ended the script before."""
+        return self._address.result() if self._address.done() else None
 
     @property
     def runs(self) -> bool:
-        """True until the script has ended."""
         return self._runs
 
     def end(self) -> None:
-        """GXSM is closed."""
         self._module.end()
         self._thread.join()
 
     def _run(self) -> None:
         def print_(*values: object) -> None:
             found = _LISTENS.search(" ".join(map(str, values)))
-            if found and not self._said.done():
-                self._said.set_result(f"{found[1]}:{found[2]}")
+            if found and not self._address.done():
+                self._address.set_result(f"{found[1]}:{found[2]}")
 
         scope = {
             "__name__": "__main__",
@@ -118,9 +112,9 @@ class ScriptConsole:
             exec(compile(self._script.read_text(encoding="utf-8"), str(self._script), "exec"), scope)
         except ConsoleClosed:
             pass
-        except BaseException as error:
-            if not self._said.done():
-                self._said.set_exception(error)
+        except BaseException as error:  # SystemExit, too: `poll` raises it in the emulator's thread
+            if not self._address.done():
+                self._address.set_exception(error)
         finally:
             self._runs = False
             self._ended()

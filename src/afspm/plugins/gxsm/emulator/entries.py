@@ -1,4 +1,4 @@
-"""The entries of GXSM's panel: what `set` and `get` reach, with all that is peculiar about it."""
+"""Entries of GXSM's panel behind `set` and `get`, with their quirks."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _ANGSTROM: Final = "Å"
 _PADDING: Final = " " * 4
 _NO_UNIT: Final = " " * 5
 _DAC_STEP: Final = 0.422
-"""In ångström: a range is never less."""
+"""Smallest range, in ångström: one step of the converter."""
 
 
 @dataclass
 class GxsmEntry:
-    """One.
+    """One entry.
 
     Attributes:
-        value: lengths in ångström, whatever the panel shows.
-        unit: that `gets` shows; of lengths the user's.
-        shown: how `gets` writes the number.
-        zero: what 0 becomes.
-        whole: of points.
-        told: called with each new value.
+        value: lengths in ångström, independent of the panel's unit.
+        unit: unit that `gets` shows, replaced by the user's unit for lengths.
+        shown: format of the number in `gets`.
+        zero: value that replaces 0.
+        whole: True for numbers of points.
+        on_change: called with each new value.
     """
 
     value: float
@@ -40,17 +40,17 @@ class GxsmEntry:
     shown: str = "{:.6g}"
     zero: float = 0.0
     whole: bool = False
-    told: Callable[[float], None] | None = None
+    on_change: Callable[[float], None] | None = None
 
 
 class GxsmEntries:
     """The entries by reference name.
 
     Args:
-        user_unit: of lengths, as preferred.
-        decimal_comma: GXSM runs in a country that writes 12,5.
         version: 3 or 4.
-        dialogs: called with what a dialog on the screen says.
+        user_unit: preferred unit of lengths.
+        decimal_comma: True for a locale with decimal commas, 12,5.
+        dialogs: receives the texts of dialogs on the screen.
     """
 
     def __init__(self, version: int, user_unit: str, *, decimal_comma: bool, dialogs: Callable[[str], None]) -> None:
@@ -70,34 +70,35 @@ class GxsmEntries:
         return ref in self._entries
 
     def __getitem__(self, ref: str) -> float:
-        """Inside: lengths in ångström."""
+        """Return a value, lengths in ångström."""
         return self._entries[ref].value
 
     def put(self, ref: str, value: float) -> None:
-        """Set an entry as at the panel, lengths in ångström, without checks or side effects."""
+        """Set an entry without checks or side effects, lengths in ångström."""
         self._entries[ref].value = value
 
     def set(self, ref: str, text: str) -> int:
-        """Always 0, whatever came of it."""
+        """Set an entry from text. Returns 0 in any case, as GXSM does."""
         entry = self._entries.get(ref)
         if entry is None:
             return 0
         value = self._atof(text) * self._factor(entry)
         value = (float(np.trunc(value)) if entry.whole else value) or entry.zero
+        # the real one keeps its value, returns 0, and shows a dialog on the screen
         if not entry.low <= value <= entry.high:
             self._dialogs(f"Valid Range of {ref}: {entry.low} to {entry.high}")
             return 0
         if ref in ("StepsX", "StepsY"):
             ref, value = f"Range{ref[-1]}", value * max(self[f"Points{ref[-1]}"] - 1.0, 1.0)
         self._take(ref, value)
-        if ref in ("RangeX", "PointsX"):  # the ratio is kept: here 1:1
+        if ref in ("RangeX", "PointsX"):  # GXSM keeps the aspect ratio, here always 1:1
             self._take(f"{ref[:-1]}Y", value)
         for axis in "XY":
             self.put(f"Steps{axis}", self[f"Range{axis}"] / max(self[f"Points{axis}"] - 1.0, 1.0))
         return 0
 
     def get(self, ref: str) -> float | str:
-        """Return a value in the user's unit; of what there is not: -inf, or in Gxsm3 memory that nobody has written."""
+        """Return a value in the user's unit; for an unknown name -inf, or in Gxsm3 uninitialised memory."""
         entry = self._entries.get(ref)
         if entry is not None:
             return entry.value / self._factor(entry)
@@ -106,7 +107,7 @@ class GxsmEntries:
         return -math.inf
 
     def gets(self, ref: str) -> str:
-        """Return a value as shown, by the first name that begins so."""
+        """Return the value as text with its unit, of the first entry whose name starts with `ref`."""
         found = [entry for name, entry in self._entries.items() if name.startswith(ref)]
         if not found:
             return "ERROR"
@@ -118,24 +119,24 @@ class GxsmEntries:
     def _take(self, ref: str, value: float) -> None:
         entry = self._entries[ref]
         entry.value = value
-        if entry.told is not None:
-            entry.told(value)
+        if entry.on_change is not None:
+            entry.on_change(value)
 
     def _factor(self, entry: GxsmEntry) -> float:
         return USER_UNITS[self._user_unit] if entry.unit == _ANGSTROM else 1.0
 
     def _atof(self, text: str) -> float:
-        """Parse the longest numeric prefix, as C's atof does; 0 if there is none."""
+        # C's atof reads the longest numeric prefix, and 0 if there is none: "1.5nm" is 1.5, "abc" is 0.
         wanted = text.replace(".", "\0").replace(",", ".") if self._comma else text
         match = _FLOAT.match(wanted)
         return float(match[0]) if match else 0.0
 
 
-def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dict[str, GxsmEntry]:
-    """The entries of the scan frame that every GXSM has, in ångström, up to so far from the centre."""
+def lengths(reach: float, on_change: Callable[[str], Callable[[float], None]]) -> dict[str, GxsmEntry]:
+    """Return the entries of the scan frame that every GXSM has, in ångström, up to `reach` from the centre."""
 
     def length(ref: str, value: float, low: float, high: float) -> GxsmEntry:
-        return GxsmEntry(value, low, high, _ANGSTROM, "{:.1f}", told=told(ref))
+        return GxsmEntry(value, low, high, _ANGSTROM, "{:.1f}", on_change=on_change(ref))
 
     def extent(value: float, shown: str) -> GxsmEntry:
         return GxsmEntry(value, 0.0, 2 * reach, _ANGSTROM, shown, _DAC_STEP)
@@ -157,7 +158,7 @@ def lengths(reach: float, told: Callable[[str], Callable[[float], None]]) -> dic
 
 
 def simulated_3() -> dict[str, GxsmEntry]:
-    """Return the entries that the simulator of Gxsm3 has besides those of Gxsm4's."""
+    """Return the entries that only Gxsm3's simulator has."""
     return {
         "sim-stm-fbs-bias": GxsmEntry(0.1, -10.0, 10.0, "V"),
         "sim-stm-fbs-mx0-current-set": GxsmEntry(0.5, -100.0, 100.0, "nA"),

@@ -1,4 +1,4 @@
-"""GXSM's files: written late, one after the other, in parts, and numbered."""
+"""Writing of GXSM's files: late, one after the other, in two parts, and numbered."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
     "half-file": "a file is half written, and whole only after the duration",
     "file-missing": "a file is never written",
 }
+# Measured: files appear 0.1 s after the scanning bit drops, one by one, and are seen half written.
 _FIRST_S, _APART_S, _HALF_S = 0.1, 0.05, 0.02
 
 
@@ -25,11 +26,11 @@ class _Write:
 
 
 class GxsmFileWriter:
-    """The files of one folder.
+    """Writes files to one folder.
 
     Attributes:
-        folder: of scans and spectra; somebody at the panel may choose another.
-        done_s: when all files are written, unless something goes wrong.
+        folder: folder of scans and spectra; a person may choose another one at the panel.
+        done_s: time at which all files are written, without faults.
     """
 
     def __init__(self, folder: Path, faults: Faults) -> None:
@@ -37,32 +38,32 @@ class GxsmFileWriter:
         self._faults = faults
         self._writes: list[_Write] = []
         self.counter = 1
-        """Of the next scan: it begins anew with each start of GXSM, whatever files there are."""
+        """Number of the next scan: 1 at each start of GXSM, even if files have it."""
         self.done_s = 0.0
 
     def next_number(self) -> int:
-        """A scan begins: it takes the counter's number, whether or not it is ever saved."""
+        """Return the number of a starting scan, which is used up even if the scan is never saved."""
         self.counter += 1
         return self.counter - 1
 
     def named(self, ending: str, counter: int) -> Path:
-        """A scan's file."""
+        """Return the path of a scan's file."""
         return self.folder / f"scan{counter:03d}-{ending}"
 
     def free(self, ending: str, number: int) -> Path:
-        """The first file, from a number on, that is not there yet: each channel counts by itself."""
+        """Return the path with the first free number from `number` on; each channel counts by itself."""
         counter = number
         while (path := self.named(ending, counter)).exists() or any(write.path == path for write in self._writes):
             counter += 1
         return path
 
     def counted(self, files: list[Path]) -> None:
-        """A scan was saved: the next has the next number."""
+        """Set the counter behind the numbers of the saved files."""
         numbers = (int(file.name.removeprefix("scan").partition("-")[0]) for file in files)
         self.counter = max(self.counter, *(number + 1 for number in numbers))
 
     def write(self, contents: list[tuple[Path, bytes]], now_s: float) -> None:
-        """Begin to write files, the last one first."""
+        """Start writing files, in reverse order, as GXSM does."""
         for k, (path, content) in enumerate(reversed(contents)):
             at_s = now_s + _FIRST_S + k * _APART_S
             self.done_s = at_s + _HALF_S
@@ -74,7 +75,7 @@ class GxsmFileWriter:
             self._writes.append(_Write(at_s + (half.duration_s if half else _HALF_S), path, content))
 
     def advance(self, now_s: float) -> float | None:
-        """Up to now; returns when there is more to write."""
+        """Write the files that are due; return the time of the next write."""
         due = sorted((write for write in self._writes if write.at_s <= now_s), key=lambda write: write.at_s)
         self._writes = [write for write in self._writes if write.at_s > now_s]
         for write in due:

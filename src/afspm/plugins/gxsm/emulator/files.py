@@ -1,4 +1,4 @@
-"""The files that GXSM saves: NetCDF-3 and NetCDF-4 of scans, text of spectra, with the headers that real ones have."""
+"""The files that GXSM saves: scans as NetCDF-3 or NetCDF-4, spectra as text, with the headers of real files."""
 
 from __future__ import annotations
 
@@ -14,9 +14,61 @@ import numpy as np
 if TYPE_CHECKING:
     import h5py
 
-_USER: Final = "Nobody"
+_USER: Final = "user"
 _VERSIONS: Final = {3: ("gxsm3", "3.54.0"), 4: ("gxsm4", "4.4.1")}
 _ANGSTROM: Final = {"label": "L", "var_unit": "Ang", "unit": "AA"}
+
+
+@dataclass(frozen=True)
+class GxsmChannel:
+    """A channel that GXSM records.
+
+    Attributes:
+        source: the instrument's name of it.
+        label: GXSM's name of it.
+        direction: "Xp" forward, "Xm" backward.
+        unit: unit in the file ("AA" for lengths), and unit on the panel.
+        scale: factor from the instrument's values to this unit.
+        dz: factor from stored values to this unit.
+    """
+
+    source: str
+    label: str
+    direction: str
+    unit: tuple[str, str]
+    scale: float
+    dz: float
+
+    def ending(self, *, master: bool) -> str:
+        """Return the part of the file's name after the number."""
+        return f"{'M-' if master else ''}{self.direction}-{self.label.replace('-', 'm')}.nc"
+
+    def raw(self, values: np.ndarray) -> np.ndarray:
+        """Return the stored values of an image [y, x] with y ascending: rows from the top, NaN where not scanned."""
+        return (values[::-1] * (self.scale / self.dz)).astype(np.float32)
+
+
+_IN_ANGSTROM: Final = (("AA", "Å"), 1e10)
+SIMULATED_3: Final = (
+    GxsmChannel("Height", "Topo", "Xp", *_IN_ANGSTROM, 0.117506942891),
+    GxsmChannel("Amplitude", "MIX1", "Xp", ("V", "V"), 1.0, 0.000305185),
+)
+"""Channels of Gxsm3's simulator."""
+CHANNELS: Final = {
+    3: (
+        GxsmChannel("Height", "Topo", "Xp", *_IN_ANGSTROM, 0.117506942891),
+        GxsmChannel("Height Retrace", "Topo", "Xm", *_IN_ANGSTROM, 0.117506942891),
+        GxsmChannel("Amplitude", "ADC1", "Xp", ("V", "V"), 1.0, 0.000305185),
+    ),
+    4: (
+        GxsmChannel("Height", "ZS-Topo", "Xp", *_IN_ANGSTROM, 1.0),
+        GxsmChannel("Height Retrace", "ZS-Topo", "Xm", *_IN_ANGSTROM, 1.0),
+        GxsmChannel("Current", "I-Tunnel", "Xp", ("nA", "nA"), 1e9, 1.0),
+        GxsmChannel("Frequency Shift", "dFreq", "Xp", ("Hz", "Hz"), 1.0, 1.0),
+        GxsmChannel("Phase", "Phase", "Xp", ("deg", "°"), 1.0, 1.0),
+    ),
+}
+"""Channels by the version of GXSM."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +76,8 @@ class GxsmScanFile:
     """One channel of a scan.
 
     Attributes:
-        raw: what is stored, rows from the top; times `dz` it is in `unit`.
-        unit: as stored ("AA" of lengths), and as shown.
+        raw: stored values, rows from the top; times `dz` they are in `unit`.
+        unit: unit in the file ("AA" for lengths), and unit on the panel.
         frame: x, y, width, height in ångström, angle clockwise in degrees.
     """
 
@@ -41,7 +93,7 @@ class GxsmScanFile:
     bias_v: float
 
     def numbers(self) -> dict[str, float]:
-        """The variables of one value."""
+        """Return the variables with one number."""
         x, y, width, height, angle_deg = self.frame
         rows, columns = self.raw.shape
         return {
@@ -64,11 +116,11 @@ class GxsmScanFile:
         }
 
     def times(self) -> dict[str, int]:
-        """The whole seconds."""
+        """Return the variables in whole seconds."""
         return {"t_start": int(self.start_s), "t_end": int(self.end_s), "viewmode": 2}
 
     def texts(self) -> dict[str, str]:
-        """The variables of characters."""
+        """Return the text variables."""
         begun = time.ctime(self.start_s)
         return {
             "reftime": f"{begun}\n",
@@ -83,13 +135,13 @@ class GxsmScanFile:
         }
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Relative to the centre: x ascending, y from the top."""
+        """Return x ascending and y descending, relative to the centre, in ångström."""
         _, _, width, height, _ = self.frame
         rows, columns = self.raw.shape
         return np.linspace(-width / 2, width / 2, columns), np.linspace(height / 2, -height / 2, rows)
 
     def about(self, version: int) -> dict[str, str]:
-        """The attributes of the whole."""
+        """Return the global attributes."""
         creator, number = _VERSIONS[version]
         return {
             "Creator": creator,
@@ -102,12 +154,12 @@ class GxsmScanFile:
 
 
 def prepare(version: int) -> None:
-    """Import what writes the files now: the first scan's are not to be later than others."""
+    """Import the libraries that write the files, so that the first scan's files are not later than others."""
     import_module("scipy.io" if version == 3 else "h5py")
 
 
 def netcdf3(scan: GxsmScanFile) -> bytes:
-    """The file that Gxsm3 saves."""
+    """Encode the file that Gxsm3 saves."""
     from scipy.io import netcdf_file
 
     made = io.BytesIO()
@@ -143,7 +195,7 @@ def _variable(file: Any, name: str, kind: str, dimensions: tuple[str, ...], valu
 
 
 def netcdf4(scan: GxsmScanFile) -> bytes:
-    """The file that Gxsm4 saves."""
+    """Encode the file that Gxsm4 saves."""
     import h5py
 
     made = io.BytesIO()
@@ -184,8 +236,8 @@ class GxsmSpectrumFile:
     """A spectrum.
 
     Attributes:
-        columns: label with its unit -> values; the first is what is swept.
-        offset: of the scan frame, in ångström, which is not where it was taken.
+        columns: values by label with unit; the swept column comes first.
+        offset: offset of the scan frame in ångström, which is not the place of the spectrum.
     """
 
     path: str
@@ -197,7 +249,7 @@ class GxsmSpectrumFile:
 
 
 def vpdata(curve: GxsmSpectrumFile) -> bytes:
-    """The file of a spectrum."""
+    """Encode the file of a spectrum."""
     labels, values = list(curve.columns), [*curve.columns.values()]
     count = len(values[0])
     x, y = curve.offset
@@ -213,7 +265,7 @@ def vpdata(curve: GxsmSpectrumFile) -> bytes:
         f"# Probe Data Number      :: N={count}",
         "#C ",
         "#C Data Table             :: data=",
-        # what is swept comes a second time
+        # real files repeat the swept column
         "\t".join(["#C Index", *(f'"{label}"' for label in [labels[0], *labels]), "Block-Start-Index"]),
     ]
     for i in range(count):

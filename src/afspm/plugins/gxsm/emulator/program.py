@@ -1,4 +1,4 @@
-"""GXSM itself: what it has set and is doing, with the simulated instrument behind it, and the files that it saves."""
+"""GXSM itself: settings and measurements with the simulated instrument behind them, and the saving of files."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
 from afspm.model import Region
 from afspm.plugins.gxsm.emulator import files
-from afspm.plugins.gxsm.emulator.channels import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.plugins.gxsm.emulator.entries import GxsmEntries, GxsmEntry, lengths, simulated_3
 from afspm.plugins.gxsm.emulator.file_writer import GxsmFileWriter
+from afspm.plugins.gxsm.emulator.files import CHANNELS, SIMULATED_3, GxsmChannel
 from afspm.simulation.activities import ScanActivity, SpectrumActivity
 from afspm.simulation.faults import Faults
 from afspm.simulation.instrument import Instrument
@@ -30,15 +30,15 @@ FAULT_KINDS: Final[Mapping[str, str]] = {
 }
 ANGSTROM_M: Final = 1e-10
 SHOWS_S: Final = 0.15
-"""A scan is seen running so long after it was begun."""
+"""Delay of the scanning bit after the start of a scan."""
 NAMED_S: Final = 0.04
-"""Until so long after its begin the names of the scan before are told."""
+"""Time after the start of a scan during which the previous scan's file names are reported."""
 IGAIN: Final = 10.0
-"""The simulated integral gain for one of GXSM's, which go to 200."""
+"""Simulated integral gain for a gain of 1 in GXSM, whose range is 0 to 200."""
 UNFINISHED_S: Final = 0.25
-"""So long after the end of a scan GXSM is not done with it: a file that is saved then has no end in it."""
+"""GXSM's own work after the end of a scan; a file saved during it has no end time."""
 _PIXELS_S: Final = 0.045
-"""What its own simulator takes for a line besides its pixels."""
+"""Duration of a line in GXSM's own simulator, in addition to its pixels."""
 _NEVER_WRITTEN: Final = -296
 """The line that Gxsm4's simulator reports at the start of its first scan."""
 _PULSE_S: Final = 1.0
@@ -47,13 +47,13 @@ _MIXERS: Final = {
     "current": ("dsp-fbs-mx0-current-set", "nA", 1e-9),
     "frequency-shift": ("dsp-fbs-mx1-freq-set", "Hz", 1.0),
 }
-"""By the mode of the feedback: the entry of its setpoint, the unit, and a simulated one for one of GXSM's."""
+"""By the mode of the feedback: entry of the setpoint, unit, and SI value of this unit."""
 _COLUMNS: Final = {"Bias": "Bias-mon", "Z": "Z-mon", "Current": "CurrentSim1"}
 
 
 @dataclass(frozen=True)
 class GxsmSettings:
-    """The settings of the emulated program, as `GxsmEmulator` takes them."""
+    """Settings of the emulated program; the arguments of `GxsmEmulator`."""
 
     version: int
     card: str
@@ -69,9 +69,9 @@ class GxsmPanel:
     """The switches of GXSM's panel.
 
     Attributes:
-        auto_save: of scans; probe_auto_save of spectra.
-        repeats: a scan that comes to its end is followed by the next.
-        behind_s: how much the clock of its computer, whose times are in files, is behind; it may be set at any time.
+        auto_save, probe_auto_save: automatic saving of scans, of spectra.
+        repeats: True if each complete scan is followed by another one.
+        behind_s: lag of the clock of GXSM's computer, whose times are in files; it may be set at any time.
     """
 
     auto_save: bool
@@ -82,18 +82,20 @@ class GxsmPanel:
 
 @dataclass
 class GxsmScan:
-    """The last scan that was begun, and the memory that it is scanned into.
+    """The last scan that was started, and GXSM's memory of its values.
 
     Attributes:
-        activity: None before the first.
+        activity: None before the first scan.
         frame: offset, range and rotation at its start.
-        runs: until GXSM has seen its end; `saved`: since then.
-        shows_s: how long after its begin it is seen running.
-        next_follows: another scan is to begin; `follows`: it does so at once.
-        number, own: the number in the names of its files; the names, once it is saved.
-        before: the names that are reported at first; None: its own at once.
-        y_before: the line that is reported until its first one is complete.
-        memory: rows of the scan before, by channel.
+        runs: True until GXSM has seen its end.
+        saved: True if it has been saved since.
+        shows_s: delay between its start and the scanning bit.
+        next_follows: True if another scan is due to start.
+        follows: True if that scan starts without a pause.
+        number, own: number in its file names; the file names, once saved.
+        before: file names reported at first; None: its own at once.
+        y_before: line reported until its first line is complete.
+        memory: rows of the previous scan, by channel.
     """
 
     activity: ScanActivity | None = None
@@ -114,10 +116,10 @@ class GxsmProgram:
     """The program.
 
     Attributes:
-        panel: the switches of its panel.
-        channels: that a scan records.
-        dialogs: the texts of dialogs on the screen.
-        scan: the last scan that was begun.
+        panel: switches of its panel.
+        channels: channels that a scan records.
+        dialogs: texts of dialogs on the screen.
+        scan: the last scan that was started.
     """
 
     def __init__(self, rig: Instrument, faults: Faults, clock: Clock, folder: Path, settings: GxsmSettings) -> None:
@@ -135,51 +137,55 @@ class GxsmProgram:
         self.curve: SpectrumActivity | None = None
         self._bias_since_s = -math.inf
         self._curves = 0
-        for ref, entry in lengths(settings.reach_m / ANGSTROM_M, self._told).items():
+        for ref, entry in lengths(settings.reach_m / ANGSTROM_M, self._on_change).items():
             self.entries.add(ref, entry)
         for ref, entry in self._of_hardware().items():
             self.entries.add(ref, entry)
 
-    def _told(self, ref: str) -> Callable[[float], None]:
+    def _on_change(self, ref: str) -> Callable[[float], None]:
         if ref in ("ScanX", "ScanY", "OffsetX", "OffsetY"):
             return lambda _: self._move()
         return lambda _: None
 
     def _of_hardware(self) -> dict[str, GxsmEntry]:
         rig, loop = self.rig, self.rig.setup.feedback
-        bias = GxsmEntry(rig.setup.bias_v, -10.0, 10.0, "V", told=self._bias)
+        bias = GxsmEntry(rig.setup.bias_v, -10.0, 10.0, "V", on_change=self._bias)
         if self.card == "simulator":
             speed = GxsmEntry(1.0, 0.01, 4000.0, "px/s", "{:.2f}")
             return {"sim-stm-speed": speed, "sim-stm-bias": bias, **(simulated_3() if self.version == 3 else {})}
 
         def fed_back(name: str, factor: float = 1.0) -> Callable[[float], None]:
-            def told(value: float) -> None:
+            def on_change(value: float) -> None:
                 changed: Plain = {name: value * factor}
                 rig.setup.feedback = replace(rig.setup.feedback, **changed)
 
-            return told
+            return on_change
 
         def sloped(axis: int) -> Callable[[float], None]:
             return lambda value: setattr(
                 rig.setup, "slope", (*rig.setup.slope[:axis], value, *rig.setup.slope[axis + 1 :])
             )
 
-        speed = GxsmEntry(2e4, 1e-3, 1e7, told=lambda value: setattr(rig.setup, "move_speed_m_s", value * ANGSTROM_M))
+        speed = GxsmEntry(
+            2e4, 1e-3, 1e7, on_change=lambda value: setattr(rig.setup, "move_speed_m_s", value * ANGSTROM_M)
+        )
         mixer, unit, factor = _MIXERS.get(rig.world.settings.feedback.mode, _MIXER)
-        setpoint = GxsmEntry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, told=fed_back("setpoint", factor))
+        setpoint = GxsmEntry((loop.setpoint or 0.0) / factor, -1e3, 1e3, unit, on_change=fed_back("setpoint", factor))
         found = {
             "dsp-fbs-bias": bias,
             "dsp-fbs-mx0-current-set": GxsmEntry(0.0, -100.0, 100.0, "nA"),
             mixer: setpoint,
             "dsp-fbs-mx0-current-level": GxsmEntry(0.0, -100.0, 100.0, "nA"),
-            "dsp-fbs-cp": GxsmEntry(loop.proportional_gain or 0.0, -100.0, 200.0, told=fed_back("proportional_gain")),
+            "dsp-fbs-cp": GxsmEntry(
+                loop.proportional_gain or 0.0, -100.0, 200.0, on_change=fed_back("proportional_gain")
+            ),
             "dsp-fbs-ci": GxsmEntry(
-                (loop.integral_gain or 0) / IGAIN, -100, 200, told=fed_back("integral_gain", IGAIN)
+                (loop.integral_gain or 0) / IGAIN, -100, 200, on_change=fed_back("integral_gain", IGAIN)
             ),
             "dsp-fbs-scan-speed-scan": GxsmEntry(1e4, 1e-3, 1e7),
             "dsp-fbs-scan-speed-move": speed,
-            "dsp-adv-scan-slope-x": GxsmEntry(0.0, -0.2, 0.2, told=sloped(0)),
-            "dsp-adv-scan-slope-y": GxsmEntry(0.0, -0.2, 0.2, told=sloped(1)),
+            "dsp-adv-scan-slope-x": GxsmEntry(0.0, -0.2, 0.2, on_change=sloped(0)),
+            "dsp-adv-scan-slope-y": GxsmEntry(0.0, -0.2, 0.2, on_change=sloped(1)),
             "dsp-gvp-du00": GxsmEntry(0.0, -10.0, 10.0, "V"),
         }
         if self.card == "RPSPMC":
@@ -188,7 +194,7 @@ class GxsmProgram:
         return {**found, **zs, "dsp-Z-Slope": GxsmEntry(100.0, 1e-3, 1e6), "dsp-fbs-motor": GxsmEntry(0.0, -10.0, 10.0)}
 
     def _bias(self, value: float) -> None:
-        """Another bias; one that was in force for a short while has been a pulse."""
+        # A bias voltage in force for less than a second counts as a pulse on the simulated tip.
         now_s = self.clock.now_s()
         if now_s - self._bias_since_s < _PULSE_S:
             self.rig.pulsed(self.rig.setup.bias_v, now_s - self._bias_since_s, now_s)
@@ -197,7 +203,7 @@ class GxsmProgram:
     # --- what happens by itself ---
 
     def advance(self, now_s: float) -> float | None:
-        """Up to now; returns when a file is to be written."""
+        """Advance to now; return the time of the next change."""
         if self.scan.runs and self.faults.strikes("panel-stop", now_s):
             self.rig.stop_scan(now_s)
         if self.scan.runs and self.scan.activity is not None and not self.scan.activity.running(now_s):
@@ -216,19 +222,19 @@ class GxsmProgram:
 
     @property
     def is_between_repeats(self) -> bool:
-        """True after the end of a scan that the next one follows at once: GXSM does not tell of an end then."""
+        """True between repeated scans, where GXSM's scanning bit stays set."""
         is_whole = self.scan.activity is not None and self.scan.activity.stopped_s is None
         return self.panel.repeats and is_whole and (self.scan.runs or self.scan.next_follows)
 
     def stop_scan(self) -> None:
-        """Break off the scan that runs, or is to begin."""
+        """Stop the running scan, or the one due to start."""
         self.scan.next_follows = False
         self.rig.stop_scan(self.clock.now_s())
 
     # --- scans ---
 
     def start_scan(self) -> None:
-        """If it can; there is no answer. While files are written GXSM does nothing else."""
+        """Start a scan if possible. GXSM reports no failure, and does nothing else while it writes files."""
         now_s = self.clock.now_s()
         self.scan.next_follows = now_s < self.saving.done_s
         if self.scan.next_follows:
@@ -244,7 +250,7 @@ class GxsmProgram:
         region = self.frame()
         self.rig.setup.region, self.rig.setup.shape, self.rig.setup.upwards = region, (rows, columns), False
         if self.card == "simulator":
-            # it turns its picture the other way than the frame
+            # the real simulator turns its picture against the direction of the frame
             self.rig.setup.region = replace(region, angle_rad=-region.angle_rad)
             self.rig.setup.line_s = _PIXELS_S + len(self.channels) * columns / entries["sim-stm-speed"]
         else:
@@ -265,7 +271,7 @@ class GxsmProgram:
         self.scan.runs, self.scan.saved = True, False
 
     def y_current(self, now_s: float) -> int:
-        """The last line that is complete: that of the scan before until the first is; the very last after a stop."""
+        """Return the last complete line; before the first one the previous scan's; after a stop the last line."""
         scan = self.scan.activity
         if scan is None:
             return 0
@@ -275,12 +281,12 @@ class GxsmProgram:
         return done - 1 if done else self.scan.y_before
 
     def frame(self) -> Region:
-        """The frame of the next scan."""
+        """Return the frame of the next scan."""
         x, y, width, height = (self.entries[ref] * ANGSTROM_M for ref in ("OffsetX", "OffsetY", "RangeX", "RangeY"))
         return Region((x, y), (width, height), -math.radians(self.entries["Rotation"]))
 
     def names(self, now_s: float) -> list[Path]:
-        """Return where each channel is to be saved, whatever is there already, or was; none before the first scan."""
+        """Return the paths that GXSM reports for its channels' files, existing or not; empty before the first scan."""
         if self.scan.activity is None:
             return []
         if self.scan.before is not None and now_s < self.scan.activity.start_s + NAMED_S:
@@ -290,11 +296,11 @@ class GxsmProgram:
         return [self.saving.named(ending, self.scan.number) for ending in self._endings()]
 
     def shown(self, path: Path) -> str:
-        """Return a path as it is told: a GXSM whose user has chosen no folder saves to ".", wherever it was started."""
+        """Return a path as GXSM reports it; in the default folder "./name", relative to GXSM's start folder."""
         return f"./{path.name}" if path.parent == self.folder else str(path)
 
     def image(self, channel: GxsmChannel) -> np.ndarray:
-        """Return what is in memory of a channel: rows that the last scan did not come to are as they were."""
+        """Return a channel of GXSM's memory: rows not yet scanned hold the previous scan."""
         if self.scan.activity is None or channel not in self.scan.memory:
             return np.zeros((0, 0), np.float32)
         now_s = self.clock.now_s()
@@ -304,10 +310,10 @@ class GxsmProgram:
         return np.where(np.isnan(scanned), self.scan.memory[channel], scanned)
 
     def save(self, now_s: float, *, finished: bool = False) -> None:
-        """Save the last scan, if there is one: again, if it was saved.
+        """Save the last scan, if any; a saved scan is saved again under the next number.
 
         Args:
-            finished: GXSM is done with it, whatever the time.
+            finished: True if GXSM has finished its own work on the scan; False: decided by the time since its end.
         """
         if self.scan.activity is None:
             return
@@ -343,7 +349,7 @@ class GxsmProgram:
     # --- the tip ---
 
     def move_tip(self, x: float, y: float) -> float:
-        """Within the frame, in ångström from its centre: 0, or -1 if that is outside."""
+        """Move the tip to x, y in ångström from the frame's centre; return 0, or -1 if outside the frame."""
         sides = self.entries["RangeX"], self.entries["RangeY"]
         if not all(abs(value) <= side / 2 * (1 + 1e-9) for value, side in zip((x, y), sides, strict=True)):
             return -1
@@ -357,7 +363,7 @@ class GxsmProgram:
             self.rig.move_probe(self.tip_m(), self.clock.now_s())
 
     def tip_m(self) -> tuple[float, float]:
-        """The position that the tip was sent to."""
+        """Return the position where the tip was sent, (x, y) in m."""
         angle, (cx, cy) = -math.radians(self.entries["Rotation"]), self.frame().center_m
         u, v = (self.entries[ref] * ANGSTROM_M for ref in ("ScanX", "ScanY"))
         return cx + math.cos(angle) * u - math.sin(angle) * v, cy + math.sin(angle) * u + math.cos(angle) * v
@@ -365,7 +371,7 @@ class GxsmProgram:
     # --- spectra ---
 
     def take_curve(self, kind: str) -> None:
-        """If it can; nobody is told whether."""
+        """Start a spectrum if possible. GXSM reports no failure."""
         if self.rig.busy(self.clock.now_s()):
             return
         try:
@@ -374,7 +380,7 @@ class GxsmProgram:
             self.dialogs.append(str(error))
 
     def columns(self, curve: SpectrumActivity) -> dict[str, np.ndarray]:
-        """Return the columns with GXSM's labels."""
+        """Return a spectrum's columns by GXSM's labels."""
         blanks = "    " if self.card == "RPSPMC" else ""
         found = {}
         for name, unit, values in zip(curve.names, curve.units, curve.values.T, strict=True):
@@ -385,7 +391,7 @@ class GxsmProgram:
     def _save_curve(self, curve: SpectrumActivity, now_s: float) -> None:
         self._curves += 1
         path = self._curve_path()
-        while self.card == "RPSPMC" and path.exists():  # others overwrite
+        while self.card == "RPSPMC" and path.exists():  # RPSPMC skips existing names, other hardware overwrites them
             self._curves += 1
             path = self._curve_path()
         offset = self.entries["OffsetX"], self.entries["OffsetY"]
@@ -398,7 +404,7 @@ class GxsmProgram:
 
 
 def _resized(image: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
-    """Return memory of another size: what both have stays, the rest is zero."""
+    # Where both sizes overlap, the memory keeps its values; the rest is zero.
     found = np.zeros(shape, np.float32)
     rows, columns = (min(pair) for pair in zip(shape, image.shape, strict=True))
     found[:rows, :columns] = image[:rows, :columns]

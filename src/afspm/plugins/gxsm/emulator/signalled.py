@@ -1,10 +1,11 @@
-"""The process that Gxsm4's shared memory belongs to, and that is signalled: it passes calls on to the emulator.
+"""Owner process of Gxsm4's shared memory: it receives the signals, and passes calls to the emulator.
 
-Run by `block.py` as a script of its own, with the name of the block and of the process; frames of a length and
-content go out to standard output (a call: the function's name, 64 bytes, and the pickled arguments), and come in from
-standard input (a status of 8 bytes, and the pickled result). It ends when that does. A block that is there already is
-taken over as it is, with a request in it that nobody has answered. One call is passed on at a time: a request that is
-written over another one before that is answered is answered with it.
+Started by `block.py` as a script of its own, with the name of the block and of the process; it ends when standard input
+does. Frames have a length and a content. Calls go to standard output: the function's name in 64 bytes, and the pickled
+arguments. Answers come from standard input: a status of 8 bytes, a length of 8 bytes, and the pickled result.
+
+An existing block is reused as it is, with an unanswered request in it. One call is passed on at a time: a request that
+overwrites another one receives the answer to that one.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def read(count: int) -> bytes:
 
 
 def passed_on(memory: mmap.mmap) -> bool:
-    """Pass on what is asked. Returns whether anything is."""
+    """Pass on a request; return False if there is none."""
     if struct.unpack_from("<q", memory, STATUS)[0] != 1:
         return False
     length = struct.unpack_from("<I", memory, LENGTH)[0]
@@ -44,7 +45,7 @@ def passed_on(memory: mmap.mmap) -> bool:
 
 
 def answered(memory: mmap.mmap) -> None:
-    """The answer, its status last."""
+    """Write an answer to the block, its status last."""
     answer = read(struct.unpack(">I", read(4))[0])
     memory[CONTENT : CONTENT + len(answer) - 16] = answer[16:]
     memory[LENGTH : LENGTH + 8] = answer[8:16]
@@ -63,7 +64,7 @@ def run(block: str, name: str) -> None:
     sys.stdout.buffer.flush()
     asked = False
     while True:
-        # while a call is out nothing else is passed on: whoever writes the answer does not read meanwhile
+        # one call at a time: the emulator does not read while it writes an answer, and both would block
         ready = select.select([0] if asked else [0, woken], [], [])[0]
         if 0 in ready:
             answered(memory)

@@ -1,4 +1,4 @@
-"""An emulated Nanonis controller: the vendor's TCP protocol and files, with simulated physics behind them."""
+"""Emulated Nanonis controller: the vendor's TCP protocol and files, with simulated physics."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Length
 from afspm.plugins.nanonis.emulator import logger, wire
 from afspm.plugins.nanonis.emulator.dispatch import DeferredResult, FunctionRefused, Results
-from afspm.plugins.nanonis.emulator.faults import FAULT_KINDS, senseless_value
 from afspm.plugins.nanonis.emulator.software import NanonisSoftware
 from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
 from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
 from afspm.simulation.instrument import InstrumentBusy
 
 RELEASES: Final = {"2021": 10862, "2022": 11798, "2023": 13742, "2024": 14429, "2025": 14573}
-"""By the year of the software: the first that has what the protocol has from then on."""
+"""By the year of the software: the first release with this version of the protocol."""
 _ACTS: Final = ("Start", "Action", "Set", "Pulse", "Withdraw", "StartMove", "Home")
 _LOGS_EVERY_S: Final = 0.005
-"""Real time between two looks at what the TCP Logger has to send."""
+"""Real time between two polls of the TCP Logger."""
 _OTHER_NAME: Final = "Util.RTFreqGet"
 _QPLUS: Final[PlainMapping] = {"resonance_hz": 30e3, "spring_n_per_m": 1800.0, "oscillation_m": 100e-12}
 _STM: Final[PlainMapping] = {"mode": "current", "setpoint": 100e-12, "qplus": True}
@@ -35,7 +34,8 @@ class NanonisRequest:
     """A request.
 
     Attributes:
-        name: of the function as the protocol has it; sent: as the client has written it, which is echoed.
+        name: the function's name in the protocol.
+        sent: the name as sent by the client, which the reply repeats.
     """
 
     name: str
@@ -45,7 +45,7 @@ class NanonisRequest:
 
 @dataclass(frozen=True)
 class PendingReply:
-    """A reply that comes when something has happened."""
+    """A reply that waits for an event."""
 
     asked: NanonisRequest
     later: DeferredResult
@@ -57,31 +57,58 @@ class PendingReply:
 
 @dataclass(frozen=True)
 class DelayedReply:
-    """A reply that is ready, and sent at a time."""
+    """A complete reply with the time at which it is sent."""
 
     content: bytes
     at_s: float
 
 
 class NanonisEmulator(Emulator):
-    """The emulated controller: of an STM with a qPlus sensor, unless `feedback` has another mode.
+    r"""The emulated controller of an STM with a qPlus sensor, unless `feedback` has another mode.
 
     Args:
-        release: of its software: a year of `RELEASES`, or the number itself.
-        port: the first that it listens on; 0: any free.
-        ports: how many, one after the other; where any is free, each is any.
-        logger_port: of the TCP Logger's stream; 0: any free one.
-        one_each: whether a port serves one client at a time, as the real one's do.
-        session_path: what it calls its session folder, e.g. "D:\\\\Data"; left out: what the folder is called here.
-        range_m: of its scanner in x and y.
-        bare_errors: replies with an error have no results; they have, all zero, if not.
-        grabbed_rows: how scans in its memory are handed out: "top-first" or as "recorded".
-        seed, faults, and all of the simulated world: as of every emulator.
+        release: release of its software: a year of `RELEASES`, or the number itself.
+        port: first port to listen on; 0: any free port.
+        ports: number of ports, consecutive unless `port` is 0.
+        logger_port: port of the TCP Logger's stream; 0: any free port.
+        one_each: True if a port serves one client at a time, as real ones do.
+        session_path: its own path of the session folder, e.g. "D:\\Data". Default: the local path.
+        range_m: range of its scanner in x and y.
+        bare_errors: True if replies with an error have no results; False: results of zeros.
+        grabbed_rows: order of rows of scans from its memory: "top-first" or as "recorded".
+        seed, faults, and the simulated world: settings of every emulator.
     """
 
     vendor = "Nanonis"
     usual: ClassVar[Mapping[str, object]] = {"port": 6501, "ports": 4, "logger_port": logger.USUAL_PORT}
-    fault_kinds: ClassVar[Mapping[str, str]] = FAULT_KINDS
+    fault_kinds: ClassVar[Mapping[str, str]] = {
+        "no-reply": "a request is not answered",
+        "slow": "a reply comes later, by the duration",
+        "dialog": "a dialog waits on the screen: nothing is answered for the duration",
+        "cut": "the connection is cut instead of a reply",
+        "truncated": "half a reply, then the connection is cut",
+        "error": "a reply with an error",
+        "refused": "an error in reply to what sets or starts something",
+        "wrong-name": "the reply to another function",
+        "wrong-release": "for the duration, replies have the fields of another release",
+        "garbage": "bytes that are not a reply",
+        "huge": "a reply that announces two gigabytes",
+        "not-utf8": "texts that are not UTF-8",
+        "nan": "NaN for every number",
+        "nonsense": "for the duration, well-formed replies with absurd values",
+        "crash": "the software crashes",
+        "file-late": "a file appears only after the duration",
+        "half-file": "a file is half written, and whole only after the duration",
+        "file-missing": "a file is announced but never written",
+        "stale-name": "the file of the previous scan is announced for a scan",
+        "autosave-off": "scans and spectra are not saved for the duration, despite the settings",
+        "late-start": "a scan begins, and is reported as running, only after the duration",
+        "no-start": "a scan does not begin, without an error",
+        "ends-at-once": "for the duration, waiting for the end of a scan returns at once if none runs",
+        "safe-tip": "the safe tip withdraws the tip and ends the scan",
+        "safe-tip-unnoticed": "the safe tip withdraws the tip, and the scan goes on in the air",
+        "panel-stop": "the scan is stopped at the panel",
+    }
 
     def __init__(
         self,
@@ -106,11 +133,10 @@ class NanonisEmulator(Emulator):
         self._range_m = range_m
         self._bare_errors = bare_errors
         if grabbed_rows not in ("top-first", "recorded"):
-            raise ConfigError(f"{grabbed_rows!r}", where="grabbed_rows", hint='"top-first" or "recorded"')
+            raise ConfigError(f"unknown order {grabbed_rows!r}", where="grabbed_rows", hint='"top-first" or "recorded"')
         self._grabbed_rows = grabbed_rows
 
     def open(self) -> str:
-        """Listen on all ports."""
         ports = [self.port + i if self.port else 0 for i in range(self._ports)]
         self._server = TcpServer(
             LOOPBACK,
@@ -135,11 +161,11 @@ class NanonisEmulator(Emulator):
         return f"{LOOPBACK}:{','.join(map(str, self._server.ports))}"
 
     def serve(self, timeout_s: float) -> None:
-        """Answer what has come."""
+        """Answer the received requests."""
         self._server.poll(timeout_s)
 
     def tick(self, now_s: float) -> float | None:
-        """Scans end, files are written, and who has waited for that is answered."""
+        """Advance scans and files, and send the replies that waited for them."""
         times = [self.software.advance(now_s), self._log_signals(now_s)]
         for connection in self._server.connections:
             times.append(self._go_on(connection, now_s))
@@ -147,7 +173,6 @@ class NanonisEmulator(Emulator):
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def _log_signals(self, now_s: float) -> float | None:
-        """Send what the TCP Logger has to; returns when there is more."""
         readers, signals = self._server.readers, self.software.signals
         stream = signals.logger
         stream.unread = [len(reader.sending) for reader in readers]
@@ -161,7 +186,6 @@ class NanonisEmulator(Emulator):
         return max(stream.next_s(), now_s + self.software.core.experiment_s(_LOGS_EVERY_S))
 
     def _go_on(self, connection: ClientConnection, now_s: float) -> float | None:
-        """Send what was waited for, if it is there; returns when to look again."""
         waits = connection.waits_for
         if isinstance(waits, DelayedReply):
             if now_s < waits.at_s:
@@ -174,7 +198,6 @@ class NanonisEmulator(Emulator):
         return None
 
     def _settled(self, connection: ClientConnection, waits: PendingReply, now_s: float) -> float | None:
-        """Reply if what was waited for has happened, or not in time; returns when to look again."""
         later = waits.later
         results = later.ready(now_s)
         if results is None and now_s >= later.until_s:
@@ -195,7 +218,6 @@ class NanonisEmulator(Emulator):
     # --- requests ---
 
     def _answer_all(self, connection: ClientConnection) -> None:
-        """Answer the requests received on a connection until one has to wait."""
         while connection.waits_for is None and not connection.closing:
             now_s = self.clock.now_s()
             if self.faults.lasts("dialog", now_s):
@@ -215,14 +237,13 @@ class NanonisEmulator(Emulator):
 
     @contextmanager
     def _refusing(self, connection: ClientConnection, asked: NanonisRequest) -> Iterator[None]:
-        """Answer with an error where something can't be: all that a client asks passes through here."""
         try:
             yield
         except (FunctionRefused, InstrumentBusy, InvalidValue, wire.MalformedRequest) as error:
             self._refuse(connection, asked, str(error))
         except Crashed:
             raise
-        except Exception as error:
+        except Exception as error:  # an error of the emulator must not end it: the client sees one, too
             self.log.exception("%s failed", asked.name)
             self._refuse(connection, asked, str(error))
 
@@ -252,7 +273,7 @@ class NanonisEmulator(Emulator):
             self._reply(connection, asked, found)
 
     def _wire_release(self, now_s: float) -> int:
-        """The release by which the fields go."""
+        # A fault makes the replies use the fields of another release.
         if self.faults.lasts("wrong-release", now_s):
             return min(RELEASES.values()) if self.release > min(RELEASES.values()) else max(RELEASES.values())
         return self.release
@@ -270,11 +291,10 @@ class NanonisEmulator(Emulator):
         fields = wire.functions()[asked.name].results
         padded = (*results, *(wire.ZEROS[field.code] for field in fields[len(results) :]))
         if self.faults.lasts("nonsense", now_s):
-            padded = tuple(senseless_value(field.code, self._chance) for field in fields)
+            padded = tuple(wire.senseless_value(field.code, self._chance) for field in fields)
         self._send(connection, asked.sent, wire.body(asked.name, padded, self._wire_release(now_s), encoding))
 
     def _send(self, connection: ClientConnection, name: str, body: bytes) -> None:
-        """A reply, or what goes wrong with it."""
         now_s = self.clock.now_s()
         content = wire.reply(name, body)
         if self.faults.strikes("no-reply", now_s):
@@ -298,7 +318,7 @@ class NanonisEmulator(Emulator):
 
 
 def _of_stm(feedback: object) -> object:
-    """Complete the settings of the feedback; those of another mode, or no table at all, stay as they are."""
+    # A feedback of another mode, or a malformed table, stays as it is.
     if not isinstance(feedback, Mapping) or feedback.get("mode", "current") != "current":
         return feedback
     sensor = feedback.get("sensor", {})

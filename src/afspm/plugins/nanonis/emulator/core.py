@@ -1,4 +1,4 @@
-"""The state that all modules of the Nanonis software share."""
+"""State shared by all modules of the Nanonis software."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Z_CONTROLLERS: Final = {
     "frequency-shift": ("OC M1 Freq. Shift", "Hz"),
     "amplitude": ("Amplitude", "V"),
 }
-"""By the mode of the simulated feedback."""
+"""Name and unit of the z controller, by the mode of the simulated feedback."""
 
 
 @dataclass
@@ -27,10 +27,10 @@ class NanonisCore:
     """The shared state.
 
     Attributes:
-        range_m: of the scanner in x, y and z.
-        release: of the software.
+        range_m: range of the scanner in x, y and z.
+        release: release of the software.
         client: memory of the client whose request is being answered.
-        opened: the modules that clients have opened.
+        opened: modules opened by clients.
     """
 
     rig: Instrument
@@ -54,19 +54,19 @@ class NanonisCore:
 
     @property
     def z_controller_name(self) -> tuple[str, str]:
-        """Name of the z controller and unit of its setpoint."""
+        """Name of the z controller, and unit of its setpoint."""
         return _Z_CONTROLLERS[self.rig.world.settings.feedback.mode]
 
     def experiment_s(self, real_s: float) -> float:
-        """Convert real to experiment seconds."""
+        """Convert real seconds to experiment seconds."""
         return real_s / self.clock.real_s(1.0)
 
     def deadline_s(self, timeout_ms: int) -> float:
-        """Return the experiment time at which a client's timeout ends, which counts in real time."""
+        """Convert a client's timeout, real time, to a deadline in experiment time."""
         return math.inf if timeout_ms < 0 else self.now_s + self.experiment_s(timeout_ms / 1000)
 
     def until_free(self, wait: int, timeout_ms: int = -1) -> Answer:
-        """Return at once, or when the instrument is free if `wait` is set."""
+        """Return at once, or if `wait` is set as soon as the instrument is free."""
         if not wait:
             return ()
         return DeferredResult(lambda now_s: None if self.rig.busy(now_s) else (), self.deadline_s(timeout_ms))

@@ -1,4 +1,4 @@
-"""Dispatch of the protocol's functions to their handlers: methods of the software's modules, marked by `answers`."""
+"""Dispatch of the protocol's functions to handlers: methods of the software's modules marked by `answers`."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _STORED: Final = (
     "Bias", "BiasSpectr", "Current", "ZCtrl", "SafeTip", "AutoApproach", "ZSpectr", "Piezo", "Scan", "FolMe", "Pattern",
     "TipShaper", "Motor", "AtomTrack", "LockIn", "PLL", "Signals", "UserIn", "UserOut", "TCPLog", "Util", "File",
 )  # fmt: skip
-"""Modules of the real software: of functions without a handler, what is set in them is at least got again."""
+"""Modules of the real software, whose functions without a handler store values in registers."""
 _KEEPS_NAN: Final = ("BiasSpectr.PropsSet",)
 _MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
-"""A slew rate that is not limited is infinite."""
+"""Infinite slew rates mean no limit."""
 
 
 class FunctionRefused(Exception):
@@ -30,13 +30,13 @@ class FunctionRefused(Exception):
 
 @dataclass(frozen=True)
 class DeferredResult:
-    """A result that comes when something has happened.
+    """A result that waits for an event.
 
     Attributes:
-        ready: gives the results once it has.
-        until_s: or at that time, experiment seconds, with `timed_out`.
-        gave_up: called when that time has come first.
-        next_s: when to look again, where nothing else tells.
+        ready: returns the results after the event, None before.
+        until_s: deadline in experiment seconds, with `timed_out` as the results.
+        gave_up: called when the deadline passes first.
+        next_s: time of the next check, if nothing else triggers it.
     """
 
     ready: Callable[[float], Results | None]
@@ -51,7 +51,7 @@ Handler = Callable[..., Answer]
 
 
 def answers(*names: str) -> Callable[[Handler], Handler]:
-    """Mark a method as the handler of these functions; a parameter `name` receives the function's name."""
+    """Mark a method as the handler of functions; its parameter `name` receives the called function's name."""
 
     def marked(handler: Handler) -> Handler:
         handler.answered_functions = names  # type: ignore[attr-defined]
@@ -61,7 +61,7 @@ def answers(*names: str) -> Callable[[Handler], Handler]:
 
 
 class Dispatcher:
-    """The handlers of all modules, and the registers behind the other functions."""
+    """The handlers of all modules, with registers behind all other functions."""
 
     def __init__(self, registers: Registers, modules: Iterable[object]) -> None:
         self._registers = registers
@@ -72,7 +72,7 @@ class Dispatcher:
                     self._handlers[name] = _bound(getattr(module, attribute), name)
 
     def call(self, name: str, arguments: list[object]) -> Answer:
-        """Execute a function and return its results.
+        """Execute a function; return its results.
 
         Raises:
             FunctionRefused, InstrumentBusy, InvalidValue.
@@ -95,19 +95,18 @@ class Dispatcher:
 
 
 def _bound(handler: Handler, name: str) -> Handler:
-    """Return the handler for one function, whose name it is told if it asks for that."""
     return partial(handler, name) if "name" in inspect.signature(handler).parameters else handler
 
 
 def chosen(number: int, *choices: object) -> Any:
-    """Return the choice of a number; choice 0 is usually "no change"."""
+    """Return the choice with a number; 0 usually means no change."""
     if not 0 <= number < len(choices):
         raise FunctionRefused(f"{number} is none of the choices")
     return choices[number]
 
 
 def _refuse_nan(name: str, arguments: Iterable[object], *, keeps_nan: bool) -> None:
-    """The maker's own examples say of some functions that NaN is no change; (!) how others take it is not known."""
+    # NaN means no change in the maker's own examples of some functions; (!) its meaning for others is unknown.
     for argument in arguments:
         if not isinstance(argument, str) and np.asarray(argument).dtype.kind == "f":
             values = np.asarray(argument)

@@ -1,4 +1,4 @@
-"""The files that Nanonis saves: scans (.sxm) and spectra (.dat), with the headers that real ones have."""
+"""The files that Nanonis saves: scans (.sxm) and spectra (.dat), with the headers of real files."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ class SxmContent:
     """The content of a scan's file.
 
     Attributes:
-        center_m, range_m: of the frame of whole pixels; angle_deg clockwise.
-        line_s: forward and backward.
-        channels: index, name, unit, and images forward and backward, each [y, x] with both ascending.
-        settings: lines of the header `module>name`, in their order.
+        center_m, range_m: frame from edge to edge of its pixels.
+        angle_deg: clockwise.
+        line_s: duration of a line forward, backward.
+        channels: index, name, unit, and images forward and backward, both [y, x] with both axes ascending.
+        settings: header lines `module>name`, in order.
     """
 
     path: str
@@ -38,7 +39,7 @@ class SxmContent:
 
 
 def sxm(scan: SxmContent) -> bytes:
-    """The bytes of a scan's file."""
+    """Encode a scan's file."""
     rows, columns = scan.channels[0][3].shape
     start = _local(scan.start_s)
     name, on, setpoint, unit, proportional, integral = scan.z_controller
@@ -69,6 +70,7 @@ def sxm(scan: SxmContent) -> bytes:
         ),
     }
     header = "".join(f":{key}:\n{value}\n" for key, value in fields.items()) + ":SCANIT_END:\n\n\n"
+    # As in real files: backward lines from right to left, rows in recording order.
     images = (image for *_, forward, backward in scan.channels for image in (forward, backward[:, ::-1]))
     recorded = (image if scan.upwards else image[::-1] for image in images)
     values = b"".join(np.asarray(image, dtype=">f4").tobytes() for image in recorded)
@@ -76,7 +78,7 @@ def sxm(scan: SxmContent) -> bytes:
 
 
 def dat(header: Mapping[str, str], columns: Sequence[str], values: np.ndarray) -> bytes:
-    """The bytes of a spectrum's file: values [points, columns]."""
+    """Encode a spectrum's file: values [points, columns]."""
     lines = [f"{key}\t{value}\t" for key, value in header.items()]
     table = ["\t".join(columns), *("\t".join(engineering(value) for value in row) for row in values.tolist())]
     return "".join(f"{line}\r\n" for line in [*lines, "", "[DATA]", *table]).encode("latin-1", "replace")
@@ -84,7 +86,7 @@ def dat(header: Mapping[str, str], columns: Sequence[str], values: np.ndarray) -
 
 @dataclass(frozen=True)
 class DatContent:
-    """The content of a spectrum's file: lines of the header, split at tabs, and values [points, columns]."""
+    """The content of a spectrum's file: header lines split at tabs, and values [points, columns]."""
 
     header: Sequence[Sequence[str]]
     columns: Sequence[str]
@@ -92,7 +94,7 @@ class DatContent:
 
 
 def read_dat(content: bytes) -> DatContent:
-    """Read what `dat` writes. Raises ValueError: there is no such table."""
+    """Parse the result of `dat`. Raises ValueError: no such table."""
     head, found, table = content.decode("latin-1").partition("[DATA]")
     names, *rows = table.strip().splitlines() or [""]
     if not found or not names:
@@ -103,17 +105,17 @@ def read_dat(content: bytes) -> DatContent:
 
 
 def moment(time_s: float) -> str:
-    """Date and time on the clock of the controller's computer."""
+    """Format a time by the clock of the controller's computer."""
     return f"{_local(time_s):%d.%m.%Y %H:%M:%S}"
 
 
 def scientific(value: float, digits: int) -> str:
-    """As "1.500E-9": an exponent without leading zeros."""
+    """Format as "1.500E-9": the exponent has no leading zeros."""
     return re.sub(r"E([+-])0+(?=\d)", r"E\1", f"{value:.{digits}E}")
 
 
 def engineering(value: float) -> str:
-    """As "15.0000E-9": an exponent divisible by three, six digits."""
+    """Format as "15.0000E-9": six digits, and an exponent divisible by three."""
     if not math.isfinite(value):
         return str(value).replace("nan", "NaN").replace("inf", "Inf")
     decade = int(f"{value:.5E}".partition("E")[2])

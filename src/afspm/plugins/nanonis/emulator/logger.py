@@ -1,4 +1,4 @@
-"""The TCP Logger: a stream of signals on a port of its own, to every client connected there. No sockets here."""
+"""The TCP Logger: a stream of signals to every client of a port of its own. No sockets here."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import Final
 USUAL_PORT: Final = 6590
 LARGEST_OVERSAMPLING: Final = 1000
 MOST_WAITING: Final = 1 << 20
-"""Bytes that a reader may leave unread: after that it gets nothing more until it has read."""
+"""Highest number of unread bytes of a reader, which receives nothing more until it has read."""
 _RATE_HZ: Final = 2000.0
 _MOST_AT_ONCE: Final = 20
 _DISCONNECTED, _IDLE, _RUNNING, _OVERFLOW = 0, 1, 4, 7
 
 
 class TcpLogger:
-    """The TCP Logger: which slots it streams, and its frames.
+    """The TCP Logger: selected slots, and frames.
 
     Attributes:
-        slots: of the Signals Manager, which the channels are.
-        oversampling: how many samples a value stands for.
-        unread: how many bytes each reader has left unread.
+        slots: streamed slots of the Signals Manager.
+        oversampling: number of samples averaged into a value.
+        unread: unread bytes of each reader.
     """
 
     def __init__(self) -> None:
@@ -38,15 +38,14 @@ class TcpLogger:
         return self._started_s is not None and bool(self.unread)
 
     def start(self, now_s: float) -> None:
-        """Begin, with the counter at zero."""
+        """Start with the counter at zero."""
         self._started_s, self._counter = now_s, 0
 
     def stop(self) -> None:
-        """Send nothing more."""
         self._started_s = None
 
     def status(self) -> int:
-        """Return the status code of the protocol."""
+        """Return the protocol's status code."""
         if not self.unread:
             return _DISCONNECTED
         if self._started_s is None:
@@ -54,7 +53,7 @@ class TcpLogger:
         return _OVERFLOW if max(self.unread) >= MOST_WAITING else _RUNNING
 
     def due(self, now_s: float) -> range:
-        """The counters of the frames to be sent now; what more has become due at once is lost, as they show."""
+        """Return the counters of the frames due now; frames beyond the limit are lost, as their counters show."""
         if self._started_s is None:
             return range(0)
         until = math.floor((now_s - self._started_s) / self._period_s + 1e-9)
@@ -67,7 +66,7 @@ class TcpLogger:
         return math.inf if self._started_s is None else self._started_s + self._period_s * (self._counter + 1)
 
     def frame(self, counter: int, values: Sequence[float]) -> bytes:
-        """The number of channels (i), the oversampling (f), the counter (64 bits), the state (H), the values (f)."""
+        """Encode a frame: number of channels (i), oversampling (f), counter (64 bits), state (H), values (f)."""
         head = struct.pack(">ifqH", len(values), float(self.oversampling), counter, _RUNNING)
         return head + struct.pack(f">{len(values)}f", *values)
 

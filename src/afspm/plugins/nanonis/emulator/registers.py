@@ -45,21 +45,22 @@ _KEYED_OTHERWISE: Final[dict[str, tuple[tuple[int, ...], tuple[int, ...]]]] = {
     "APRFGen.Freq": ((), (1,)),
     "APRFGen.Power": ((), (1,)),
 }
-"""Which of the arguments that are set say what they belong to, and which of them are got, where it is not that the
-first ones are those that it is got by, and the others are got in their order."""
+"""Positions of arguments of `…Set`: the ones that name the item, and the ones that `…Get` returns.
+
+Usually the first arguments are those of `…Get` and name the item, and all others are returned in their order."""
 
 _OTHER_NAMES: Final = {"AtomTrack.StatusGet": "AtomTrack.Ctrl"}
-"""The registers that are got by a name of another form."""
+"""Getters and setters with different names."""
 
 
 class Registers:
-    """The registers, by name and by what they belong to (the number of a modulator, an output …)."""
+    """The registers, by name and by the item that they belong to (number of a modulator, an output …)."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, Values], Values] = {}
 
     def set(self, name: str, arguments: Sequence[object]) -> None:
-        """Store the arguments of the function `name`. Raises ValueError: an argument is none of its choices."""
+        """Store the arguments of a function. Raises ValueError: an argument is none of its choices."""
         register = name.removesuffix("Set")
         fields = wire.functions()[name].arguments
         by, taken = _parts(register, len(arguments))
@@ -71,15 +72,15 @@ class Registers:
         self._kept[key] = tuple(now)
 
     def put(self, register: str, *values: object) -> None:
-        """Keep the values of a register that belongs to nothing in particular."""
+        """Store the values of a register that belongs to no item."""
         self._kept[register, ()] = values
 
     def get(self, register: str, belongs_to: Sequence[object] = ()) -> Values:
-        """Return the stored values, or the initial ones; empty if there are none."""
+        """Return the stored or initial values; empty if there are none."""
         return self._kept.get((register, tuple(belongs_to)), AT_FIRST.get(register, ()))
 
     def got(self, name: str, arguments: Sequence[object]) -> Values:
-        """The results of a function `…Get`: all that its fields have, zero where nothing is known."""
+        """Return the results of a function `…Get`: all fields, zero if unknown."""
         kept = self.get(_OTHER_NAMES.get(name, name.removesuffix("Get")), arguments)
         codes = [field.code for field in wire.functions()[name].results]
         zeros = tuple(wire.ZEROS[code] for code in codes)
@@ -101,7 +102,6 @@ def _keys_without_getter(register: str) -> int:
 
 
 def _set(mark: str, value: Any, before: object) -> object:
-    """Store a value; NaN is no change."""
     if isinstance(value, float) and math.isnan(value):
         return before
     if mark == "?":

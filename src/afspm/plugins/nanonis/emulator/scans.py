@@ -1,4 +1,4 @@
-"""The Scan module: frame, buffer, speed and properties, the running scan, and its file."""
+"""The Scan module: frame, buffer, speed, properties, the running scan and its file."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ Image = tuple[str, str, np.ndarray, np.ndarray]
 """Name, unit, values forward and backward [y, x]."""
 _PIXELS_AT_ONCE: Final = 16
 _WAITED: Final = "waited"
-"""Memory of a client: how many scans had ended, and when, before it waits for the next end."""
+"""Key in a client's memory: number of ended scans, and time, when it started to wait for the next end."""
 _PASTES: Final = (0, 1, 2)
 _SMALLEST_M: Final = 2e-12
-"""Of a frame: half of it, in two lines, is what the simulated scanner can just scan."""
+"""Smallest side of a frame: half of it is the shortest line distance of the simulated scanner."""
 _AUTOSAVE: Final = ("all", "next", "off")
 
 
 @dataclass
 class StartedScan:
-    """A scan with the settings of its start."""
+    """A scan with the settings at its start."""
 
     scan: ScanActivity
     frame: tuple[float, float, float, float, float]
@@ -41,7 +41,7 @@ class StartedScan:
 
 @dataclass
 class ScanProperties:
-    """The properties that `Scan.PropsSet` sets; `autosave` is "all", "next" or "off"."""
+    """The properties behind `Scan.PropsSet`; `autosave` is "all", "next" or "off"."""
 
     continuous: bool = False
     bouncy: bool = False
@@ -53,13 +53,13 @@ class ScanProperties:
 
 
 class ScanFiles:
-    """Images of scans, and the files that they are saved in."""
+    """Images of scans, and their files."""
 
     def __init__(self, core: NanonisCore, signals: Signals) -> None:
         self._core, self._signals = core, signals
 
     def images(self, started: StartedScan, until_s: float | None) -> dict[int, Image]:
-        """Return an image for each channel; lines not yet scanned are NaN."""
+        """Return the image of each channel; lines not yet scanned are NaN."""
         drawn = started.scan.channels(until_s)
         found: dict[int, Image] = {}
         for channel, (unit, values) in drawn.items():
@@ -73,7 +73,7 @@ class ScanFiles:
         return {index: found[index] for index in started.channels}
 
     def save(self, ended: StartedScan, properties: ScanProperties, now_s: float) -> str:
-        """Save a scan; return the path that the controller announces."""
+        """Save a scan; return the path that the controller reports."""
         session, scan, feedback = self._core.session, ended.scan, ended.scan.feedback
         name = session.next_name(properties.series, 3, ".sxm")
         path = session.path_of(name)
@@ -116,16 +116,17 @@ class ScanFiles:
 
 
 class ScanModule:
-    """The module.
+    """The Scan module.
 
     Args:
-        rows_as_recorded: whether `Scan.FrameDataGrab` returns rows as recorded, or top first.
+        rows_as_recorded: True if `Scan.FrameDataGrab` returns rows as recorded, False for the top row first.
 
     Attributes:
         frame: x, y, width, height in m, angle clockwise in degrees.
-        speed: forward, backward in m/s and s a line, whether the time is kept (and not the speed), their ratio.
-        running: the scan that goes on; `last` the last one started.
-        ends: how many scans have ended.
+        speed: forward, backward in m/s and in s a line; 1 if the time and not the speed is kept; their ratio.
+        running: the running scan.
+        last: the scan started last.
+        ends: number of ended scans.
     """
 
     def __init__(self, core: NanonisCore, signals: Signals, *, rows_as_recorded: bool) -> None:
@@ -144,7 +145,7 @@ class ScanModule:
     # --- the running scan ---
 
     def advance(self, now_s: float) -> float | None:
-        """Start and end scans that are due; return when a delayed one starts."""
+        """Start and end due scans; return the start of a delayed one."""
         if self.running is not None and self._core.faults.strikes("panel-stop", now_s):
             self._core.rig.stop_scan(now_s)
         if self._delayed_start is not None and now_s >= self._delayed_start[0]:
@@ -170,7 +171,7 @@ class ScanModule:
     def _action(self, action: int, direction: int) -> Answer:
         now_s, rig = self._core.now_s, self._core.rig
         if action == 0:
-            if self.running is not None:  # it begins anew
+            if self.running is not None:  # the running scan is restarted
                 rig.stop_scan(now_s)
                 self.advance(now_s)
             self._start_on_request(bool(direction), now_s)
@@ -221,11 +222,9 @@ class ScanModule:
 
     @answers("Scan.WaitEndOfScan")
     def _wait_end_of_scan(self, timeout_ms: int) -> Answer:
-        """Wait for the next end of a scan; an earlier one does not count.
-
-        A client's pause since it has begun the scan, or since its last wait has timed out, is taken to last as long in
-        experiment time as it does in real time, as if the clock went no faster.
-        """
+        # The next end of a scan counts, not an earlier one. A client's pause since its start of the scan, or since its
+        # last timeout, counts as long in experiment time as in real time: a fast clock must not let a scan end between
+        # two waits.
         core, client, ends = self._core, self._core.client, self.ends
         if self.running is None and core.faults.lasts("ends-at-once", core.now_s):
             return 0, ""
@@ -245,7 +244,7 @@ class ScanModule:
 
     @answers("Scan.WaitEndOfLine")
     def _wait_end_of_line(self, timeout_ms: int) -> Answer:
-        """Wait for the end of a line, forward (0) or backward (1), counted from 1."""
+        # Lines are counted from 1; direction 0 is forward, 1 backward.
         scan = self._core.rig.scan
         timed_out = (1, 0, 0, 0)
         if scan is None or not scan.running(self._core.now_s):
@@ -266,12 +265,14 @@ class ScanModule:
 
     @answers("Scan.FrameSet")
     def set_frame(self, x: float, y: float, width: float, height: float, angle_deg: float) -> Answer:
-        """Set the frame, moved into the scanner's range as the real one does.
+        """Set the frame, clipped to the scanner's range like the real controller.
 
-        (!) What the real one does with a frame smaller than an atom is not known: here it is refused.
+        (!) The real controller's answer to a frame smaller than an atom is unknown: here it is refused.
         """
         if not (min(width, height) >= _SMALLEST_M and all(map(math.isfinite, (x, y, width, height, angle_deg)))):
-            raise FunctionRefused(f"a frame of {width:g} m x {height:g} m can't be scanned: from {_SMALLEST_M:g} m")
+            raise FunctionRefused(
+                f"a frame of {width:g} m x {height:g} m can't be scanned: its sides must be at least {_SMALLEST_M:g} m"
+            )
         range_m = self._core.range_m[:2]
         width, height = min(width, range_m[0]), min(height, range_m[1])
         x, y = (
@@ -288,7 +289,7 @@ class ScanModule:
 
     @answers("Scan.BufferSet")
     def _set_buffer(self, channels: list[int], pixels: int, lines: int) -> Answer:
-        """The pixels of a line come in packages of 16: any other number is made one of those."""
+        # The real controller rounds the pixels of a line to multiples of 16.
         if not all(0 <= channel < 128 for channel in channels) or not 1 <= pixels <= MOST_PIXELS or lines < 0:
             raise FunctionRefused("no such channel or number of pixels")
         ratio = self.lines / self.pixels
@@ -303,7 +304,7 @@ class ScanModule:
 
     @answers("Scan.SpeedSet")
     def _set_speed(self, *speed: Any) -> Answer:
-        """`keep` is 1 for the speed and 2 for the time; which of both is kept says which of both counts now."""
+        # In SpeedSet, keep 1 is the speed and 2 the time, in SpeedGet 0 and 1. The kept one is the one that counts now.
         *speeds, keep, ratio = speed
         if not min(speeds) > 0.0 or keep > 2:
             raise FunctionRefused("no such speed")
@@ -328,6 +329,7 @@ class ScanModule:
         self, continuous: int, bouncy: int, autosave: int, series: str, comment: str, *rest: Any
     ) -> Answer:
         props = self.properties
+        # In PropsSet 0 is no change, 1 on, 2 off.
         props.continuous = bool(chosen(continuous, props.continuous, 1, 0))
         props.bouncy = bool(chosen(bouncy, props.bouncy, 1, 0))
         props.autosave = chosen(autosave, props.autosave, *_AUTOSAVE)
@@ -342,6 +344,7 @@ class ScanModule:
     def _properties(self) -> Answer:
         props = self.properties
         counts, table = [1] * len(props.modules), [["Setpoint"] for _ in props.modules]
+        # PropsGet counts differently from PropsSet, which has 0 for no change: all 0, next 1, off 2.
         flags = int(props.continuous), int(props.bouncy), _AUTOSAVE.index(props.autosave)
         return *flags, props.series, props.comment, list(props.modules), counts, table, props.autopaste
 

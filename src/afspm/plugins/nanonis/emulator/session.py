@@ -1,4 +1,4 @@
-"""The session folder: its path on the controller's computer, file names, and writing as well as the faults allow."""
+"""The session folder: its path on the controller's computer, file names, and writing with faults."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ _LONGEST_NAME: Final = 200
 
 
 class SessionFolder:
-    """The folder for scans and spectra.
+    """The folder of scans and spectra.
 
     Attributes:
-        folder: on this computer; `path` is its path on the controller's computer, which clients see.
+        folder: local path.
+        path: path on the controller's computer, as clients see it.
     """
 
     def __init__(self, folder: Path, path: str, faults: Faults, log: logging.Logger) -> None:
@@ -28,7 +29,7 @@ class SessionFolder:
         self._late: list[tuple[float, Path, bytes]] = []
 
     def change(self, path: str) -> None:
-        """Change to a folder within the initial one. Raises InvalidValue."""
+        """Change to a subfolder of the initial folder. Raises InvalidValue: another folder."""
         root = self._root_path.rstrip("\\/")
         if path.rstrip("\\/") != root and not path.startswith((f"{root}/", f"{root}\\")):
             raise InvalidValue(f"Session Path not valid: {path!r}", hint=f"{root}, or a folder in it")
@@ -39,7 +40,7 @@ class SessionFolder:
         self.folder, self.path = folder, path
 
     def next_name(self, base: str, digits: int, suffix: str) -> str:
-        """Return a name with the next number that no file has."""
+        """Return the next file name with a free number."""
         while True:
             number = self._numbers[base, suffix] = self._numbers.get((base, suffix), 0) + 1
             name = f"{base}{number:0{digits}d}{suffix}"
@@ -47,12 +48,12 @@ class SessionFolder:
                 return name
 
     def path_of(self, name: str) -> str:
-        """Return the path of a file on the controller's computer."""
+        """Return a file's path on the controller's computer."""
         windows = "\\" in self.path
         return str(PureWindowsPath(self.path) / name) if windows else str(Path(self.path) / name)
 
     def save(self, name: str, content: bytes, now_s: float) -> bool:
-        """Write a file as well as the faults allow; return whether the controller announces it."""
+        """Write a file, subject to faults; return True if the controller reports its path."""
         path = self.folder / name
         if self._faults.strikes("file-missing", now_s):
             return True
@@ -63,14 +64,14 @@ class SessionFolder:
         return late is not None or self._write(path, content[: len(content) // 2] if half else content)
 
     def read(self, path: str) -> bytes:
-        """Return a file of the folder, by the path that the controller announces. Raises OSError, InvalidValue."""
+        """Read a file by its path on the controller's computer. Raises OSError, InvalidValue."""
         name = PureWindowsPath(path).name
         if path != self.path_of(name):
             raise InvalidValue(f"{path!r} is not in the session folder", hint=self.path)
         return (self.folder / checked_name(name)).read_bytes()
 
     def write_late(self, now_s: float) -> float | None:
-        """Write the late files that are due; return when the next one is."""
+        """Write the late files that are due; return the time of the next one."""
         due = [late for late in self._late if late[0] <= now_s]
         self._late = [late for late in self._late if late[0] > now_s]
         for _, path, content in due:
@@ -87,7 +88,7 @@ class SessionFolder:
 
 
 def checked_name(text: str) -> str:
-    """Check a part of a file's name. Raises InvalidValue: Windows, where Nanonis runs, does not allow it."""
+    """Check a part of a file name. Raises InvalidValue: Windows, the controller's system, does not allow it."""
     if not _NO_FILE_NAME.isdisjoint(text) or len(text) > _LONGEST_NAME or text.strip(". ") != text:
         raise InvalidValue(f"{text!r} can't be part of a file's name")
     return text

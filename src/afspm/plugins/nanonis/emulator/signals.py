@@ -1,4 +1,4 @@
-"""The signals of the Nanonis software: names, units, present values, the Signals Manager and the TCP Logger."""
+"""Signals of the Nanonis software: names, units, present values, the Signals Manager and the TCP Logger."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from afspm.plugins.nanonis.emulator.logger import LARGEST_OVERSAMPLING, TcpLogge
 from afspm.simulation.activities import RETRACE, SpectrumActivity
 
 CHANNELS: Final = {"Current": 0, "Height": 14, "Phase": 16, "Amplitude": 17, "Frequency Shift": 18}
-"""Simulated channel -> index of its signal."""
+"""Index of the signal by simulated channel."""
 NAMES: Final = {"Height": "Z", "Frequency Shift": "OC M1 Freq. Shift"}
 _CURRENT, _BIAS = CHANNELS["Current"], 24
 _UNITS: Final = {"Current": "A", "Height": "m", "Phase": "deg", "Amplitude": "V", "Frequency Shift": "Hz"}
 _OF_SPECTRA: Final = {"Deflection": (20, "m"), "Force": (21, "N"), "dI/dV": (22, "S")}
-"""Signals of spectra alone, with their units."""
+"""Signals of spectra only: index and unit."""
 _SWEPT: Final = {"Bias": "Bias calc", "Z": "Z rel"}
 _SLOTS: Final = 24
 _GAINS: Final = [f"LN 10^{decade}" for decade in range(3, 12)]
@@ -25,11 +25,11 @@ _ADDITIONAL: Final = ["Counter 1 (Hz)", "Counter 2 (Hz)"]
 
 
 class Signals:
-    """The signals and what reads them.
+    """The signals, and the functions that read them.
 
     Attributes:
-        names: of the 128 signals, with their units.
-        slots: the signals in the 24 slots of the Signals Manager.
+        names: names with units of the 128 signals.
+        slots: indexes of the signals in the 24 slots of the Signals Manager.
     """
 
     def __init__(self, core: NanonisCore) -> None:
@@ -44,7 +44,7 @@ class Signals:
             self._registers.set("PLL.AmpCtrlSetpntSet", [1, sensor.oscillation_m])
 
     def values(self, indexes: Sequence[int], now_s: float) -> list[float]:
-        """Return the values of signals at one moment; unconnected ones are zero."""
+        """Return the values of signals at one time; unconnected ones are zero."""
         rig = self._core.rig
         shown = rig.signals(now_s)
         values = {CHANNELS[name]: value for name, value in shown.items() if name in CHANNELS}
@@ -52,11 +52,11 @@ class Signals:
         return [values.get(index, 0.0) for index in indexes]
 
     def z_m(self, now_s: float) -> float:
-        """Return the height of the tip."""
+        """Return the height of the tip in m."""
         return self._z_m(self._core.rig.signals(now_s)["Height"])
 
     def _z_m(self, shown_m: float) -> float:
-        """A withdrawn tip is at the upper end of the range."""
+        # A withdrawn tip is at the upper end of the range.
         return shown_m if self._core.rig.engaged else self._core.range_m[2] / 2 + shown_m
 
     # --- the Signals Manager ---
@@ -146,20 +146,19 @@ class Signals:
 
     @answers("PLL.FreqShiftGet")
     def _frequency_shift(self, modulator: int) -> Answer:
-        """Return the measured shift of the first modulator, or the stored value of the others."""
+        # Only the first modulator measures; the others return stored values.
         if modulator == 1 and self._core.measures_frequency_shift:
             return tuple(self.values([CHANNELS["Frequency Shift"]], self._core.now_s))
         return self._registers.got("PLL.FreqShiftGet", [modulator])
 
     @answers("PLL.AmpCtrlGainGet", "PLL.PhasCtrlGainGet")
     def _gain(self, name: str, modulator: int) -> Answer:
-        """Return P and T, which can be set, and I = P / T."""
+        # I = P / T follows from P and T, and can't be set.
         proportional, time_s, _ = self._registers.got(name, [modulator])
         return proportional, time_s, proportional / time_s if time_s else 0.0
 
     @answers("PLL.FreqShiftAutoCenter")
     def _center_frequency(self, modulator: int) -> Answer:
-        """Move the centre to where the frequency has shifted to."""
         (shift_hz,) = self._registers.got("PLL.FreqShiftGet", [modulator])
         (center_hz,) = self._registers.got("PLL.CenterFreqGet", [modulator])
         self._registers.set("PLL.CenterFreqSet", [modulator, center_hz + shift_hz])
@@ -200,7 +199,7 @@ class Signals:
 
 
 def spectrum_columns(curve: SpectrumActivity) -> list[str]:
-    """Return the column names as Nanonis writes them: "Current [bwd] (A)"; the swept signal comes first."""
+    """Return the column names as in Nanonis' files, "Current [bwd] (A)", the swept signal first."""
     columns: list[str] = []
     for name, unit in zip(curve.names, curve.units, strict=True):
         forward = name.removesuffix(RETRACE)
@@ -210,13 +209,13 @@ def spectrum_columns(curve: SpectrumActivity) -> list[str]:
 
 
 def name_and_unit(signal: str) -> tuple[str, str]:
-    """Split "Current (A)"."""
+    """Split "Current (A)" into name and unit."""
     name, _, unit = signal.removesuffix(")").rpartition(" (")
     return name, unit
 
 
 def spectrum_signal(column: str) -> int | None:
-    """Return the index of the signal of a simulated spectrum's column."""
+    """Return the signal's index of a simulated spectrum's column; None: it has none."""
     name = column.removesuffix(RETRACE)
     return CHANNELS.get(name) if name in CHANNELS else _OF_SPECTRA.get(name, (None,))[0]
 

@@ -1,4 +1,4 @@
-"""The Nanonis software: its modules put together, patterns, and utilities."""
+"""The Nanonis software: its modules, patterns and utilities."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class NanonisSoftware:
     """The software.
 
     Args:
-        session_path: the session folder's path on the controller's computer; empty: that of `folder`.
-        range_m: of the scanner in x and y.
-        rows_as_recorded: whether images are handed out as recorded, or top first.
+        session_path: session folder's path on the controller's computer; empty: the path of `folder`.
+        range_m: range of the scanner in x and y.
+        rows_as_recorded: True if images are returned as recorded, False for the top row first.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class NanonisSoftware:
 
 
 class PatternModule:
-    """Grids of spectra, of which only the duration is emulated and nothing is saved."""
+    """Grids of spectra: only their duration is emulated, no data is saved."""
 
     def __init__(self, core: NanonisCore) -> None:
         self._core = core
@@ -124,7 +124,7 @@ class PatternModule:
 
 
 class Utilities:
-    """Session path, version and lock."""
+    """Session path, version, lock and files."""
 
     def __init__(self, core: NanonisCore) -> None:
         self._core = core
@@ -144,7 +144,7 @@ class Utilities:
 
     @answers("File.datLoad")
     def _load(self, path: str, header_only: int) -> Answer:
-        """Return the content of a file in the session folder; (!) each row of the data is taken to be a channel."""
+        # (!) The order of the data is unknown: each row is taken to be a channel.
         try:
             found = read_dat(self._core.session.read(path))
         except (OSError, ValueError) as error:

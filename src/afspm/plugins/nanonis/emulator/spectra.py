@@ -16,7 +16,7 @@ from afspm.simulation.activities import SpectrumActivity
 
 _KINDS: Final = {"BiasSpectr": "IV", "ZSpectr": "force"}
 _CHANNELS: Final = {"BiasSpectr": (0, 22), "ZSpectr": (20, 21)}
-"""Signals that the simulated spectra have."""
+"""Indexes of the signals in simulated spectra."""
 _TITLES: Final = {"BiasSpectr": "bias spectroscopy", "ZSpectr": "Z spectroscopy"}
 _FILE_NAMES: Final = {"BiasSpectr": "Bias-Spectroscopy", "ZSpectr": "Z-Spectroscopy"}
 _MOST_POINTS: Final = 1 << 16
@@ -24,15 +24,17 @@ _MOST_POINTS: Final = 1 << 16
 
 @dataclass
 class SweepSettings:
-    """The sweep settings of a spectroscopy module.
+    """Sweep settings of a spectroscopy module.
 
     Attributes:
-        points: None: as many as the simulated spectrum has.
-        limits: first and last value of the sweep; None: those of the simulated spectrum. Beyond it the values stay.
-        sweeps: how many are averaged.
-        channels: indexes of the recorded signals; None: all that the simulated spectrum has.
-        backward: whether it is swept back, too.
-        saves: whether a file is written; `saves_all` and `dialog` are only stored.
+        points: number of points; None: as in the simulated spectrum.
+        limits: first and last value of the sweep; None: those of the simulated spectrum, whose last values continue
+            beyond.
+        sweeps: number of averaged sweeps.
+        channels: indexes of recorded signals; None: all of the simulated spectrum.
+        backward: True if also swept backwards.
+        saves: True if a file is written.
+        saves_all, dialog: stored without effect.
     """
 
     points: int | None = None
@@ -64,11 +66,12 @@ class SweepSettings:
 
 
 class SpectroscopyModules:
-    """Both modules.
+    """Both spectroscopy modules.
 
     Attributes:
         sweeps: settings by module.
-        running: the spectrum that goes on; `ended` counts those that have ended.
+        running: the running spectrum.
+        ended: number of ended spectra.
     """
 
     def __init__(self, core: NanonisCore, signals: Signals) -> None:
@@ -79,7 +82,7 @@ class SpectroscopyModules:
         self._base_names = dict(_FILE_NAMES)
 
     def advance(self, now_s: float) -> None:
-        """End and save a spectrum that is over."""
+        """End and save the spectrum once it is over."""
         curve = self.running
         if curve is None or curve.running(now_s):
             return
@@ -99,7 +102,7 @@ class SpectroscopyModules:
         self.running = curve if sweep.channels is None else self._recorded(curve, sweep.channels)
 
     def _recorded(self, curve: SpectrumActivity, channels: list[int]) -> SpectrumActivity:
-        """Select the recorded channels; one that the simulated spectrum does not have is constant."""
+        # A recorded channel that the simulated spectrum lacks is constant.
         names, units, columns = [curve.names[0]], [curve.units[0]], [curve.values[:, 0]]
         for index in channels:
             having = [k for k, name in enumerate(curve.names) if spectrum_signal(name) == index]

@@ -1,4 +1,4 @@
-"""The tip: its position, the z controller, the bias, the piezos, the tip shaper and the coarse motor."""
+"""The tip: position, z controller, bias, piezos, tip shaper and coarse motor."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class ZController:
     """The z controller and the auto-approach.
 
     Attributes:
-        state: "off", "on" or "safe", after the safe tip.
-        pulse_holds: whether the controller is on hold during a pulse.
+        state: "off", "on" or "safe" (after the safe tip).
+        pulse_holds: True if a pulse holds the controller.
     """
 
     def __init__(self, core: NanonisCore, scans: ScanModule, signals: Signals) -> None:
@@ -35,7 +35,7 @@ class ZController:
         self._follows_s = 0.0
 
     def go_wrong(self, now_s: float) -> None:
-        """Let the safe tip withdraw the tip, where a fault says so."""
+        """Withdraw the tip by the safe tip, if a fault demands it."""
         faults, rig = self._core.faults, self._core.rig
         if faults.strikes("safe-tip", now_s):
             rig.withdraw(now_s)
@@ -45,7 +45,7 @@ class ZController:
             self.state = "safe"
 
     def switch(self, now_s: float, *, on: bool, off_delay_s: float = 0.0) -> None:
-        """Switch after the delay; switched on it brings a withdrawn tip back."""
+        """Switch after the delay. Switching on brings back a withdrawn tip."""
         rig = self._core.rig
         self.state = "on" if on else "off"
         self._follows_s = now_s + (0.0 if on else off_delay_s)
@@ -57,7 +57,7 @@ class ZController:
             rig.engaged = True
 
     def _status(self, now_s: float) -> int:
-        """Return off 1, on 2, hold 3, switching off 4, safe tip 5, withdrawing 6."""
+        # The protocol's codes: off 1, on 2, hold 3, switching off 4, safe tip 5, withdrawing 6.
         doing = self._core.rig.doing(now_s)
         if doing == "approach" and not self._core.rig.engaged:
             return 6
@@ -78,7 +78,7 @@ class ZController:
 
     @answers("ZCtrl.OnOffGet")
     def _get_on(self) -> Answer:
-        """Return the state of the real-time controller, which is still on while switching off."""
+        # The state of the real-time controller, which is still on while switching off.
         return (int(self._status(self._core.now_s) in (2, 4)),)
 
     @answers("ZCtrl.ZPosSet")
@@ -94,7 +94,7 @@ class ZController:
 
     @answers("ZCtrl.Home")
     def _home(self) -> Answer:
-        """(!) Whether the real one refuses that while its controller is on is not known: here it is switched off."""
+        # (!) It is unknown if the real one refuses this while its controller is on; here it is switched off.
         relative, home_m = (*self._core.registers.get("ZCtrl.HomeProps"), 0, 0.0)[:2]
         z_m = self._signals.z_m(self._core.now_s)
         self.switch(self._core.now_s, on=False)
@@ -112,7 +112,7 @@ class ZController:
 
     @answers("ZCtrl.GainSet")
     def _set_gain(self, proportional: float, time_s: float, integral: float) -> Answer:
-        """Set P and T; I = P / T."""
+        # I = P / T; an I in the request counts only without T.
         integral = proportional / time_s if time_s > 0.0 else integral
         rig = self._core.rig
         rig.setup.feedback = replace(rig.setup.feedback, proportional_gain=proportional, integral_gain=integral)
@@ -130,7 +130,7 @@ class ZController:
 
     @answers("ZCtrl.Withdraw")
     def _withdraw(self, wait: int, timeout_ms: int) -> Answer:
-        """Withdraw the tip, which an auto-approach that goes on meanwhile brings back."""
+        # An auto-approach that goes on brings the tip back, as in the real software.
         if not self._approaches():
             rig = self._core.rig
             rig.withdraw(self._core.now_s)
@@ -271,7 +271,7 @@ class TipModules:
 
     @answers("AtomTrack.QuickCompStart", "AtomTrack.DriftComp")
     def _compensate(self, *which: int) -> Answer:
-        """Compensate the drift that tracking the atom under the tip would have found; there is no tilt."""
+        # The drift that tracking an atom under the tip would find. There is no tilt to correct.
         drift = 1
         if which in ((), (drift,)):
             world, now_s = self._core.rig.world, self._core.now_s
@@ -286,7 +286,7 @@ class TipModules:
 
     @answers("Motor.StartMove")
     def _start_motor(self, direction: int, steps: int, group: int, wait: int) -> Answer:
-        """(!) Whether the real one refuses that during a scan or a withdrawal is not known; here it does."""
+        # (!) It is unknown if the real one refuses this during a scan or a withdrawal; here it does.
         if direction > 5:
             raise FunctionRefused(f"{direction} is not a direction")
         now_s = self._core.now_s

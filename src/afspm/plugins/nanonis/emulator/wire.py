@@ -1,11 +1,12 @@
-"""The controller's side of the TCP protocol: requests from bytes, replies to bytes.
+"""Controller's side of the TCP protocol: requests from bytes, replies to bytes.
 
-Written apart from the translator's, which it is to be tested against.
+Independent of the translator's code, so that each checks the other.
 """
 
 from __future__ import annotations
 
 import math
+import random
 import re
 import struct
 from collections.abc import Mapping, Sequence
@@ -29,10 +30,24 @@ ZEROS: Final[Mapping[str, object]] = {
     **dict.fromkeys(("A", "2S", *(f"[{code}]" for code in _SIZES), *(f"*{code}" for code in (*_SIZES, "S"))), ()),
     "2f": np.zeros((0, 0)),
 }
+_SENSELESS_NUMBERS: Final = (float("nan"), float("inf"), -float("inf"), 0.0, -1.0, 1e-38, 3e38, -3e38, 1e9)
+_SENSELESS_INTEGERS: Final = (0, 1, 2, 3, 7, 127, 500, 65535, 2**31 - 1, -1, -(2**31))
+_SENSELESS_TEXTS: Final = (
+    "",
+    "\0",
+    "../..",
+    "x" * 3000,
+    "Z (m)",
+    "Current (A)",
+    "(",
+    "ä€",
+    "C:\\nowhere\\at all.sxm",
+    "/nowhere/a.dat",
+)
 
 
 class MalformedRequest(Exception):
-    """The bytes of a client are not what belongs to the function."""
+    """The bytes of a request do not fit its function."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +55,9 @@ class WireField:
     """One field of a request or a reply.
 
     Attributes:
-        code: as in `functions.txt`.
-        since, until: the first release that has it, and the first that has it no more.
-        mark: how what is set is got: see `functions.txt`.
+        code: type code, see `functions.txt`.
+        since, until: first release with the field, first one without it.
+        mark: relation between values in `…Set` and `…Get`, see `functions.txt`.
     """
 
     code: str
@@ -64,7 +79,7 @@ class WireField:
 
 @dataclass(frozen=True)
 class NanonisFunction:
-    """One function: its fields, and the first release that has it."""
+    """A function: its fields, and the first release that has it."""
 
     arguments: tuple[WireField, ...]
     results: tuple[WireField, ...]
@@ -94,7 +109,7 @@ def _by_lower_case() -> Mapping[str, str]:
 
 
 def known_as(name: str) -> str | None:
-    """Return the table's spelling of a name, ignoring case; None if it is not there."""
+    """Return the table's spelling of a name, ignoring case; None: unknown."""
     return _by_lower_case().get(name.lower())
 
 
@@ -103,10 +118,12 @@ def _fields(column: str) -> tuple[WireField, ...]:
 
 
 def split(received: bytearray) -> tuple[str, bool, bytes] | None:
-    """Takes one request off: its function, whether an answer is wanted, its body; None if it is not there yet.
+    """Remove one request from the received bytes; return name, whether an answer is wanted, and body.
+
+    None: the request is incomplete.
 
     Raises:
-        MalformedRequest: these are no requests.
+        MalformedRequest: not a request.
     """
     if len(received) < HEADER_BYTES:
         return None
@@ -123,7 +140,7 @@ def split(received: bytearray) -> tuple[str, bool, bytes] | None:
 
 
 def arguments(name: str, body: bytes, release: int) -> list[object]:
-    """The arguments in the body of a request.
+    """Decode the arguments in a request's body.
 
     Raises:
         MalformedRequest: too few or too many bytes.
@@ -142,13 +159,13 @@ def arguments(name: str, body: bytes, release: int) -> list[object]:
 
 
 def _unpacked(code: str, body: bytes, at: int, count: int) -> tuple[Any, int]:
-    """A value, and where the next begins; `count` is that of the lists which share one."""
+    # `count` is the length of lists that share one length field.
     if code in _SIZES:
         return struct.unpack_from(f">{code}", body, at)[0], at + _SIZES[code]
     if code.startswith("*"):
         return _items(code[1], count, body, at)
     if code == "A":
-        at += 4  # the size in bytes, which clients reckon in different ways
+        at += 4  # the size in bytes, which clients calculate differently: nanonis-spm and nanonisTCP disagree
     (number,) = struct.unpack_from(">i", body, at)
     at += 4
     if code == "n":
@@ -177,7 +194,7 @@ def _items(code: str, count: int, body: bytes, at: int) -> tuple[list[Any], int]
 
 
 def reply(name: str, body: bytes) -> bytes:
-    """With its header."""
+    """Encode a reply from its header's name and its body."""
     return name.encode("ascii", "replace")[:32].ljust(32, b"\0") + struct.pack(">i", len(body)) + bytes(4) + body
 
 
@@ -189,7 +206,8 @@ def body(name: str, results: Sequence[object], release: int, encoding: str = "ut
 
 
 def error_body(name: str, text: str, release: int, *, bare: bool) -> bytes:
-    """Encode the body of a reply with an error, after results that are all zero, or without results."""
+    """Encode the body of a reply with an error, after results of zeros, or without results."""
+    # The specification does not define if results are present after an error: both can be emulated.
     codes = [] if bare or name not in functions() else functions()[name].result_codes(release)
     return b"".join(_packed(code, ZEROS[code], "utf-8") for code in codes) + error_block(text, 1)
 
@@ -201,6 +219,7 @@ def error_block(text: str, status: int) -> bytes:
 
 def _packed(code: str, value: Any, encoding: str) -> bytes:
     if code == "S":
+        # The real software on Windows may send texts in Latin-1.
         raw = str(value).encode(encoding, "replace")
         return struct.pack(">i", len(raw)) + raw
     if code == "A":
@@ -219,7 +238,26 @@ def _packed(code: str, value: Any, encoding: str) -> bytes:
         return b"".join(_packed(code[1], one, encoding) for one in value)
     if code == "f" and abs(value) > _LARGEST_SINGLE:
         return struct.pack(">f", math.copysign(math.inf, value))
-    if code in "BHIin":  # what was set with a sign may be got without one
+    if code in "BHIin":  # a value set as a signed field may be returned as an unsigned one
         size = _SIZES[code.replace("n", "i")]
         return (int(value) % (1 << 8 * size)).to_bytes(size, "big")
     return struct.pack(f">{code}", value)
+
+
+def senseless_value(code: str, chance: random.Random) -> object:
+    """Return a random absurd value of a field's type."""
+    if code in "fd":
+        return chance.choice(_SENSELESS_NUMBERS)
+    if code in "BHIin":
+        return chance.choice(_SENSELESS_INTEGERS)
+    if code == "S":
+        return chance.choice(_SENSELESS_TEXTS)
+    if code == "2f":
+        shape = chance.randrange(4), chance.randrange(4)
+        return np.reshape([chance.choice(_SENSELESS_NUMBERS) for _ in range(shape[0] * shape[1])], shape)
+    if code == "2S":
+        return [
+            [chance.choice(_SENSELESS_TEXTS) for _ in range(chance.randrange(3))] for _ in range(chance.randrange(3))
+        ]
+    item = "S" if code == "A" else code[1]
+    return [senseless_value(item, chance) for _ in range(chance.randrange(4))]

@@ -1,29 +1,36 @@
-"""An emulated Nanosurf Studio: its socket, its scripts in a real Lua, and its files, with simulated physics behind."""
+"""Emulated Nanosurf Studio: its socket, its scripts in a real Lua, and its files, with simulated physics."""
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final, cast
 
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration
 from afspm.plugins.nanosurf.emulator.studio import StudioProgram
 from afspm.plugins.nanosurf.emulator.tree import CommandTree
-from afspm.plugins.nanosurf.emulator.wire import StudioWire
+from afspm.simulation.emulation.emulator import LOOPBACK
 from afspm.simulation.emulation.program import MakerProgram
 from afspm.simulation.emulation.scripted import Client, OnRequest, ScriptedEmulator, ScriptWire, Unfinished
+from afspm.simulation.emulation.tcp_server import ClientConnection, TcpServer
+
+_LENGTH: Final = struct.Struct("<I")
+LONGEST_SCRIPT: Final = 1 << 20
+_MOST_UNREAD: Final = 64 << 20
+"""Highest number of unread bytes of a client, whose connection then ends."""
 
 
 class NanosurfEmulator(ScriptedEmulator):
     """The emulated program. Needs lupa.
 
     Args:
-        release: of Studio: 19 lacks commands that 17 and 18 have.
-        image_buffer: number of the low-level buffer that the lines of a running scan are read from.
-        start_s: how long the ramp to the first line takes, experiment time.
-        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
-        one_client: whether a further connection waits until the first has gone.
-        seed, faults, and all of the simulated world: as of every emulator.
+        release: release of Studio; 19 lacks commands of 17 and 18.
+        image_buffer: number of the low-level buffer with the lines of the running scan.
+        start_s: duration of the ramp to the first line, experiment time.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        one_client: True if a further connection waits for the end of the first.
+        seed, faults, and the simulated world: settings of every emulator.
     """
 
     vendor = "Nanosurf"
@@ -47,7 +54,6 @@ class NanosurfEmulator(ScriptedEmulator):
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
-        """Make Studio with its tree of commands."""
         self._levels: dict[Client, int | None] = {}
         self._client: Client = None
         program = StudioProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
@@ -55,22 +61,21 @@ class NanosurfEmulator(ScriptedEmulator):
         return program
 
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
-        """Listen for the connections of clients."""
         return StudioWire(port, on_request, self.woken, one_client=self._one_client)
 
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
-        """Run a script in the tree that the client has selected."""
+        """Run a script in the tree selected by the client."""
         self._client = client
         thread, problem = self._tree.start(request.decode("utf-8", "replace"), self._levels.get(client))
         return problem.encode() if problem is not None else self._run_on(client, thread)
 
     def failure(self, request: bytes, reason: str) -> bytes:
-        """Status 1, and the reason."""
+        """Return a reply with status 1 and the reason."""
         quoted = reason.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
         return f'{{1,{{"{quoted}"}}}}'.encode()
 
     def not_a_number(self, request: bytes) -> bytes:
-        """The value that Lua writes for 0/0."""
+        """Return Lua's text of 0/0."""
         return b"{0,{(0/0)}}"
 
     def _run_on(self, client: Client, thread: object) -> bytes | Unfinished:
@@ -80,3 +85,56 @@ class NanosurfEmulator(ScriptedEmulator):
 
     def _select(self, level: int | None) -> None:
         self._levels[self._client] = level
+
+
+class StudioWire:
+    """Studio's socket: a script and its reply, each after its length in four bytes, least significant first.
+
+    See `ScriptWire`.
+    """
+
+    def __init__(self, port: int, on_request: OnRequest, wakes: object, *, one_client: bool) -> None:
+        self._on_request = on_request
+        self._server = TcpServer(LOOPBACK, [port], one_each=one_client, wakes=wakes, on_bytes=self._split)
+
+    @property
+    def port(self) -> int:
+        return self._server.ports[0]
+
+    @property
+    def address(self) -> str:
+        return f"{LOOPBACK}:{self.port}"
+
+    def poll(self, timeout_s: float) -> None:
+        self._server.poll(timeout_s)
+
+    def send(self, client: Client, reply: bytes) -> None:
+        connection = cast(ClientConnection, client)
+        if connection in self._server.connections:
+            self._server.send(connection, _LENGTH.pack(len(reply)) + reply)
+            if len(connection.sending) > _MOST_UNREAD:
+                self._server.cut(connection)
+
+    def send_half(self, client: Client, reply: bytes) -> None:
+        """Send half a reply, then end the connection."""
+        connection = cast(ClientConnection, client)
+        if connection in self._server.connections:
+            connection.closing = True
+            self._server.send(connection, (_LENGTH.pack(len(reply)) + reply)[: 4 + len(reply) // 2])
+
+    def close(self) -> None:
+        self._server.close()
+
+    def _split(self, connection: ClientConnection) -> None:
+        # A connection that announces a script of more than 1 MiB ends.
+        received = connection.received
+        while len(received) >= _LENGTH.size:
+            (size,) = _LENGTH.unpack_from(received)
+            if size > LONGEST_SCRIPT:
+                self._server.cut(connection)
+                return
+            if len(received) < _LENGTH.size + size:
+                return
+            script = bytes(received[_LENGTH.size : _LENGTH.size + size])
+            del received[: _LENGTH.size + size]
+            self._on_request(connection, script)

@@ -1,4 +1,4 @@
-"""The files that the emulated Studio saves: .nhf of format 2, HDF5 with integers that lie in a range."""
+"""Files of the emulated Studio: .nhf of format 2, HDF5 with integers scaled to a range."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _BLOCKS: Final = "block_size"
 
 
 def image(scan: ScanActivity, now_s: float, mode: str) -> bytes:
-    """The file of a scan; lines that were not scanned hold the number for none."""
+    """Encode the file of a scan; lines not scanned hold the fill value."""
     channels = scan.channels(scan.end_s if scan.stopped_s is not None else None)
     (rows, columns), region = scan.shape, scan.region
     width, height = region.size_m
@@ -48,10 +48,13 @@ def image(scan: ScanActivity, now_s: float, mode: str) -> bytes:
 
 
 def curves(spectra: Sequence[SpectrumActivity], shape: tuple[int, int], now_s: float, mode: str) -> bytes:
-    """The file of force curves: a segment towards the sample, another back; (!) its axes are a line for each curve.
+    """Encode the file of force curves: one segment for the approach, one for the retract.
+
+    (!) The axes of a segment are taken as a line for each curve.
 
     Args:
-        shape: of the grid: (rows, columns).
+        spectra: the curves.
+        shape: shape of the grid, (rows, columns).
     """
     facts = {
         "group_type": "spectroscopy",
@@ -98,7 +101,7 @@ def _file(
 
 
 def _add(segment: Any, name: str, signal: str, unit: str, values: Array) -> None:
-    """Add a channel: integers over a range about zero, as in real files; NSFopen relies on it."""
+    # Real files have integers over a range about zero, and NSFopen relies on it.
     largest = float(np.max(np.abs(values), initial=0.0, where=np.isfinite(values))) or 1.0
     integers = np.where(np.isfinite(values), np.rint(values / largest * _LARGEST), _MISSING).astype(np.int32)
     dataset = segment.create_dataset(name, data=integers.ravel(), fillvalue=_MISSING)

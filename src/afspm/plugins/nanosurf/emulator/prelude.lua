@@ -37,7 +37,7 @@ for _, name in ipairs({"math", "string", "table"}) do
   for key, value in pairs(_G[name]) do safe[name][key] = value end
 end
 
--- Scripts may add globals, which last; what is there they can't replace.
+-- Scripts may add lasting globals, but can't replace existing ones.
 local function environment(root)
   local known = setmetatable({root = root}, {__index = safe})
   return setmetatable({}, {

@@ -1,4 +1,4 @@
-"""Nanosurf Studio's own part: the values of its panels, and what it does with the instrument."""
+"""Nanosurf Studio: the values of its panels, and its use of the instrument."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from afspm.simulation.activities import RETRACE, Channels, ScanActivity, Spectru
 from afspm.simulation.emulation.program import MakerProgram, NamedFile
 
 _INTEGRAL_GAIN: Final = 0.5
-"""What Studio's integral gain of 1 is to the simulated feedback, in 1/s."""
+"""Simulated integral gain, in 1/s, for a gain of 1 in Studio."""
 _GAIN_SHARE: Final = 0.4
-"""The gain that the Gain Finder finds, as a share of the one at which the simulated feedback oscillates."""
+"""Result of the Gain Finder, as a share of the gain at which the simulated feedback oscillates."""
 _NOMINAL: Final = 1.2
-"""The maker's values of the cantilever, as a multiple of the true ones."""
+"""The maker's nominal cantilever values, as a multiple of the true ones."""
 _REACH_M: Final = 50e-6
 _MOST_PIXELS: Final = 8192
 _MOST_GAIN: Final = 100000
@@ -37,10 +37,10 @@ class PanelValue:
     """One value of a panel.
 
     Attributes:
-        at_first: before anybody sets it; its type stays.
+        at_first: initial value; its type is fixed.
         low, high: bounds of a number.
-        enum: the choices of one that is chosen, by name.
-        read_only: it can't be set.
+        enum: names and numbers of the choices.
+        read_only: True if it can't be set.
     """
 
     at_first: float | int | str | bool
@@ -143,10 +143,12 @@ CYCLES: Final = ("force_distance_z_z",)
 
 @dataclass
 class CurveGrid:
-    """A running measurement of a grid of curves: the points that are left, and the curves taken.
+    """A running measurement of a grid of curves.
 
     Attributes:
-        at_point: the tip is at the point of the next curve, or on its way there.
+        points_m: remaining points.
+        curves: curves taken so far.
+        at_point: True if the tip is at the next curve's point, or on its way there.
     """
 
     shape: tuple[int, int]
@@ -156,13 +158,13 @@ class CurveGrid:
 
 
 class StudioProgram(MakerProgram):
-    """The program, to which the tree of commands leads.
+    """The program behind the tree of commands.
 
     Attributes:
-        values: of the panels, by path.
+        values: values of the panels, by path; the setpoint in V, in Hz for a frequency shift.
         on_signal: called with "scanning_started" and "scanning_finished".
-        when_advanced: called after each advance; returns whether it has begun to measure something.
-        setpoint_unit: in which `get` and `put` have the setpoint; `values` has it in V, of a frequency shift in Hz.
+        when_advanced: called after each advance; returns True if it has started a measurement.
+        setpoint_unit: unit of the setpoint in `get` and `put`.
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -175,7 +177,7 @@ class StudioProgram(MakerProgram):
         self._item_name = "Image"
         self._grid: CurveGrid | None = None
         self._calibrated = False
-        self._told_scanning = False
+        self._signalled_scanning = False
         feedback = self.rig.setup.feedback
         if feedback.setpoint is not None:
             self.values[SETPOINT] = feedback.setpoint
@@ -186,7 +188,7 @@ class StudioProgram(MakerProgram):
             "probe.current_deflection_sensitivity": world.feedback.sensitivity_m_per_v,
             "probe.current_spring_constant": world.force.spring_n_per_m,
         }
-        # until it is calibrated, those of its maker
+        # nominal values until the calibration
         self.values |= {path: _NOMINAL * value for path, value in self._cantilever.items()}
 
     @property
@@ -195,37 +197,37 @@ class StudioProgram(MakerProgram):
 
     @property
     def setpoint_units(self) -> Mapping[str, float]:
-        """Return the possible units of the setpoint, with the value in each of 1 V, or of 1 Hz of a frequency shift."""
+        """Units of the setpoint, each with the value of 1 V in it, or of 1 Hz for a frequency shift."""
         if self._holds_frequency:
             return {"Hz": 1.0}
         return {"V": 1.0, "m": float(self.values["probe.current_deflection_sensitivity"])}
 
     def scale(self, path: str) -> float:
-        """Return the factor from a value of `values` to the one that `get` returns."""
+        """Return the factor from an entry of `values` to the result of `get`."""
         return self.setpoint_units[self.setpoint_unit] if path == SETPOINT else 1.0
 
     def bounds(self, path: str) -> tuple[float, float]:
-        """Return the bounds of a number as `get` returns it."""
+        """Return the bounds of a number, in the unit of `get`."""
         row, scale = PANEL[path], self.scale(path)
         if path == SETPOINT and self._holds_frequency:
             return -_MOST_SHIFT_HZ, _MOST_SHIFT_HZ
         return row.low * scale, row.high * scale
 
     def set_setpoint_unit(self, unit: str) -> None:
-        """Change the unit of the setpoint for `get` and `put`. Raises InvalidValue."""
+        """Change the setpoint's unit for `get` and `put`. Raises InvalidValue."""
         if unit not in self.setpoint_units:
             raise InvalidValue(f"{SETPOINT} has no unit {unit!r}", hint=f"one of {', '.join(self.setpoint_units)}")
         self.setpoint_unit = unit
 
     def get(self, path: str) -> object:
-        """Return a value of a panel, or where the tip is."""
+        """Return a value of a panel, or the position of the tip."""
         if path in ("scanner.offset_x", "scanner.offset_y"):
             return self.rig.probe_at(self.now_s)[path.endswith("y")]
         value: object = self.values[path] * self.scale(path) if path == SETPOINT else self.values[path]
         return value
 
     def put(self, path: str, value: object) -> None:
-        """Set a value of a panel. Raises InvalidValue: it is read-only, out of bounds or of another type."""
+        """Set a value of a panel. Raises InvalidValue: read-only, out of bounds, or another type."""
         row = PANEL[path]
         if row.read_only:
             raise InvalidValue(f"{path} can't be set")
@@ -245,8 +247,8 @@ class StudioProgram(MakerProgram):
         if self.when_advanced(now_s):
             again_s = super().advance(now_s)
             self._go_on_with_grid(now_s)
-        if self.scanning is not self._told_scanning:
-            self._told_scanning = self.scanning
+        if self.scanning is not self._signalled_scanning:
+            self._signalled_scanning = self.scanning
             self.on_signal("scanning_started" if self.scanning else "scanning_finished")
         return again_s
 
@@ -255,7 +257,7 @@ class StudioProgram(MakerProgram):
         return super().measuring_curve or self._grid is not None
 
     def occupied(self, now_s: float) -> bool:
-        """True while something is measured, or the instrument is busy otherwise."""
+        """Return True during a measurement, or if the instrument is busy otherwise."""
         return self.scanning or self.measuring_curve or self.engages or self.rig.busy(now_s)
 
     def start_curves(self, now_s: float) -> None:
@@ -266,7 +268,7 @@ class StudioProgram(MakerProgram):
         self._start_grid(CurveGrid((rows, columns), [(px, py) for px, py in points.tolist()]), now_s)
 
     def measure_at(self, kind: str, name: str, place: Sequence[Any], now_s: float) -> None:
-        """Measure an item of the workspace: a frame, a grid, or a point. Raises InstrumentBusy, InvalidValue."""
+        """Measure a workspace item: a frame, a grid or a point. Raises InstrumentBusy, InvalidValue."""
         self._item_name = name
         for path, value in zip(FRAMES.get(kind, ()), place, strict=False):
             self.put(path, value)
@@ -279,7 +281,7 @@ class StudioProgram(MakerProgram):
             self._start_grid(CurveGrid((1, 1), [(place[0], place[1])]), now_s)
 
     def stop_curve(self) -> None:
-        """Break curves off: a grid as a whole."""
+        """Stop the curve, or the whole grid."""
         super().stop_curve()
         if self._grid is not None:
             self._grid = None
@@ -295,7 +297,7 @@ class StudioProgram(MakerProgram):
         self._grid = None
 
     def begin_procedure(self, path: str) -> None:
-        """Begin one of `PROCEDURES_S`. Raises InstrumentBusy."""
+        """Start one of `PROCEDURES_S`. Raises InstrumentBusy."""
         self._refuse_busy()
         self.rig.occupy(path, PROCEDURES_S[path], self.now_s)
         if path == "probe.cantilever_calibration.run":
@@ -305,42 +307,40 @@ class StudioProgram(MakerProgram):
             self.values["z_control.i_gain"] = min(round(highest), _MOST_GAIN)
 
     def apply_calibration(self) -> None:
-        """Use the results of the calibration from now on. Raises InvalidValue: there was no calibration."""
+        """Apply the results of the calibration. Raises InvalidValue: there was no calibration."""
         if not self._calibrated:
             raise InvalidValue("the cantilever has not been calibrated: run the calibration first")
         self.values |= self._cantilever
 
     def load_mode(self, name: str) -> None:
-        """Load a mode of measurement. Raises InstrumentBusy: a measurement is running."""
+        """Load a measurement mode. Raises InstrumentBusy: a measurement is running."""
         self._refuse_busy()
         self.values["mode.name"] = name
 
     def select_cycle(self, cycle: str | float) -> None:
-        """Select a cycle of spectroscopy by its id or number. Raises InvalidValue: there is no such one."""
+        """Select a spectroscopy cycle by its id or number. Raises InvalidValue: unknown."""
         number = CYCLES.index(cycle) if cycle in CYCLES else cycle
         if not (isinstance(number, int | float) and number in range(len(CYCLES))):
             raise InvalidValue(f"there is no cycle {cycle!r}", hint=f"{', '.join(CYCLES)}, or 0 to {len(CYCLES) - 1}")
         self.values["spectroscopy.selected_cycle"] = CYCLES[int(number)]
 
     def pause(self, now_s: float) -> None:
-        """Stay on the line."""
         if self.rig.scan is not None:
             self.rig.scan.pause(now_s)
 
     def resume(self, now_s: float) -> None:
-        """Go on with the line."""
         if self.rig.scan is not None:
             self.rig.scan.resume(now_s)
 
     def move(self) -> None:
-        """Send the tip to the target. Raises InstrumentBusy, InvalidValue."""
+        """Move the tip to the target. Raises InstrumentBusy, InvalidValue."""
         self.rig.setup.move_speed_m_s = self.values["scanner.move_speed_xy_on_surface"]
         self.rig.move_probe(
             (self.values["scanner.offset_x_target"], self.values["scanner.offset_y_target"]), self.now_s
         )
 
     def lines(self, channel: int) -> tuple[str, str, list[float]]:
-        """Return name, unit and the complete lines of the running scan, one after the other as they were scanned."""
+        """Return name, unit and the complete lines of the running scan, flattened in scanning order."""
         scan = self.rig.scan
         if scan is None:
             return "", "", []
@@ -386,7 +386,6 @@ class StudioProgram(MakerProgram):
             self._grid = grid
 
     def _go_on_with_grid(self, now_s: float) -> None:
-        """Move to the next point, measure there, and so on; save the file after the last one."""
         grid = self._grid
         while grid is not None and not self.rig.busy(now_s):
             if grid.at_point:
@@ -413,7 +412,7 @@ class StudioProgram(MakerProgram):
         return [(name, made())]
 
     def _next_name(self, now_s: float) -> str:
-        """Return the name of the next file, and count on; a file never leaves its folder."""
+        # A file never leaves its folder.
         index = self.values["data.storage.next_file_index"]
         self.values["data.storage.next_file_index"] = index + 1
         base = _fit_for_a_name(self.values["data.storage.file_basename"])
@@ -434,7 +433,6 @@ def _fit_for_a_name(text: str) -> str:
 
 
 def _named(channels: Channels) -> Channels:
-    """The channels by the names that a file gives them."""
     return {
         f"{name.removesuffix(RETRACE)} {'Backward' if name.endswith(RETRACE) else 'Forward'}": data
         for name, data in channels.items()

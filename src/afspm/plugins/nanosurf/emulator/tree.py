@@ -1,4 +1,4 @@
-"""The tree of commands, as Lua sees it: `root` of the application and `root` of a measurement session."""
+"""The tree of commands as Lua sees it: `root` of the application, and `root` of a measurement session."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from afspm.plugins.nanosurf.emulator.workspace import MeasurementQueue, Workspac
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 SESSION: Final = "91-01-000"
-"""The name of a simulated controller in the maker's client."""
+"""The maker's client has this name for a simulated controller."""
 LAST_WITH_OLD_COMMANDS: Final = 18
 ALL_LEVELS: Final = 5
 _INT32: Final = 2**31 - 1
 _FIELDS: Final = ("unit", "units", "min", "max")
-"""Of a property, besides its value."""
+"""Fields of a property besides its value."""
 _SYNCHRONIZED: Final = 3
 _MEMORY: Final = 64 << 20
-"""Of all scripts together, in bytes."""
+"""Highest memory of all scripts together, in bytes."""
 _ROOM: Final = 16 << 20
-"""Scripts may keep so much of it after their end."""
+"""Highest memory that scripts may keep after their end, in bytes."""
 _WRAPPER: Final = Path(__file__).with_name("wrapper.py.in")
 
 Nested = Plain
 
 
 class CommandTree:
-    """Both trees, in one Lua, and the scripts that run in them.
+    """Both trees in one Lua, and the scripts that run in them.
 
     Args:
-        level_chosen: called with a level when a client selects the session, None for the application.
-        release: of Studio: 19 has no `is_scanning` any more.
+        release: release of Studio; 19 has no `is_scanning`.
         image_buffer: number of the low-level buffer with the running scan.
+        level_chosen: called with the level when a client selects the session, None for the application.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class CommandTree:
         self._open()
 
     def _open(self) -> None:
-        """Make a Lua with both trees, without anything that scripts have kept in the one before."""
+        # A new Lua has nothing that scripts have stored in the previous one.
         from lupa import lua54
 
         self._lua = lua54.LuaRuntime(
@@ -72,13 +72,13 @@ class CommandTree:
             self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
 
     def start(self, script: str, level: int | None) -> tuple[object, str | None]:
-        """Return a script that is ready to run, or the reply that it can't be. Raises ScriptFailed."""
+        """Return a script ready to run, or the reply that it can't be. Raises ScriptFailed."""
         with self._bounded():
             started = self._prelude.start(script, self._roots[level])
         return started if isinstance(started, tuple) else ((self._prelude, started), None)
 
     def step(self, script: Any) -> str | None:
-        """Run a script on; return its reply, or None while it waits for the instrument. Raises ScriptFailed."""
+        """Continue a script; return its reply, or None while it waits for the instrument. Raises ScriptFailed."""
         prelude, started = script
         if prelude is not self._prelude:
             raise ScriptFailed("another script has used up the memory, which ended all")
@@ -88,7 +88,7 @@ class CommandTree:
 
     @contextmanager
     def _bounded(self) -> Iterator[None]:
-        """Bound the memory of a script; make a new Lua if scripts have kept too much of it. Raises ScriptFailed."""
+        # Scripts of any client share the memory: one that stores too much would end the emulator.
         from lupa import lua54
 
         try:
@@ -115,7 +115,6 @@ class CommandTree:
         return self._prelude.as_function(call)
 
     def _table(self, nested: PlainMapping) -> object:
-        """A Lua table of a nested dictionary; Python's functions become Lua's."""
         return self._lua.table_from({name: self._in_lua(inner) for name, inner in nested.items()})
 
     def _in_lua(self, inner: Any) -> object:
@@ -144,8 +143,9 @@ class CommandTree:
         self._level_chosen(int(level))
 
     def _session(self, workflow: Nested, level: int) -> Nested:
-        """What a licence of a level adds to the application's own commands."""
+        # A licence of a higher level adds commands to the application's own ones.
         imaging = workflow["imaging"]
+        # The real tree has the old commands at the highest level only.
         if level == ALL_LEVELS and self._release <= LAST_WITH_OLD_COMMANDS:
             imaging = {**imaging, "is_scanning": lambda: self._program.scanning}
         found: Nested = {"workflow": {**workflow, "imaging": imaging}}
@@ -206,7 +206,7 @@ class CommandTree:
         return self._blocking(partial(program.begin_procedure, path), lambda: program.rig.doing(self._now_s) == path)
 
     def _workspace_commands(self) -> Nested:
-        """The commands of the workspace; (!) the names in what `get_item_…` returns are not known."""
+        # (!) The field names in the results of `get_item_…` are unknown.
         items = self._workspace
 
         def getter(**names: str) -> Callable[[str], object]:
@@ -288,8 +288,6 @@ class CommandTree:
         return self._prelude.property(self._lua.table_from(table), enum)
 
     def _buffers(self) -> Nested:
-        """The low-level buffers of measured values, as far as the running scan is in one."""
-
         def numbers(buffer: float, channel: float) -> object:
             values = self._channel(buffer, channel)[2]
             span = self._span(values)
@@ -319,7 +317,7 @@ class CommandTree:
         return max(map(abs, values), default=1.0) or 1.0
 
     def _write_wrapper(self, root: Any, name: str, path: str) -> None:
-        """Write Python classes for the tree, for the maker's client, which asks for it by the path of its own file."""
+        # The maker's client requests Python classes for the tree, by the path of its own file.
         file = Path(path)
         if not (PureWindowsPath(path).name.startswith("cmd_tree_") and file.suffix == ".py" and file.parent.is_dir()):
             raise ScriptFailed(f"{path!r} is not the file of a wrapper")
@@ -333,7 +331,6 @@ def _is_python(value: object) -> bool:
 
 
 def _described(table: Any) -> Nested:
-    """A tree: of each table its tables, of each property its fields and whether they can be set, and the functions."""
     from lupa import lua54
 
     found: Nested = {}

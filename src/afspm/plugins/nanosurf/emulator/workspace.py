@@ -1,4 +1,4 @@
-"""Studio's workspace: frames, grids and points with their places, and the queue in which they are measured."""
+"""Studio's workspace: frames, grids and points with their positions, and the queue that measures them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _UNFIT_FOR_NAMES: Final = frozenset('\\/:*?"<>|') | {chr(number) for number in r
 
 @dataclass
 class WorkspaceItem:
-    """A place to measure at: a "frame", a "grid" of curves or a "point" for one.
+    """A place to measure: a "frame", a "grid" of curves or a "point" for one.
 
     Attributes:
         columns, rows: pixels of a frame, curves of a grid.
@@ -46,7 +46,7 @@ class WorkspaceItem:
 
 
 class Workspace:
-    """The items by their ids. Files are in the gallery: of their paths on Studio's computer the name counts."""
+    """The items by id. Files are in the gallery: only the name of a path on Studio's computer counts."""
 
     def __init__(self, program: StudioProgram) -> None:
         self._program = program
@@ -55,7 +55,7 @@ class Workspace:
         self.add("frame", _FIRST, 0.0, 0.0)
 
     def __getitem__(self, item_id: str) -> WorkspaceItem:
-        """Raises InvalidValue: there is no such item."""
+        """Return an item. Raises InvalidValue: unknown."""
         if item_id not in self._items:
             raise InvalidValue(f"there is no item {item_id!r} in the workspace")
         return self._items[item_id]
@@ -71,11 +71,11 @@ class Workspace:
         return item_id
 
     def id_of(self, name: str) -> str:
-        """Return the id of an item by its name; all zeros if there is none."""
+        """Return the id of an item by name; all zeros: unknown."""
         return next((item_id for item_id, item in self._items.items() if item.name == name), NO_ITEM)
 
     def change(self, item_id: str, **values: Any) -> None:
-        """Change an item. Raises InvalidValue: there is none, or it can't be measured so."""
+        """Change an item. Raises InvalidValue: unknown, or not measurable with these values."""
         before = self[item_id]
         changed = WorkspaceItem(**{**asdict(before), **values})
         sizes = changed.width_m, changed.height_m, changed.columns, changed.rows
@@ -84,20 +84,19 @@ class Workspace:
         self._items[item_id] = changed
 
     def delete(self, item_id: str) -> None:
-        """Delete an item. Raises InvalidValue: there is none."""
+        """Delete an item. Raises InvalidValue: unknown."""
         self[item_id]
         del self._items[item_id]
 
     def clear(self) -> None:
-        """Delete all items."""
         self._items.clear()
 
     def ids(self) -> list[str]:
-        """Return the ids in the order in which the items were added."""
+        """Return the ids in the order of creation."""
         return list(self._items)
 
     def save(self, path: str) -> None:
-        """Write the items to a file. Raises InvalidValue: it has no name, or can't be written."""
+        """Write the items to a file. Raises InvalidValue: the path is unfit, or writing fails."""
         root = ElementTree.Element("workspace")
         for item_id, item in self._items.items():
             ElementTree.SubElement(root, "item", {"id": item_id, **{key: str(of) for key, of in asdict(item).items()}})
@@ -107,7 +106,7 @@ class Workspace:
             raise InvalidValue(f"{path!r} can't be written: {error}") from error
 
     def load(self, path: str) -> None:
-        """Replace the items by those of a saved file. Raises InvalidValue: it is missing, or has another content."""
+        """Replace the items by those of a saved file. Raises InvalidValue: missing or damaged."""
         kinds = {
             field.name: {"str": str, "int": int, "float": float}[str(field.type)] for field in fields(WorkspaceItem)
         }
@@ -132,8 +131,8 @@ class MeasurementQueue:
     """The queue of Studio's automation, which measures items one after the other.
 
     Attributes:
-        entries: ids and how often each is measured.
-        message: why the queue ended early; empty if it did not.
+        entries: ids, each with its number of repetitions.
+        message: reason for an early end; empty: none.
     """
 
     def __init__(self, program: StudioProgram, workspace: Workspace) -> None:
@@ -145,11 +144,11 @@ class MeasurementQueue:
 
     @property
     def running(self) -> bool:
-        """True until all has been measured."""
+        """True until all items are measured."""
         return self._left is not None
 
     def add(self, item_ids: list[str], repetitions: int = 1) -> None:
-        """Add items. Raises InvalidValue: there is no such item, or it is too much."""
+        """Add items. Raises InvalidValue: unknown items, or too many."""
         for item_id in item_ids:
             self._workspace[item_id]
         if not 1 <= repetitions <= _MOST_REPETITIONS or len(self.entries) + len(item_ids) > _MOST_ITEMS:
@@ -157,14 +156,14 @@ class MeasurementQueue:
         self.entries += [(item_id, int(repetitions)) for item_id in item_ids]
 
     def remove(self, item_id: str) -> None:
-        """Remove an item. Raises InvalidValue: it is not in the queue."""
+        """Remove an item. Raises InvalidValue: not in the queue."""
         kept = [entry for entry in self.entries if entry[0] != item_id]
         if len(kept) == len(self.entries):
             raise InvalidValue(f"{item_id!r} is not in the queue")
         self.entries = kept
 
     def process(self, entries: list[tuple[str, int]]) -> None:
-        """Measure items. Raises InstrumentBusy: something is being measured; InvalidValue: there is no such item."""
+        """Measure items. Raises InstrumentBusy: a measurement is running; InvalidValue: unknown item."""
         for item_id, _ in entries:
             self._workspace[item_id]
         if self.running or self._program.occupied(self._program.now_s):
@@ -178,7 +177,7 @@ class MeasurementQueue:
         self._left = None
 
     def advance(self, now_s: float) -> bool:
-        """Measure the next item when the instrument is free; return whether one has been begun."""
+        """Measure the next item if the instrument is free; return True if one was started."""
         program, begun = self._program, False
         while self._left is not None and not program.occupied(now_s):
             item_id = next(self._left, None)

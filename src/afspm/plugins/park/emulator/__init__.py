@@ -1,18 +1,20 @@
-"""An emulated SmartScan: its socket, its scripts in a real JavaScript, and its files, with simulated physics behind."""
+"""Emulated SmartScan: its socket, its scripts in a real JavaScript, and its files, with simulated physics."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, Final, Literal, NoReturn
+from typing import Any, ClassVar, Final, Literal, NoReturn, cast
+
+import zmq
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import Duration
 from afspm.plugins.park.emulator.engine import Script
 from afspm.plugins.park.emulator.smartscan import GEOMETRY, SmartScanProgram
-from afspm.plugins.park.emulator.wire import SmartRemoteWire
+from afspm.simulation.emulation.emulator import LOOPBACK
 from afspm.simulation.emulation.program import MakerProgram
 from afspm.simulation.emulation.scripted import (
     Client,
@@ -26,20 +28,23 @@ from afspm.simulation.emulation.scripted import (
 _DONE: Final = "Done"
 _FAILED: Final = -32000
 _NO_JSON: Final = -32700
+LONGEST_REQUEST: Final = 1 << 20
 
 
 class ParkEmulator(ScriptedEmulator):
-    """The emulated program. What is not known of the real one can be chosen.
+    """The emulated program; unconfirmed behaviour of the real one can be chosen.
 
     Args:
-        errors: how it says that a script failed: in an "error" of JSON-RPC, in the "result", or in the "value" alone.
-        values: a value is told as "text", or as it is ("native").
-        replies: to a script that waits for the instrument, "at-end" of it, or "at-once" and without a value.
-        scan_words: what it says to whether it scans: yes, no.
-        tells_gains: whether the gains of the feedback can be read, or only set.
-        start_s: how long the ramp to the first line takes, experiment time.
-        file_s: how long after the end a file begins to appear; the other half of it comes as much later.
-        seed, faults, and all of the simulated world: as of every emulator.
+        errors: place of a script's error in a reply: JSON-RPC's "error", the "result", or the "value" alone ("rpc",
+            "result", "value").
+        values: form of values: "text", or "native".
+        replies: time of the reply to a script that waits for the instrument: "at-end", or "at-once" and without a
+            value.
+        scan_words: answers of `scan_query`: scanning, idle.
+        reports_gains: True if the gains of the feedback can be read, False if only set.
+        start_s: duration of the ramp to the first line, experiment time.
+        file_s: delay between the end of a measurement and the first half of its file, and between both halves.
+        seed, faults, and the simulated world: settings of every emulator.
     """
 
     vendor = "Park"
@@ -54,25 +59,23 @@ class ParkEmulator(ScriptedEmulator):
         values: Literal["text", "native"] = "text",
         replies: Literal["at-end", "at-once"] = "at-end",
         scan_words: Sequence[str] = ("true", "false"),
-        tells_gains: bool = True,
+        reports_gains: bool = True,
         start_s: Duration = 0.2,
         file_s: Duration = 0.1,
         **settings: Any,
     ) -> None:
         super().__init__(**settings)
         self._errors, self._values, self._replies = errors, values, replies
-        self._scan_words, self._tells_gains = scan_words, tells_gains
+        self._scan_words, self._reports_gains = scan_words, reports_gains
         self._times = {"start_s": start_s, "file_s": file_s}
 
     def make_program(self) -> MakerProgram:
-        """Make SmartScan."""
-        self._scripts: dict[Script, bool] = {}  # and whether its reply was sent already
+        self._scripts: dict[Script, bool] = {}  # True: its reply was sent already
         self._smartscan = SmartScanProgram(self.rig, self.faults, self.clock, self.folder, self.log, **self._times)
-        self._smartscan.tells_gains = self._tells_gains
+        self._smartscan.reports_gains = self._reports_gains
         return self._smartscan
 
     def open_wire(self, port: int, on_request: OnRequest) -> ScriptWire:
-        """Listen for clients."""
         return SmartRemoteWire(port, on_request, self.woken)
 
     def answer(self, client: Client, request: bytes) -> bytes | Unfinished:
@@ -85,7 +88,7 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result=self._queried(str(asked.get("method"))))
 
     def failure(self, request: bytes, reason: str) -> bytes:
-        """The words of an error, where `errors` says; JSON-RPC says how a request is refused that is none."""
+        """Return a reply with an error, in the form that `errors` chooses; JSON-RPC's own for malformed requests."""
         if _parsed(request) is None:
             return _reply(request, error={"code": _NO_JSON, "message": reason})
         if self._errors == "rpc":
@@ -95,11 +98,11 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result=_DONE, value=reason)
 
     def not_a_number(self, request: bytes) -> bytes:
-        """The text that JavaScript has for 0/0."""
+        """Return JavaScript's text of 0/0."""
         return _reply(request, result="NaN", value="NaN")
 
     def tick(self, now_s: float) -> float | None:
-        """Run the scripts on that are answered already, too."""
+        """Advance also the scripts that have been answered already."""
         for script in [one for one, is_answered in self._scripts.items() if is_answered]:
             try:
                 ended = script.step() is not None
@@ -115,12 +118,11 @@ class ParkEmulator(ScriptedEmulator):
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def abandon(self) -> None:
-        """End the scripts, too."""
+        """Also end the scripts."""
         super().abandon()
         self._end_scripts()
 
     def close(self) -> None:
-        """Listen no more."""
         super().close()
         self._end_scripts()
 
@@ -152,7 +154,7 @@ class ParkEmulator(ScriptedEmulator):
     def _step(self, request: bytes, script: Script) -> bytes | Unfinished:
         try:
             found = script.step()
-        except BaseException:
+        except BaseException:  # any end of a script, also by an error of the emulator
             self._scripts.pop(script, None)
             raise
         if found is None and script.waits and self._replies == "at-once":
@@ -172,7 +174,7 @@ def _reply(request: bytes, **fields: object) -> bytes:
 
 
 def _parsed(request: bytes) -> Plain | None:
-    """Return the object of a request; None if it is none, or a text in it can't be encoded."""
+    # Lone surrogates are valid JSON but can't be encoded in a reply.
     try:
         asked = json.loads(request, parse_constant=_no_constant)
         json.dumps(asked, ensure_ascii=False).encode()
@@ -183,3 +185,52 @@ def _parsed(request: bytes) -> Plain | None:
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON")
+
+
+class SmartRemoteWire:
+    """SmartRemote's socket: a ZeroMQ REP for several clients, which wait for their replies.
+
+    See `ScriptWire`.
+    """
+
+    def __init__(self, port: int, on_request: OnRequest, wakes: object) -> None:
+        self._on_request = on_request
+        self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+        self._socket = self._context.socket(zmq.ROUTER)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.SNDTIMEO, 0)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LONGEST_REQUEST)
+        try:
+            self._socket.bind(f"tcp://{LOOPBACK}:{port or '*'}")
+        except zmq.ZMQError as error:
+            self.close()
+            raise OSError(error.errno, str(error)) from error
+        self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+        self._poller = zmq.Poller()
+        self._poller.register(wakes, zmq.POLLIN)
+        self._poller.register(self._socket, zmq.POLLIN)
+
+    @property
+    def address(self) -> str:
+        return f"tcp://{LOOPBACK}:{self.port}"
+
+    def poll(self, timeout_s: float) -> None:
+        if self._socket not in dict(self._poller.poll(max(0, round(timeout_s * 1000)))):
+            return
+        while True:
+            try:
+                client, *frames = self._socket.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            if len(frames) == 2 and not frames[0]:
+                self._on_request(client, frames[1])
+
+    def send(self, client: Client, reply: bytes) -> None:
+        self._socket.send_multipart([cast(bytes, client), b"", reply])
+
+    def send_half(self, client: Client, reply: bytes) -> None:
+        """Send a reply cut in half. ZeroMQ never cuts a message, but its content may be incomplete."""
+        self.send(client, reply[: len(reply) // 2])
+
+    def close(self) -> None:
+        self._context.destroy(linger=0)

@@ -1,7 +1,7 @@
-"""Scripts of JavaScript, each in an engine of its own, that wait for the instrument without holding anything else up.
+"""JavaScript scripts, each in an engine of its own, that wait for the instrument without blocking others.
 
-An engine can't be left in the middle of a script, so each has a thread; what a script asks of the instrument is done by
-the emulator's own thread, which takes turns with it.
+An engine can't be left in the middle of a script, so each has a thread. The emulator's own thread executes what a
+script requests of the instrument, and takes turns with the script's thread.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from afspm.basics.errors import AfspmError
 from afspm.simulation.emulation.scripted import ScriptFailed
 
 LONGEST_S: Final = 5.0
-"""Real seconds of computing after which a script is given up. Its thread computes on: the engine can't be left."""
+"""Real seconds of computing before a script is ended. Its thread goes on: the engine can't be interrupted."""
 _AT_ONCE_S: Final = 0.25
-"""Real seconds that the emulator waits for a script before it serves others: as long as most need to the end."""
+"""Real seconds of waiting for a script before others are served; most scripts end within them."""
 _MEMORY: Final = 64 << 20
 _PRELUDE: Final = Path(__file__).with_name("prelude.js")
 _REFUSALS: Final = (AfspmError, ArithmeticError, TypeError, ValueError)
@@ -31,18 +31,20 @@ _END: Final = json.dumps({"error": "the script was ended"})
 
 @dataclass(frozen=True)
 class Wait:
-    """What a method returns that takes its time: the script waits until `waiting` is false, and then has the value."""
+    """The result of a long method: the script waits until `waiting` is false, then gets the value."""
 
     waiting: Callable[[], bool]
     value: Callable[[], object] = lambda: None
 
 
 Ask = Callable[[str, str, list[Any]], object]
-"""Answers a script: "get", "set" or "call", a path below `spm`, arguments; "now" gives ms. Raises AfspmError."""
+"""Executes a script's request: "get", "set" or "call", a path below `spm`, arguments; "now" returns ms.
+
+Raises AfspmError."""
 
 
 class Script:
-    """A script that runs.
+    """A running script.
 
     Args:
         names: the "values" and "methods" of `spm`.
@@ -59,7 +61,7 @@ class Script:
         Thread(target=self._work, args=(source, names), name="emulated script", daemon=True).start()
 
     def step(self) -> tuple[object, str] | None:
-        """Run on; return its value as it is and as text, or None while it waits or computes. Raises ScriptFailed."""
+        """Continue the script; return its value and text, or None while it waits or computes. Raises ScriptFailed."""
         if self._wait is not None:
             if self._wait.waiting():
                 return None
@@ -83,21 +85,20 @@ class Script:
 
     @property
     def waits(self) -> bool:
-        """True while it waits for the instrument."""
+        """True while the script waits for the instrument."""
         return self._wait is not None
 
     @property
     def computes_for_s(self) -> float:
-        """Real seconds after which a script that computes is given up; infinite while it waits for the instrument."""
+        """Real seconds left for computing before the script is ended; infinite while it waits for the instrument."""
         return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
 
     def end(self) -> None:
-        """Run it no further: whatever it asks for fails."""
+        """End the script: all its further requests fail."""
         self._ended, self._wait = True, None
         self._answers.put(_END)
 
     def _answered(self, content: str) -> bool:
-        """Do what was asked for; return False if the script waits for it."""
         self._computes_since_s = time.monotonic()
         try:
             found = self._ask(*json.loads(content))
@@ -131,12 +132,12 @@ class Script:
             context.eval(_PRELUDE.read_text(encoding="utf-8"))
             context.set("__source", source)
             self._hand_over("done", context.eval("__run(__source)"))
-        # an engine that fails in any other way must end its script, too: the emulator waits for it
+        # any other failure of the engine must end its script, too: the emulator waits for it
         except Exception as error:
             self._hand_over("failed", str(error).partition("\n")[0])
 
     def _asked(self, content: str) -> str:
-        """Never raises: the engine would not survive it."""
+        # Never raises: the engine would not survive it.
         if self._ended:
             return _END
         self._hand_over("ask", content)

@@ -1,4 +1,4 @@
-"""The files that SmartScan saves: a TIFF for each channel and direction, with the maker's private tags."""
+"""The files that SmartScan saves: a TIFF for each channel and direction, with private tags."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from afspm.simulation.fields import Array
 _VERSION = max(VERSIONS)
 _FLOATS = 2
 _GAIN = 0.5
-"""Of curves: one that a reader must not forget."""
+"""Gain of curves, other than 1 so that tests notice a reader that ignores it."""
 _UNITS = {"m": ("um", 1e-6), "A": ("nA", 1e-9), "N": ("nN", 1e-9)}
-"""As files have them, and what one of it is."""
+"""Units in files, with their SI value."""
 _BYTES, _ASCII, _LONG = 1, 2, 4
 _ROWS_PER_STRIP = 278
 Picture = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
@@ -45,10 +45,10 @@ Picture = np.ndarray[tuple[int, int], np.dtype[np.uint8]]
 def images(
     scan: ScanActivity, now_s: float, mode: str, recorded: Collection[str] | None = None
 ) -> Iterator[tuple[str, bytes]]:
-    """Yield the name of each channel with its direction, and its file.
+    """Yield channel and direction, with the file's bytes.
 
     Args:
-        recorded: the channels that are saved; None: all.
+        recorded: the saved channels; None: all.
     """
     for name, (unit, values) in scan.channels(scan.end_s if scan.stopped_s is not None else None).items():
         forward = not name.endswith(RETRACE)
@@ -65,7 +65,7 @@ def _image(
     header = np.zeros((), HEADER)
     rows, columns = scan.shape
     (width, height), (x, y) = scan.region.size_m, scan.region.center_m
-    told = {
+    fields = {
         "mode": _wide(mode, 8),
         "source": _wide(source, 32),
         "columns": columns,
@@ -86,36 +86,35 @@ def _image(
         "unit": _wide("um" if unit == "m" else unit, 8),
         "numbers": _FLOATS,
     }
-    for name, value in told.items():
+    for name, value in fields.items():
         header[name] = value
     numbers = (values / MICROMETRE if unit == "m" else values).astype("<f4")
     return _tiff(header, {DATA_TAG: numbers.tobytes()}, _shown(values), now_s)
 
 
 def curve(spectrum: SpectrumActivity, now_s: float, mode: str) -> bytes:
-    """The file of a curve: its channels, each there and back."""
+    """Encode the file of a curve: its channels, each forward and backward."""
     there, back = spectrum.both_ways()
-    told = np.zeros((), CURVES)
+    layout = np.zeros((), CURVES)
     columns = []
     for number, (name, (unit, values)) in enumerate(there.items()):
         shown, factor = _UNITS.get(unit, (unit, 1.0))
-        told["channels"][number] = (_wide(name, 32), _wide(shown, 8), _GAIN, number == 0, number > 0)
+        layout["channels"][number] = (_wide(name, 32), _wide(shown, 8), _GAIN, number == 0, number > 0)
         columns.append(np.concatenate([values, back[name][1]]) / factor / _GAIN)
-    told["channel_count"], told["points"], told["driving"] = len(there), 1, 0
-    told["numbers_each"], told["numbers"] = len(columns[0]), _FLOATS
-    told["kind"] = next(number for number, kind in CURVE_KINDS.items() if kind == spectrum.kind)
+    layout["channel_count"], layout["points"], layout["driving"] = len(there), 1, 0
+    layout["numbers_each"], layout["numbers"] = len(columns[0]), _FLOATS
+    layout["kind"] = next(number for number, kind in CURVE_KINDS.items() if kind == spectrum.kind)
     x, y = spectrum.position_m
     point = np.array((x / MICROMETRE, y / MICROMETRE, 0.0), POINT)
     header = np.zeros((), HEADER)
     header["kind"], header["mode"], header["source"] = SPECTROSCOPY, _wide(mode, 8), _wide(spectrum.kind, 32)
-    data = {CURVES_TAG: told.tobytes() + point.tobytes(), CURVES_DATA_TAG: np.array(columns, "<f4").tobytes()}
+    data = {CURVES_TAG: layout.tobytes() + point.tobytes(), CURVES_DATA_TAG: np.array(columns, "<f4").tobytes()}
     return _tiff(header, data, _shown(np.array(columns)), now_s)
 
 
 def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) -> bytes:
-    """A file that the maker's own reader (pspylib) takes: it needs a picture in colours, in strips, of which one
-    would be told in a way that it does not know.
-    """
+    # The maker's own reader (pspylib) needs a picture with a palette, in several strips: it does not parse the tags of
+    # a single strip.
     from PIL import Image, TiffImagePlugin
 
     tags = TiffImagePlugin.ImageFileDirectory_v2()
@@ -138,7 +137,7 @@ def _tiff(header: Any, data: Mapping[int, bytes], shown: Picture, now_s: float) 
 
 
 def _shown(values: Array) -> Picture:
-    """The picture that other programs see: 255 is highest, and the top row has the largest y; of a line, twice."""
+    # For other programs: 255 is highest, and the top row has the largest y. A single line is doubled.
     low, high = np.nanmin(values, initial=np.inf), np.nanmax(values, initial=-np.inf)
     scaled = (values - low) / (high - low) * 255.0 if high > low else np.zeros_like(values)
     picture = np.nan_to_num(scaled[::-1]).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""SmartScan's own part: the values and methods below `spm`, and what it does with the instrument."""
+"""SmartScan: the values and methods below `spm`, and their use of the instrument."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ GEOMETRY: Final[dict[str, tuple[type, float, float]]] = {
     "offsetY": (float, -50.0, 50.0),
     "rotation": (float, -360.0, 360.0),
 }
-"""The frame, in the order in which it is told: type and bounds, in micrometres and degrees."""
+"""The frame in the order of `geometry_query`: type and bounds, in µm and degrees."""
 _CURVES: Final = {"fd": "force", "iv": "IV"}
 _OTHER_NAMES: Final = {
     "zheight": "Height",
@@ -36,34 +36,34 @@ _OTHER_NAMES: Final = {
     "ncmphase": "Phase",
     "ncmfrequency": "Frequency Shift",
 }
-"""What users' scripts call channels; "Channel" before a name, capitals and spaces make no difference."""
+"""Names of channels in users' scripts; "Channel" before a name, capitals and spaces are ignored."""
 _SHOWN: Final = {"m": ("um", 1e6), "A": ("pA", 1e12)}
-"""The unit in which a channel is read, and how many of it are one of the simulation's."""
+"""Units of read values, with the factor from SI."""
 _MOST_READ: Final = 10_000
 _LOCATION: Final = {"subDir": "", "fileName": "SIMULATED", "fileSuffix": "", "direction": "auto", "jpegSave": False}
 _RETRACTED_UM, _EXTENDED_UM = 7.5, -7.5
 _SCANNER_UM_S, _STAGE_UM_S = 10.0, 1000.0
-"""Speeds where a script gives none: of the scanner, and of a stage at its normalized speed of 1."""
+"""Default speed of the scanner; speed of a stage at its normalized speed of 1."""
 _STAGE_TOP_UM: Final = 1e4
 _TOUCHES_UM: Final = 0.02
-"""So far below the height at which it touches, a tip is still not driven into the sample."""
+"""Depth below the height of contact at which a move starts to damage the tip."""
 _SWEEP_S: Final = 3.0
 _LINE_SCAN: Final = "line scan"
 _LINE_SCAN_S: Final = 1e9
-"""A line is scanned again and again until it is stopped."""
+"""A line is scanned repeatedly until stopped."""
 _SETPOINT, _ENABLE, _RATE, _BIAS = "zservo.setpoint.value", "zservo.enable", "scan.rate", "bias.tip"
 _GAIN: Final = "zservo.gain"
 _PROPORTIONAL, _INTEGRAL = 0.2, 3000.0
-"""What SmartScan's gains of 1 are to the simulated feedback; the second in 1/s."""
+"""Simulated gains for gains of 1 in SmartScan; the second in 1/s."""
 _BOUNDS: Final = {_SETPOINT: (-10.0, 10.0), _RATE: (1e-4, 1e5), _BIAS: (-10.0, 10.0), "bias.sample": (-10.0, 10.0)}
 
 
 class SmartScanProgram(MakerProgram):
-    """The program, which scripts lead to.
+    """The program behind the scripts.
 
     Attributes:
-        geometry: the frame.
-        tells_gains: whether the gains of the feedback can be read, or only set.
+        geometry: the scan frame.
+        reports_gains: True if the gains of the feedback can be read, False if only set.
     """
 
     def __init__(self, *given: Any, **settings: Any) -> None:
@@ -82,7 +82,7 @@ class SmartScanProgram(MakerProgram):
             "scan.options": {"twoWay": False, "overScan": {"enable": False, "percent": 5}},
             "dataLocation": {"baseDir": str(self.folder), **_LOCATION},
         }
-        self._told: dict[str, Callable[[], object]] = {
+        self._reported: dict[str, Callable[[], object]] = {
             "zscanner.pos": lambda: self._z_um,
             "zscanner.fullyRetractedPos": lambda: _RETRACTED_UM,
             "zscanner.fullyExtendedPos": lambda: _EXTENDED_UM,
@@ -122,7 +122,7 @@ class SmartScanProgram(MakerProgram):
             "readChannelAveraged": self._average_channel,
             "sleep": self._sleep,
         }
-        self.tells_gains = True
+        self.reports_gains = True
         self.stage_um = [0.0, 0.0, 0.0]
         self._z_um = self._focus_um = 0.0
         self._recorded = dict.fromkeys(name.removesuffix(RETRACE) for name in self.rig.channels)
@@ -132,11 +132,11 @@ class SmartScanProgram(MakerProgram):
 
     @property
     def names(self) -> str:
-        """What there is below `spm`, in JSON."""
-        return json.dumps({"values": [*self._values, *self._told], "methods": list(self._methods)})
+        """The names below `spm`, as JSON."""
+        return json.dumps({"values": [*self._values, *self._reported], "methods": list(self._methods)})
 
     def ask(self, kind: str, path: str, given: list[Any]) -> object:
-        """Do what a script asks for. Raises AfspmError, TypeError."""
+        """Execute a request of a script. Raises AfspmError, TypeError."""
         if kind == "now":
             return round(self.now_s * 1e3)
         if kind == "call":
@@ -144,12 +144,12 @@ class SmartScanProgram(MakerProgram):
         if kind == "set":
             self._set(path, given[0])
             return None
-        if path == _GAIN and not self.tells_gains:
+        if path == _GAIN and not self.reports_gains:
             return None
-        return self._told[path]() if path in self._told else self._values[path]
+        return self._reported[path]() if path in self._reported else self._values[path]
 
     def next_waking_s(self, now_s: float) -> float | None:
-        """Return when the next script that sleeps goes on."""
+        """Return the time at which the next sleeping script continues."""
         self._wakings_s = [at_s for at_s in self._wakings_s if at_s > now_s]
         return min(self._wakings_s, default=None)
 
@@ -183,10 +183,10 @@ class SmartScanProgram(MakerProgram):
         return Wait(lambda: self.scanning)
 
     def _start_curve(self, mode: str | Plain = "fd", place: str = "given") -> None:
-        told = mode if isinstance(mode, dict) else {"mode": mode, "type": place}
-        if told.get("mode") not in _CURVES or told.get("type") != "here":
+        wanted = mode if isinstance(mode, dict) else {"mode": mode, "type": place}
+        if wanted.get("mode") not in _CURVES or wanted.get("type") != "here":
             raise InvalidValue(f"no points are given for {mode!r}, or there is no such spectroscopy")
-        self.start_curve(_CURVES[told["mode"]], self.now_s)
+        self.start_curve(_CURVES[wanted["mode"]], self.now_s)
 
     def _measure_curve(self, *given: Any) -> Wait:
         self._start_curve(*given)
@@ -207,7 +207,7 @@ class SmartScanProgram(MakerProgram):
         if mode not in ("q", "quick", "q+s", "quickAndsafe", "inc", "incremental", "incz", "incrementalzscanner"):
             raise InvalidValue(f"there is no approach {mode!r}")
         self.engage()
-        self._z_um = self.stage_um[2] = 0.0  # where the tip touches
+        self._z_um = self.stage_um[2] = 0.0  # the height of contact
         return Wait(lambda: self.engages or self.rig.doing(self.now_s) == "approach")
 
     def _retract(self) -> Wait:
@@ -225,7 +225,7 @@ class SmartScanProgram(MakerProgram):
         return self._move_along_z(self._z_um, z_um, abs(z_um - self.stage_um[2]), speed * _STAGE_UM_S)
 
     def _move_along_z(self, scanner_um: float, stage_um: float, way_um: float, speed_um_s: float) -> Wait:
-        """Move scanner or stage; below the height at which the tip touches, it is driven into the sample."""
+        # Below the height at which the tip touches, the move drives it into the sample.
         self._refuse_busy()
         self.rig.occupy("move along z", way_um / speed_um_s, self.now_s)
         self._z_um, self.stage_um[2] = scanner_um, stage_um
@@ -237,7 +237,7 @@ class SmartScanProgram(MakerProgram):
         return Wait(lambda: self.rig.busy(self.now_s))
 
     def _move_xy_stage(self, x_um: float, y_um: float, x_speed: float = 1.0, y_speed: float = 1.0) -> Wait:
-        """Move the sample under the tip: afterwards the tip is over another place."""
+        # The stage moves the sample: afterwards the tip is over another place.
         for name, value in (("x", x_um), ("y", y_um)):
             _number(f"{name} of the stage", value, -_STAGE_TOP_UM, _STAGE_TOP_UM)
         for value in (x_speed, y_speed):
@@ -278,7 +278,6 @@ class SmartScanProgram(MakerProgram):
         del self._recorded[name]
 
     def _channel(self, wanted: str | Plain) -> str:
-        """Return the channel of a name. Raises InvalidValue."""
         given = str(wanted.get("name") if isinstance(wanted, dict) else wanted)
         plain = re.sub(r"[\W_]", "", given.casefold()).removeprefix("channel")
         known = {re.sub(r"\W", "", name.casefold()): name for name in self.rig.channels if not name.endswith(RETRACE)}
@@ -340,7 +339,6 @@ class SmartScanProgram(MakerProgram):
         return [(f"{self._next_name()}_{curve.kind}.tiff", files.curve(curve, now_s, "NCM"))]
 
     def _next_name(self) -> str:
-        """Return the beginning of the next files' names, which no file has."""
         location = self._values["dataLocation"]
         folder = f"{_plain(location['subDir'])}/" if location["subDir"] else ""
         while True:
@@ -363,12 +361,11 @@ class SmartScanProgram(MakerProgram):
 
 
 def _plain(name: object) -> str:
-    """Return a part of a file's name: a file never leaves its folder."""
+    # A file never leaves its folder.
     return re.sub(r"[^A-Za-z0-9_-]", "_", str(name))[:100]
 
 
 def _number(name: str, value: Any, low: float, high: float, *, whole: bool = False) -> None:
-    """Raises InvalidValue."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not low <= value <= high or (whole and value != int(value)):
         raise InvalidValue(f"{name}: {value!r} is not within {low:g} to {high:g}")
