@@ -17,7 +17,7 @@ from afspm.client.component import Component
 from afspm.model import Packet, Request, Response
 from afspm.storage.memory import Memory
 from afspm.translator.driver import Driver
-from afspm.translator.translator import Translator
+from afspm.translator.translator import Translator, TranslatorRun
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.port import (
     CaughtUp,
@@ -291,7 +291,7 @@ class HostedTranslator(HostedProcess):
     def body(self) -> int:
         memory = Memory(self._folder / "translator.json")
         log = logging.getLogger("afspm.translator")
-        return Translator(self._make(), MemoryServerPort(self), memory, self._folder, log).run()
+        return Translator(self._make(), MemoryServerPort(self), memory, TranslatorRun(self._folder), log).run()
 
     # --- what comes ---
 

@@ -62,7 +62,7 @@ class Commands:
         self._about_to_act = about_to_act
         self._log = log
         driver.for_a_while = temporary.begin
-        self.actions = driver.own_actions() | self._added_actions(driver.added_actions)
+        self.actions = driver.own_actions() | self._added_actions(driver.common.actions)
 
     def do(self, request: Request) -> CommandOutcome:
         """Carry out a request, whatever is wrong with it or with the controller. Raises only what says it is lost."""

@@ -123,6 +123,17 @@ class Introduction(Protocol):
         """Return the controller's answer to a line; empty: hang up."""
 
 
+@dataclass(frozen=True)
+class CommonSettings:
+    """The settings that every driver takes: see `DriverBase`."""
+
+    actions: PlainMapping
+    poll_period_s: float
+    result_timeout_s: float
+    live_lines_s: float | None
+    trace: bool
+
+
 class DriverBase(ABC):
     """A microscope behind its controller. Write the abstract methods and an `@action` for each action::
 
@@ -216,11 +227,7 @@ class DriverBase(ABC):
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
         self.table = self.parameter_table(parameters or {})
-        self.added_actions = dict(actions or {})
-        self.poll_period_s = poll_period_s
-        self.result_timeout_s = result_timeout_s
-        self.live_lines_s = live_lines_s
-        self.trace = trace
+        self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
         self.adjustable: frozenset[str] = frozenset()
         self.prove: Callable[[], None] = _nothing_to_prove
         self._told: dict[str, Value] = {}

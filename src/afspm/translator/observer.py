@@ -18,7 +18,6 @@ from afspm.translator.driver_base import LOST, MEASURING, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.parameters import Value
 from afspm.translator.polling import AdaptivePolling
-from afspm.translator.safe_exit import FeedbackWatch
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
@@ -38,7 +37,6 @@ class Observer:
         port: ServerPort,
         state: TranslatorState,
         temporary: TemporarySettings,
-        feedback: FeedbackWatch,
         log: logging.Logger,
     ) -> None:
         self._driver = driver
@@ -46,10 +44,9 @@ class Observer:
         self._clock = port.clock
         self._state = state
         self._temporary = temporary
-        self._feedback = feedback
         self._log = log
         self._outbox = Outbox(driver, state.kept["outbox"], state.stamp, log)
-        self._polling = AdaptivePolling(driver.poll_period_s, driver.eager_poll_s)
+        self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
         self.values: dict[str, Value] = {}
         self._polled_for = ScopeState.UNDEFINED
@@ -169,7 +166,7 @@ class Observer:
         for name, thing in setting_groups.messages(values).items():
             if name in announce or before.get(name) != thing:
                 self.publish(thing)
-        wait_s, next_s = self._driver.poll_period_s, self._driver.next_change_s()
+        wait_s, next_s = self._driver.common.poll_period_s, self._driver.next_change_s()
         if next_s is not None:
             wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
         self._all_at_s = self._clock.monotonic_s() + wait_s
@@ -185,7 +182,7 @@ class Observer:
 
     def _take_in(self, values: dict[str, Value]) -> None:
         self.values = values
-        if self._feedback.saw(setting_groups.feedback(values).on):
+        if self._state.feedback.saw(setting_groups.feedback(values).on):
             self._state.save()
 
     def _poll_for(self, state: ScopeState) -> None:
@@ -216,8 +213,8 @@ class Observer:
 
 def _live_lines_s(microscope: DriverBase) -> float | None:
     """Return how often, in experiment seconds, lines of a running scan are published; None: never."""
-    if microscope.live_lines_s is not None:
-        return microscope.live_lines_s or None
+    if microscope.common.live_lines_s is not None:
+        return microscope.common.live_lines_s or None
     real_s = microscope.live_real_s
     return None if real_s is None else real_s / microscope.clock.real_s(1.0)
 

@@ -28,7 +28,6 @@ from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.observer import Observer
-from afspm.translator.safe_exit import FeedbackWatch
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 from afspm.translator.trace import TRACE
@@ -53,7 +52,6 @@ class RequestHandler:
         connection: Connection,
         observer: Observer,
         state: TranslatorState,
-        feedback: FeedbackWatch,
         temporary: TemporarySettings,
         log: logging.Logger,
         *,
@@ -65,7 +63,6 @@ class RequestHandler:
         self._connection = connection
         self._observer = observer
         self._state = state
-        self._feedback = feedback
         self._fence = fence
         self._is_connected = is_connected
         self._reply = reply
@@ -140,7 +137,7 @@ class RequestHandler:
         self._driver.prove()
         self._acting = request
         TRACE.command(f"{request_name(request.kind)} {request.subject}")
-        in_doubt = self._feedback.may_switch(request)
+        in_doubt = self._state.feedback.may_switch(request)
         self._outcomes.begin(request)
         # what a kill leaves half set may be set again; an action may not be done again
         once = bool(request.id) and request.kind == ControlRequest.ACTION
@@ -152,7 +149,7 @@ class RequestHandler:
         if self._acting is request:
             self._acting = None
             if request.subject == names.RETRACT and response.ok:
-                self._feedback.retracted()
+                self._state.feedback.retracted()
             if response.code == ControlResponse.PARAM_ERROR:
                 self._outcomes.forget(request)  # nothing was changed
             else:

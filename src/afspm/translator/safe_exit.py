@@ -7,57 +7,16 @@ import logging
 from collections.abc import Callable
 
 from afspm.basics.clock import Clock
-from afspm.model import ControlRequest, Request, Response, ScopeState, names
-from afspm.model.microscope_status import feedback_of
+from afspm.model import Response, ScopeState, names
 from afspm.translator.connection import RETRY_S, Connection
 from afspm.translator.driver_base import LOST
-from afspm.translator.state import Kept, TranslatorState
+from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 
 _LOOK_S = 0.1
 _TIP_S = 8.0
 """Real time in which the tip is tried to be retracted when the run is stopped: a controller may be lost just then, or
 refuse. A little less than `transport.process.parent` leaves."""
-
-
-class FeedbackWatch:
-    """Remembers whether a request, rather than a person at the panel, has switched the feedback off.
-
-    Args:
-        kept: JSON values that outlive a kill.
-    """
-
-    def __init__(self, kept: Kept) -> None:
-        self._kept = kept
-
-    @property
-    def is_off(self) -> bool:
-        """True while the feedback is known to be switched off by a request."""
-        return bool(self._kept.get("feedback_off"))
-
-    @property
-    def in_danger(self) -> bool:
-        """True while the feedback is, or may be, switched off by a request."""
-        return self.is_off or bool(self._kept.get("may_have_switched"))
-
-    def saw(self, on: bool | None) -> bool:
-        """Note the feedback as it is now. Return True if a request was just seen to have switched it off."""
-        kept = self._kept
-        switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
-        kept["feedback_off"] = on is False and (switched_off or self.is_off)
-        kept["feedback_was_on"], kept["may_have_switched"] = on, False
-        return switched_off
-
-    def may_switch(self, request: Request) -> bool:
-        """Note that a request is about to act. Return True if a kill must not make this be forgotten."""
-        affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
-        in_doubt = affects and not self._kept.get("may_have_switched")
-        self._kept["may_have_switched"] = True
-        return in_doubt
-
-    def retracted(self) -> None:
-        """Note that the tip is away, and needs no feedback."""
-        self._kept["may_have_switched"] = self._kept["feedback_off"] = False
 
 
 class SafeExit:
@@ -74,7 +33,6 @@ class SafeExit:
         self,
         connection: Connection,
         state: TranslatorState,
-        feedback: FeedbackWatch,
         temporary: TemporarySettings,
         clock: Clock,
         log: logging.Logger,
@@ -85,7 +43,6 @@ class SafeExit:
     ) -> None:
         self._connection = connection
         self._state = state
-        self._feedback = feedback
         self._temporary = temporary
         self._clock = clock
         self._log = log
@@ -95,7 +52,7 @@ class SafeExit:
 
     def is_owed(self) -> bool:
         """Return True if the tip has to be retracted before the process ends. May be called from another thread."""
-        return self._retracts and self._feedback.in_danger
+        return self._retracts and self._state.feedback.in_danger
 
     def end(self) -> None:
         """End as the scheduler says, which has seen to the tip."""
@@ -115,7 +72,7 @@ class SafeExit:
         until_s = self._clock.monotonic_s() + _TIP_S
         is_told = False
         while is_told or self.is_owed():
-            is_off = is_told or self._feedback.is_off
+            is_off = is_told or self._state.feedback.is_off
             why_not = self._why_not_told() if is_off else f"the controller is lost: {self._connection.why_lost}"
             if not why_not:
                 is_told = True

@@ -4,12 +4,53 @@ from __future__ import annotations
 
 from afspm.basics.clock import Clock
 from afspm.basics.plain_data import Plain
-from afspm.model import ScopeState, ScopeStatus
+from afspm.model import ControlRequest, Request, ScopeState, ScopeStatus
+from afspm.model.microscope_status import feedback_of
 from afspm.storage.memory import Memory
 from afspm.translator.sequence import StatusSequence
 
 Kept = Plain
 """JSON values by name, kept on disk."""
+
+
+class FeedbackWatch:
+    """Remembers whether a request, rather than a person at the panel, has switched the feedback off.
+
+    Args:
+        kept: JSON values that outlive a kill.
+    """
+
+    def __init__(self, kept: Kept) -> None:
+        self._kept = kept
+
+    @property
+    def is_off(self) -> bool:
+        """True while the feedback is known to be switched off by a request."""
+        return bool(self._kept.get("feedback_off"))
+
+    @property
+    def in_danger(self) -> bool:
+        """True while the feedback is, or may be, switched off by a request."""
+        return self.is_off or bool(self._kept.get("may_have_switched"))
+
+    def saw(self, on: bool | None) -> bool:
+        """Note the feedback as it is now. Return True if a request was just seen to have switched it off."""
+        kept = self._kept
+        switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
+        kept["feedback_off"] = on is False and (switched_off or self.is_off)
+        kept["feedback_was_on"], kept["may_have_switched"] = on, False
+        return switched_off
+
+    def may_switch(self, request: Request) -> bool:
+        """Note that a request is about to act. Return True if a kill must not make this be forgotten."""
+        affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
+        in_doubt = affects and not self._kept.get("may_have_switched")
+        self._kept["may_have_switched"] = True
+        return in_doubt
+
+    def retracted(self) -> None:
+        """Note that the tip is away, and needs no feedback."""
+        self._kept["may_have_switched"] = self._kept["feedback_off"] = False
 
 
 class TranslatorState:
@@ -20,12 +61,14 @@ class TranslatorState:
 
     Attributes:
         kept: JSON values of the translator's parts; the part that changes them calls `save`.
+        feedback: whether a request has switched the feedback off.
     """
 
     def __init__(self, memory: Memory, clock: Clock, result_timeout_s: float) -> None:
         self._memory = memory
         self._clock = clock
         self.kept: Kept = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
+        self.feedback = FeedbackWatch(self.kept)
         self.sequence = StatusSequence(ScopeStatus(ScopeState(self.kept["said"])), result_timeout_s)
 
     def save(self) -> None:

@@ -11,6 +11,7 @@ import itertools
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from importlib.metadata import version
@@ -28,7 +29,7 @@ from afspm.translator.driver_base import DriverBase
 from afspm.translator.emulated_controller import EmulatedController, wired_to
 from afspm.translator.observer import Observer
 from afspm.translator.requests import RequestHandler
-from afspm.translator.safe_exit import FeedbackWatch, SafeExit
+from afspm.translator.safe_exit import SafeExit
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 from afspm.translator.trace import FILE, TRACE, TraceHeader
@@ -38,6 +39,24 @@ if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext
 
 
+@dataclass(frozen=True)
+class TranslatorRun:
+    """The run that a translator belongs to.
+
+    Attributes:
+        folder: of the run.
+        name: the identity of the run: only its scheduler is obeyed; empty: the first scheduler that asks.
+        simulated: True if the microscope is, so that the scheduler of a simulated experiment may ask.
+        retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch
+            it on again.
+    """
+
+    folder: Path
+    name: str = ""
+    simulated: bool = False
+    retracts: bool = False
+
+
 class Translator:
     """Answers requests to a microscope and publishes what happens at it.
 
@@ -45,14 +64,9 @@ class Translator:
         driver: already made with its settings, not yet connected.
         port: to the network.
         memory: kept over a restart.
-        run_dir: the folder of the run.
-        step: entered around everything that takes time, so that busy can be told from frozen.
-        retracts: True if it retracts the tip when nobody is left to switch the feedback on again that a request has
-            switched off.
+        step: entered around everything that takes time, so that a busy process is not taken for a frozen one.
         controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver
             knows where its controller is.
-        run: the identity of the run, whose scheduler alone is obeyed; empty: that which asks first.
-        simulated: True if the microscope is, so that the scheduler of a simulated experiment may ask.
     """
 
     def __init__(
@@ -60,26 +74,21 @@ class Translator:
         driver: DriverBase,
         port: ServerPort,
         memory: Memory,
-        run_dir: Path,
+        run: TranslatorRun,
         log: logging.Logger,
         step: Callable[[], AbstractContextManager[None]] = nullcontext,
-        *,
-        retracts: bool = False,
         controller: EmulatedController | None = None,
-        run: str = "",
-        simulated: bool = False,
     ) -> None:
         self.driver = driver
         self._port = port
         self._log = log
         self._step = step
         self._clock = clock = port.clock
-        driver.clock, driver.log, driver.run_dir, driver.wake = clock, log, run_dir, port.wake_up
+        driver.clock, driver.log, driver.run_dir, driver.wake = clock, log, run.folder, port.wake_up
         driver.memory = memory.setdefault("microscope", {})
-        self.state = state = TranslatorState(memory, clock, 2 * driver.patience_s(driver.result_timeout_s / 2))
-        feedback = FeedbackWatch(state.kept)
+        self.state = state = TranslatorState(memory, clock, 2 * driver.patience_s(driver.common.result_timeout_s / 2))
         temporary = TemporarySettings(driver, state, log)
-        self.observer = observer = Observer(driver, port, state, temporary, feedback, log)
+        self.observer = observer = Observer(driver, port, state, temporary, log)
         # what it was doing is remembered: it may still be at it when it is found again
         undefined = partial(observer.publish, ScopeStatus(ScopeState.UNDEFINED))
         self._connection = connection = Connection(driver, controller, clock, log, on_lost=undefined)
@@ -88,16 +97,15 @@ class Translator:
             connection,
             observer,
             state,
-            feedback,
             temporary,
             log,
-            fence=SchedulerFence(run, simulated=simulated),
+            fence=SchedulerFence(run.name, simulated=run.simulated),
             is_connected=port.is_connected,
             reply=self.reply,
         )
         act, observe = self.requests.act, observer.observe
         self._safe_exit = SafeExit(
-            connection, state, feedback, temporary, clock, log, retracts=retracts, act=act, observe=observe
+            connection, state, temporary, clock, log, retracts=run.retracts, act=act, observe=observe
         )
         self._ended = False
 
@@ -175,7 +183,7 @@ def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[.
         except ControllerTaken as error:
             context.log.error("%s", error)
             return ExitCode.CRASHED  # to be tried again a few times: that run may be just ending
-        if driver.trace:
+        if driver.common.trace:
             _begin_trace(driver, context)
             stack.callback(TRACE.end)
         return _run_alone(driver, context, partial(make, controller=controller))
@@ -200,10 +208,8 @@ def _run_alone(driver: DriverBase, context: ProcessContext, make: Callable[..., 
         context.log.error("the newest saved state is damaged, the one before it is used: %s", memory.damage)
     port = open_server_port(launch, context.clock)
     context.when_stopping(lambda: port.wake_up(ParentGone()))
-    run_dir = Path(launch.run_dir or ".")
-    step = context.activity.step
+    run = TranslatorRun(Path(launch.run_dir or "."), launch.run, launch.simulated, launch.retracts)
     driver.adjustable = frozenset(launch.adjustable)
-    told = {"retracts": launch.retracts, "run": launch.run, "simulated": launch.simulated}
-    translator = make(driver, port, memory, run_dir, context.log, step, **told)
+    translator = make(driver, port, memory, run, context.log, context.activity.step)
     context.tip_in_danger(translator.leaves_danger)
     return translator.run()

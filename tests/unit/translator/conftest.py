@@ -29,7 +29,7 @@ from afspm.model import (
 )
 from afspm.storage.memory import Memory
 from afspm.translator import Driver, Value, action
-from afspm.translator.translator import Translator
+from afspm.translator.translator import Translator, TranslatorRun
 from afspm.transport.port import RequestReceived, Served
 
 TABLE = """
@@ -188,7 +188,8 @@ class Bench:
         """Start the translator's process, or start it again after a kill: only the disk is left of the last."""
         self.port = FakePort(self.clock)
         memory, log = Memory(self.folder / "translator.json"), logging.getLogger("test")
-        self.translator = Translator(self.microscope, self.port, memory, self.folder, log, retracts=retracts)
+        run = TranslatorRun(self.folder, retracts=retracts)
+        self.translator = Translator(self.microscope, self.port, memory, run, log)
         self.translator.look()
 
     def run_to_the_end(self, *last: Served, after_s: tuple[float, Callable[[], None]] = (math.inf, list)) -> ExitCode:
