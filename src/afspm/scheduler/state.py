@@ -10,7 +10,7 @@ from afspm.model.idempotency_cache import IdempotencyCache
 from afspm.model.microscope_status import MicroscopeStatus
 from afspm.model.sessions import SessionTable
 from afspm.scheduler.control.arbitration import ArbitrationState
-from afspm.scheduler.control.hand_settings import HandSettings
+from afspm.scheduler.control.descriptions import HandSettings
 from afspm.scheduler.control.holder_timeout import HolderTimeout, Lease
 from afspm.scheduler.control.lifecycle import ExperimentEnd, StartupBarrier
 from afspm.scheduler.control.supervisor_registry import SupervisorRegistry
