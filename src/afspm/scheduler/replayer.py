@@ -72,7 +72,7 @@ class Replayer:
         while not self._stopping and (self._recorded.next_ns is not None or stay):
             self._serve(self._due_in_s())
             self._publish_due()
-        self._end()
+        self._publish_end()
 
     def stop(self) -> None:
         """`run` is to return. From any thread, or a signal handler."""
@@ -83,8 +83,8 @@ class Replayer:
         """Return a file descriptor: a write to it makes `run` look whether it is to stop."""
         return self._wake_up.writer_fileno()
 
-    def _end(self) -> None:
-        """Tell everybody that it is over, also those who come in this moment."""
+    def _publish_end(self) -> None:
+        # a subscriber that connects at this moment gets the end, too
         self._ended = True
         self._publisher.serve()
         self._publisher.kill()

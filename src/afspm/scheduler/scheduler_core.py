@@ -75,18 +75,18 @@ def step(
 ) -> tuple[SchedulerState, list[Effect]]:
     """Return the state after an event, and what is to be done, in order."""
     draft = StateDraft(state, env, now_s, now_ns)
-    _take(draft, event)
+    _dispatch(draft, event)
     while draft.raised:
-        _take(draft, draft.raised.pop(0))
+        _dispatch(draft, draft.raised.pop(0))
     request_pipeline.send_next(draft)
     if draft.control is not state.control:
-        _take(draft, ControlChanged(state.control, draft.control))
+        _dispatch(draft, ControlChanged(state.control, draft.control))
     _end_when_safe(draft)
     return draft.finish()
 
 
-def _take(draft: StateDraft, event: Input) -> None:
-    """Have the coordinate frame look at an input first: it may keep it, and add to it."""
+def _dispatch(draft: StateDraft, event: Input) -> None:
+    # the coordinate frame is first: it may keep an event back, or add others
     draft.frame, outputs = draft.frame.step(event, draft.control, draft.now_s, draft.now_ns)
     for output in outputs:
         _HANDLERS[type(output)](draft, output)
@@ -94,7 +94,13 @@ def _take(draft: StateDraft, event: Input) -> None:
 
 def due_s(state: SchedulerState) -> float | None:
     """Return when, in real monotonic time, a Tick is due at the latest."""
-    dues = (state.due_s(), _malfunction(state)[0], _entries_due_s(state), _dead_at_s(state), _unrenewed_at_s(state))
+    dues = (
+        state.due_s(),
+        _malfunction_due(state)[0],
+        _entries_due_s(state),
+        _holder_dead_at_s(state),
+        _lease_ends_at_s(state),
+    )
     return min((one_s for one_s in dues if one_s is not None), default=None)
 
 
@@ -139,7 +145,7 @@ class SchedulerCore:
             draft.barrier = draft.barrier.begin(now_s, is_restart=is_restart)
             entry = start_entry(now_ns, draft.control, is_restart=is_restart)
             draft.event_log = draft.event_log.add(now_s, entry)
-        _take(draft, Started())
+        _dispatch(draft, Started())
         self.state, effects = draft.finish()
         return effects
 
@@ -239,7 +245,7 @@ def _on_unreadable(draft: StateDraft, event: Unreadable) -> None:
     draft.event_log = draft.event_log.add_request(draft.now_s, entry)
 
 
-def _on_subscriber(draft: StateDraft, event: ReplayRequested) -> None:
+def _on_replay_requested(draft: StateDraft, event: ReplayRequested) -> None:
     draft.effects.append(Replay(event.subscriber, draft.env.cache.replay(event.prefixes, event.since_ns)))
 
 
@@ -287,10 +293,10 @@ def _on_translator_caught_up(draft: StateDraft, event: TranslatorCaughtUp) -> No
 
 
 def _on_reconsidered(draft: StateDraft, output: Reconsider) -> None:
-    _take(draft, output.event)
+    _dispatch(draft, output.event)
 
 
-def _on_frame_asks(draft: StateDraft, output: AskMicroscope) -> None:
+def _on_ask_microscope(draft: StateDraft, output: AskMicroscope) -> None:
     draft.forwarder, _ = draft.forwarder.ask_own(output.request, draft.now_s, AskForFrame(output.purpose))
 
 
@@ -307,14 +313,15 @@ def _add_effect(draft: StateDraft, output: Log | Delegate) -> None:
 
 
 def _on_frame_input(draft: StateDraft, event: Input) -> None:
-    """Inputs that only a coordinate frame acts upon."""
+    # only a coordinate frame acts on these, in its `step`
+    ...
 
 
 # --- the end, and time ----------------------------------------------------------------------------------------------
 
 
 def _on_stopped(draft: StateDraft, event: Stopped) -> None:
-    """See to it that whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
+    # the run may be resumed: a tip in danger is then retracted, or a person is called; a person in control knows of it
     if draft.control.mode is ControlMode.MANUAL:
         return
     danger = draft.microscope.danger
@@ -325,7 +332,6 @@ def _on_stopped(draft: StateDraft, event: Stopped) -> None:
 
 
 def _end_when_safe(draft: StateDraft) -> None:
-    """End the experiment that is over, once the tip is out of danger or that takes too long."""
     owes_retract, kept = draft.watchdog.owes_retract, draft.end.kept
     if not draft.end.is_due(draft.now_s, owes_retract=owes_retract):
         return
@@ -343,21 +349,21 @@ def _end_when_safe(draft: StateDraft) -> None:
 
 
 def _on_tick(draft: StateDraft, event: Tick) -> None:
-    _see_to_deadlines(draft)
+    _handle_deadlines(draft)
     entries_due_s = _entries_due_s(draft)
     if entries_due_s is not None and draft.now_s >= entries_due_s:
         publishing.publish_entries(draft)
 
 
-def _see_to_deadlines(draft: StateDraft) -> None:
+def _handle_deadlines(draft: StateDraft) -> None:
     # one change of control in a step: it is saved and told before the next is decided
-    for see_to in (_open_barrier, _flag_malfunction, _have_watchdog_look):
+    for see_to in (_open_barrier, _flag_malfunction, _run_watchdog):
         if see_to(draft):
             return
-    if (holder := draft.control.holder) is not None and _has_come(_dead_at_s(draft), draft.now_s):
+    if (holder := draft.control.holder) is not None and _is_due(_holder_dead_at_s(draft), draft.now_s):
         control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
     lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
-    is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _has_come(_unrenewed_at_s(draft), draft.now_s)
+    is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _is_due(_lease_ends_at_s(draft), draft.now_s)
     if (holder := draft.control.holder) is not None and is_idle:
         control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
     for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
@@ -370,7 +376,7 @@ def _see_to_deadlines(draft: StateDraft) -> None:
 
 
 def _open_barrier(draft: StateDraft) -> bool:
-    if _has_come(draft.barrier.until_s, draft.now_s):
+    if _is_due(draft.barrier.until_s, draft.now_s):
         publishing.publish_control(draft)
         return True
     draft.barrier, kept = draft.barrier.let_in()
@@ -380,8 +386,8 @@ def _open_barrier(draft: StateDraft) -> bool:
 
 
 def _flag_malfunction(draft: StateDraft) -> bool:
-    at_s, told_by = _malfunction(draft)
-    if not _has_come(at_s, draft.now_s):
+    at_s, told_by = _malfunction_due(draft)
+    if not _is_due(at_s, draft.now_s):
         return False
     if told_by == SCHEDULER:
         draft.watchdog = draft.watchdog.people_called()
@@ -390,8 +396,8 @@ def _flag_malfunction(draft: StateDraft) -> bool:
     return True
 
 
-def _have_watchdog_look(draft: StateDraft) -> bool:
-    if not _has_come(draft.watchdog.due_s, draft.now_s):
+def _run_watchdog(draft: StateDraft) -> bool:
+    if not _is_due(draft.watchdog.due_s, draft.now_s):
         return False
     is_seen_to = draft.control.sees_to_tip
     draft.watchdog, told = draft.watchdog.look_again(draft.microscope, draft.now_s, is_seen_to=is_seen_to)
@@ -401,17 +407,17 @@ def _have_watchdog_look(draft: StateDraft) -> bool:
     return True
 
 
-def _has_come(due_s: float | None, now_s: float) -> bool:
+def _is_due(due_s: float | None, now_s: float) -> bool:
     return due_s is not None and now_s >= due_s
 
 
 def _entries_due_s(state: SchedulerState | StateDraft) -> float | None:
-    """Return when the event log is to be published; not while what was before a restart may still come again."""
+    # not before the startup barrier opens: older entries may still be published by then
     return None if state.barrier.until_s is not None else state.event_log.due_s
 
 
-def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
-    """Return when control is taken from a holder that is gone, after what was before a restart is told."""
+def _holder_dead_at_s(state: SchedulerState | StateDraft) -> float | None:
+    # not before the startup barrier opens: the state of before the restart is published first
     holder, told_at_s = state.control.holder, state.barrier.until_s
     if holder is None:
         return None
@@ -419,15 +425,14 @@ def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
     return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
 
 
-def _unrenewed_at_s(state: SchedulerState | StateDraft) -> float | None:
-    """Return when control is taken from a holder that does not renew its lease, after what was before a restart."""
+def _lease_ends_at_s(state: SchedulerState | StateDraft) -> float | None:
+    # not before the startup barrier opens: the state of before the restart is published first
     until_s, told_at_s = state.lease.asked_until_s(), state.barrier.until_s
     return until_s if until_s is None or told_at_s is None else max(until_s, told_at_s)
 
 
-def _malfunction(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
-    """Return when a problem is made of it that the microscope can't be used, and in whose name; None: it can, or it is
-    flagged already."""
+def _malfunction_due(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
+    # (when device-malfunction is to be flagged, or None; in whose name)
     if _MALFUNCTION in state.control.problems or state.control.ended:
         return None, ""
     return (_AT_ONCE_S, SCHEDULER) if state.watchdog.left_to_people else (state.microscope.lost_at_s, TRANSLATOR)
@@ -441,7 +446,7 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     Connected: _on_connected,
     Disconnected: _on_disconnected,
     Greeted: _on_greeted,
-    ReplayRequested: _on_subscriber,
+    ReplayRequested: _on_replay_requested,
     TranslatorUp: _on_translator_up,
     TranslatorDown: _on_translator_down,
     TranslatorCaughtUp: _on_translator_caught_up,
@@ -450,7 +455,7 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     Stopped: _on_stopped,
     Tick: _on_tick,
     Reconsider: _on_reconsidered,
-    AskMicroscope: _on_frame_asks,
+    AskMicroscope: _on_ask_microscope,
     HoldControl: _on_hold_control,
     SaveNow: _on_save_now,
     Log: _add_effect,

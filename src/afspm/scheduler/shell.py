@@ -85,7 +85,7 @@ class SchedulerShell:
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._look_at_s = 0.0  # at the deadlines, in real monotonic time
+        self._next_deadline_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
         self._worker = worker
@@ -98,7 +98,7 @@ class SchedulerShell:
 
     def wait(self) -> list[Source]:
         """Wait for whatever comes first, a message or a deadline."""
-        next_s = min(self._core.leave_at_s if self.ended else self._look_at_s, self._sockets.router.due_s)
+        next_s = min(self._core.leave_at_s if self.ended else self._next_deadline_s, self._sockets.router.due_s)
         timeout_s = next_s - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
@@ -110,66 +110,64 @@ class SchedulerShell:
     def handle(self, ready: list[Source]) -> None:
         """See to what has come, and to the deadlines."""
         if self.ended:
-            self._handle_late(ready)
+            self._handle_after_end(ready)
             return
         for report in () if self._worker is None else self._worker.reports():
-            self._take(events.FrameReported(report))
+            self._step_with(events.FrameReported(report))
         sockets = self._sockets
         for source in ready:
             if source in (sockets.router, sockets.router.monitor):
-                self._requests()
+                self._receive_requests()
             elif source is sockets.link:
                 heard = sockets.link.receive()
                 if heard is not None:
-                    self._take(events.TranslatorReply(heard.number, _response(heard)))
+                    self._step_with(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:
-                self._packets()
+                self._receive_packets()
             elif source is sockets.publisher:
                 sockets.publisher.serve()
             elif source is sockets.subscriber.monitor:
                 sockets.subscriber.follow()
             else:
                 for change in sockets.link.follow():
-                    self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
+                    self._step_with(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
         now_s = self._clock.monotonic_s()
         if now_s >= sockets.router.due_s:
-            self._requests()
-        if now_s >= self._look_at_s:
+            self._receive_requests()
+        if now_s >= self._next_deadline_s:
             self._deadlines(now_s)
-        elif now_s + _LATE_S < self._look_at_s:
-            self._look_at_s = now_s + _LATE_S  # what has come may have set an earlier one
+        elif now_s + _LATE_S < self._next_deadline_s:
+            self._next_deadline_s = now_s + _LATE_S  # what has come may have set an earlier one
 
-    def _handle_late(self, ready: list[Source]) -> None:
-        """After the end: nothing happens any more, but whoever comes is told so."""
+    def _handle_after_end(self, ready: list[Source]) -> None:
+        # after the end no request is decided: each is answered that the experiment has ended
         sockets = self._sockets
         for source in ready:
             if source is sockets.publisher:
                 if sockets.publisher.serve():
                     sockets.publisher.kill()
             elif source in (sockets.router, sockets.router.monitor):
-                self._requests()
+                self._receive_requests()
             elif source is sockets.link:
                 sockets.link.receive()
             elif source is sockets.link.monitor:
                 if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
-                    self._let_translator_go()
+                    self._close_translator()
             elif source is sockets.subscriber:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
         if self._clock.monotonic_s() >= sockets.router.due_s:
-            self._requests()
+            self._receive_requests()
 
-    def _let_translator_go(self) -> None:
-        """End the translator, which subscribes to nothing.
-
-        One whose tip is in danger is left to find that the scheduler is gone: then it sees to the tip by itself.
-        """
+    def _close_translator(self) -> None:
+        # a translator subscribes to nothing, so CLOSE is sent to it. With a tip in danger it gets none: it retracts the
+        # tip by itself when it is stopped or its parent has gone
         if self._tip_is_safe:
             self._sockets.link.send(0, [wire.CLOSE])
 
-    def _asked_late(self, asked: RouterEvent) -> None:
-        """Take the last words of a supervisor, and problems that were seen too late; answer that it is over."""
+    def _request_after_end(self, asked: RouterEvent) -> None:
+        # final process states, and problems seen after the end, still belong in the record
         if not isinstance(asked, PeerAsked) or not asked.frames:
             return
         if asked.frames[0] in _WRITTEN_DOWN_LATE:
@@ -181,7 +179,7 @@ class SchedulerShell:
     def stop(self) -> None:
         """See to what must be known to whoever resumes the run, unless the experiment is over."""
         if not self.ended:
-            self._take(events.Stopped())
+            self._step_with(events.Stopped())
 
     def close(self) -> None:
         """End the frame's worker, and make sure of what was written."""
@@ -191,27 +189,27 @@ class SchedulerShell:
 
     # --- what comes in ---
 
-    def _take(self, event: events.Input) -> None:
+    def _step_with(self, event: events.Input) -> None:
         self._carry_out(self._decide(event))
 
     def _decide(self, event: events.Input) -> list[events.Effect]:
         return self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns())
 
-    def _requests(self) -> None:
+    def _receive_requests(self) -> None:
         for event in self._sockets.router.receive():
             if self.ended:
-                self._asked_late(event)
+                self._request_after_end(event)
             elif isinstance(event, PeerAsked):
                 self._request(event)
             elif isinstance(event, PeerConnected):
-                self._take(events.Connected(event.connection))
+                self._step_with(events.Connected(event.connection))
             else:
-                self._take(events.Disconnected(event.connection))
+                self._step_with(events.Disconnected(event.connection))
 
     def _request(self, asked: PeerAsked) -> None:
         name = asked.name
         if not asked.frames:
-            self._take(events.Greeted(asked.connection, name, asked.user))
+            self._step_with(events.Greeted(asked.connection, name, asked.user))
             return
         try:
             request = wire.decode_request(asked.frames)
@@ -219,7 +217,7 @@ class SchedulerShell:
             self._warnings.warning(f"refused a request of {name or 'a nameless peer'}: {error}")
             response = Response(error.response, reason=str(error), id=wire.id_of(asked.frames))
             self._answer(asked, response)
-            self._take(events.Unreadable(name, response))
+            self._step_with(events.Unreadable(name, response))
             return
         now_s = self._clock.monotonic_s()
         event = events.RequestIn(asked.connection, name, request, asked.user, now_s)
@@ -228,11 +226,9 @@ class SchedulerShell:
     def _answer(self, asked: PeerAsked, response: Response) -> None:
         self._reply(events.Reply(asked.connection, asked.name, response))
 
-    def _packets(self) -> None:
-        """Take in the translator's packets; several small ones are written down together, then published.
-
-        To hand one to the disk's thread and wait takes as long as to receive and publish it.
-        """
+    def _receive_packets(self) -> None:
+        # small packets go to the disk's thread together: handing one over and waiting takes as long as receiving and
+        # publishing it
         effects, size = list[events.Effect](), 0
         for incoming in self._sockets.subscriber.receive():
             if isinstance(incoming, CaughtUp):
@@ -254,13 +250,13 @@ class SchedulerShell:
 
     def _history(self, subscriber: Hashable, prefixes: tuple[str, ...], since_ns: int) -> Iterable[Packet]:
         self._replay = ()
-        self._take(events.ReplayRequested(subscriber, prefixes, since_ns))
+        self._step_with(events.ReplayRequested(subscriber, prefixes, since_ns))
         return self._replay
 
     def _deadlines(self, now_s: float) -> None:
         if self._core_due_s() <= now_s:
-            self._take(events.Tick())
-        self._look_at_s = self._core_due_s()
+            self._step_with(events.Tick())
+        self._next_deadline_s = self._core_due_s()
 
     def _core_due_s(self) -> float:
         due_s = self._core.deadline_s()
@@ -274,7 +270,7 @@ class SchedulerShell:
     def _carry_out(self, effects: Iterable[events.Effect]) -> None:
         sockets = self._sockets
         effects = [*effects]
-        self._write_down(effects)
+        self._persist(effects)
         for effect in effects:
             match effect:
                 case events.Reply():
@@ -294,14 +290,13 @@ class SchedulerShell:
                     sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
                     sockets.publisher.kill()
                     self._tip_is_safe = effect.tip_is_safe
-                    self._let_translator_go()
+                    self._close_translator()
                     self.ended = True
 
     def _reply(self, reply: events.Reply) -> None:
         self._sockets.router.reply(reply.connection, wire.encode_response(reply.response))
 
-    def _write_down(self, effects: list[events.Effect]) -> None:
-        """Write what must outlive a crash before anybody is told."""
+    def _persist(self, effects: list[events.Effect]) -> None:
         entries: list[LoggedPacket] = []
         state: SavedState | None = None
         over = self.ended

@@ -23,7 +23,7 @@ class StateFile:
         self.path = path
         self._generations = None if path is None else CheckpointFile(path)
         self._log = log
-        self._told = OutageLog("a restart would not know what is in force now", log)
+        self._outage = OutageLog("a restart would not know what is in force now", log)
 
     def load(self) -> SavedState | None:
         """Return what was saved last; None if nothing was.
@@ -51,7 +51,7 @@ class StateFile:
         """
         if self._generations is None:
             return
-        with self._told.trying():
+        with self._outage.trying():
             self._generations.save(json.dumps(snapshot(state, KIND, VERSION), ensure_ascii=False).encode())
 
     def close(self) -> None:

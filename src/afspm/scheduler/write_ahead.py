@@ -73,7 +73,7 @@ class WriteAhead:
         self._disk.close(_CLOSED_WITHIN_S)
 
     def _append(self, entries: Sequence[LoggedPacket]) -> None:
-        """In the disk's thread."""
+        # runs in the disk's thread
         if self._log is None:
             return
         for number, entry in enumerate(entries):
@@ -88,7 +88,6 @@ class WriteAhead:
         self._missed_ns = min(times if self._missed_ns is None else [self._missed_ns, *times], default=None)
 
     def _missed(self, entries: Sequence[LoggedPacket]) -> list[LoggedPacket]:
-        """Return what is to be appended again before `entries`, since it could not be."""
         missed_ns, self._missed_ns = self._missed_ns, None
         if missed_ns is None:
             return []

@@ -92,7 +92,7 @@ class Commands:
         return self._success(request) if values is None else self._set(request, values)
 
     def _success(self, request: Request) -> CommandOutcome:
-        """Return the success of a request; of one for a parameter with its value, in the unit that the peer used."""
+        # a parameter is returned in the unit that the peer used
         asked, payload = request.subject, b""
         if isinstance(asked, Parameter):
             spec = self._driver.table.find(asked.name)
@@ -157,11 +157,10 @@ class Commands:
             for_s = _duration_s(what["for"], f"{where}.for") if "for" in what else None
             moves = ScopeState.MOVING if MOVES & values.keys() else None
             state = moves if for_s is None else state_for(values)
-            added[name] = Action(name, partial(self._do, values, command, for_s), state)
+            added[name] = Action(name, partial(self._run_added_action, values, command, for_s), state)
         return added
 
-    def _do(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
-        """Do an action of the experiment file; the request behind it was written down before it began."""
+    def _run_added_action(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
         if for_s is not None:
             self._temporary.begin(values, for_s)
         elif values:

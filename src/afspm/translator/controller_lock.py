@@ -39,8 +39,8 @@ def commanding(address: str, run: str) -> Iterator[None]:
     if not address:
         yield
         return
-    path = _file(address)
-    with _locked(path, address) as file:
+    path = _lock_file(address)
+    with _open_and_lock(path, address) as file:
         # a full disk, or the file is another user's: who holds it can't be told, and it is held all the same
         with contextlib.suppress(OSError):
             file.truncate(0)
@@ -53,11 +53,10 @@ def commanding(address: str, run: str) -> Iterator[None]:
                 path.unlink()
 
 
-def _locked(path: Path, address: str) -> BinaryIO:
-    """The file, open, and locked by us. Raises ControllerTaken."""
+def _open_and_lock(path: Path, address: str) -> BinaryIO:
     while True:
         try:
-            file = _opened(path)
+            file = _open_lock_file(path)
         except FileNotFoundError:
             continue  # whoever had it has just taken it away
         except OSError as error:
@@ -80,8 +79,8 @@ def _locked(path: Path, address: str) -> BinaryIO:
         file.close()
 
 
-def _opened(path: Path) -> BinaryIO:
-    """The file, of whichever user; a link is not followed. What is another user's can be locked, and not written."""
+def _open_lock_file(path: Path) -> BinaryIO:
+    # a link is not followed; a file of another user can be locked, but not written
     flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
     try:
         descriptor, mode = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o644), "r+b"
@@ -93,18 +92,15 @@ def _opened(path: Path) -> BinaryIO:
     return cast("BinaryIO", os.fdopen(descriptor, mode))
 
 
-def _file(address: str) -> Path:
-    """The same for all processes of this computer, however they write its name."""
+def _lock_file(address: str) -> Path:
+    # one file for all spellings of an address
     plain = address.lower().replace("localhost", "127.0.0.1")
-    return _folder() / hashlib.sha256(plain.encode()).hexdigest()[:16]
+    return _lock_folder() / hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
-def _folder() -> Path:
-    """A folder of ours that all users have in common: each may put files there, and take away only the own ones.
-
-    Raises:
-        ControllerTaken: it can't be had, or is a link, which leads where somebody else wants.
-    """
+def _lock_folder() -> Path:
+    # common to all users: each may add files, and delete only their own (sticky bit). A link in its place is refused:
+    # it may lead into a folder chosen by another user
     in_common = {"win32": os.environ.get("PROGRAMDATA"), "darwin": "/tmp"}  # where the usual one is each user's own
     folder = Path(in_common.get(sys.platform) or tempfile.gettempdir()) / "afspm-controllers"
     try:
@@ -120,7 +116,7 @@ def _folder() -> Path:
 
 
 def _holder(path: Path) -> str:
-    with contextlib.suppress(OSError), _opened(path) as file:
+    with contextlib.suppress(OSError), _open_lock_file(path) as file:
         file.seek(_LOCKED_BYTES)
         return file.read().decode(errors="replace") or "another run"
     return "another run"

@@ -66,23 +66,24 @@ class Action:
         return self.name in (names.STOP_SCAN, names.STOP_SPEC)
 
 
-def _nothing() -> None:
+def _not_implemented() -> None:
     raise NotImplementedError
 
 
-def _nothing_to_prove() -> None:
-    """A real controller is the one at its address."""
+def _prove_nothing() -> None:
+    # a real controller is the one at its address
+    ...
 
 
 _KNOWN = {
     action.name: action
     for action in (
-        Action(names.START_SCAN, _nothing, ScopeState.SCANNING),
-        Action(names.START_SPEC, _nothing, ScopeState.SPEC),
-        Action(names.STOP_SCAN, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SCANNING})),
-        Action(names.STOP_SPEC, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SPEC})),
+        Action(names.START_SCAN, _not_implemented, ScopeState.SCANNING),
+        Action(names.START_SPEC, _not_implemented, ScopeState.SPEC),
+        Action(names.STOP_SCAN, _not_implemented, None, while_busy=True, interrupts=frozenset({ScopeState.SCANNING})),
+        Action(names.STOP_SPEC, _not_implemented, None, while_busy=True, interrupts=frozenset({ScopeState.SPEC})),
         # the way out must always be open
-        Action(names.RETRACT, _nothing, None, while_busy=True, interrupts=MEASURING),
+        Action(names.RETRACT, _not_implemented, None, while_busy=True, interrupts=MEASURING),
     )
 }
 
@@ -96,7 +97,7 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
         state: what the microscope is in from the moment that it is accepted; known for the base actions.
         while_busy: it may be asked for while the microscope is not free; known for the base actions.
     """
-    known = _KNOWN.get(name, Action(name, _nothing))
+    known = _KNOWN.get(name, Action(name, _not_implemented))
     mark = replace(
         known,
         state=known.state if state is None else state,
@@ -229,8 +230,8 @@ class DriverBase(ABC):
         self.table = self.parameter_table(parameters or {})
         self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
         self.adjustable: frozenset[str] = frozenset()
-        self.prove: Callable[[], None] = _nothing_to_prove
-        self._told: dict[str, Value] = {}
+        self.prove: Callable[[], None] = _prove_nothing
+        self._last_written: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:
         """Return how long to wait, in experiment seconds, for what takes the controller `of_s` at most.
@@ -399,7 +400,7 @@ class DriverBase(ABC):
         Raises:
             InvalidValue: the controller says what is no number: it can be told to nobody.
         """
-        found, told = self.read(wanted), self._told
+        found, told = self.read(wanted), self._last_written
         for name in wanted:
             value = found[name]
             if isinstance(value, float) and not math.isfinite(value):
@@ -421,7 +422,7 @@ class DriverBase(ABC):
             parts.insert(len(parts) if on else 0, {names.FEEDBACK_ON: on})
         for part in parts:
             self.write(part)
-        self._told.update(values)
+        self._last_written.update(values)
 
     def own_actions(self) -> dict[str, Action]:
         """The methods marked with `@action`, by name."""

@@ -151,7 +151,7 @@ def wired_to(launch: Launch, microscope: DriverBase) -> EmulatedController | Non
 
 
 def _is_unlocked(file: IO[bytes]) -> bool:
-    """True while no process holds the lock. What this takes is given back when the file is closed."""
+    # closing the file releases a lock taken here
     try:
         lock(file, shared=True)
     except OSError:

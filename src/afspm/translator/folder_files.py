@@ -82,11 +82,11 @@ class FolderFiles(ResultFiles):
         """Look at the first of a file that is taken."""
 
     def _goes_on(self, running: Entry) -> None:
-        """The controller goes on with the next image."""
+        # the controller repeats scans: only a newer file belongs to the next image
         running["newest_ns"] = newest(self._files(Path(running["folder"])))[0]
 
     def _take(self, measured: Entry) -> bool:
-        """Return True if all is known of what was measured: its files are a result, or no whole scan."""
+        # True also for an incomplete scan: there is nothing more to wait for
         files = self.files_of(measured)
         paths = [Path(name) for name, _ in files]
         try:

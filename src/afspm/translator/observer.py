@@ -135,7 +135,7 @@ class Observer:
             self._port.publish(*packet)
         for step in steps:
             if isinstance(step, PublishStatus):
-                self._poll_for(step.status.state)
+                self._adapt_polling(step.status.state)
 
     def publish_all(self) -> None:
         """Publish everything in force, for a scheduler that has just connected."""
@@ -156,7 +156,7 @@ class Observer:
         return Outgoing(*wire.encode(thing), self._state.stamp()[0])
 
     def _status(self) -> ScopeStatus:
-        """Return the state of the microscope, which is not asked while something is in force for a while."""
+        # while temporary settings are in force the microscope counts as busy, whatever the controller reports
         return self._temporary.status or self._driver.status()
 
     def _observe_values(self, announce: Sequence[str]) -> None:
@@ -172,7 +172,7 @@ class Observer:
         self._all_at_s = self._clock.monotonic_s() + wait_s
 
     def _read(self) -> dict[str, Value]:
-        """Return what is in force; differences below the controller's precision are none."""
+        # a difference below the controller's resolution is no change
         table, old = self._driver.table, self.values
         values = self._driver.in_force(setting_groups.watched(table))
         return {
@@ -185,23 +185,22 @@ class Observer:
         if self._state.feedback.saw(setting_groups.feedback(values).on):
             self._state.save()
 
-    def _poll_for(self, state: ScopeState) -> None:
-        """Poll as often as the state asks for."""
+    def _adapt_polling(self, state: ScopeState) -> None:
         before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
         if state is ScopeState.SCANNING:
             self._live.begin(self._clock.now_ns())
         else:
             self._live.end()
         if state in MEASURING:
-            lasts_s, extent = self._scan_s() if state is ScopeState.SCANNING else (None, ())
+            lasts_s, extent = self._expected_scan() if state is ScopeState.SCANNING else (None, ())
             self._polling.began((state, *extent), now_s, lasts_s)
         elif state in (ScopeState.FREE, ScopeState.UNDEFINED):
             self._polling.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
         else:
             self._polling.moved(now_s)
 
-    def _scan_s(self) -> tuple[float | None, tuple[Value, ...]]:
-        """Return the real seconds of the scan, if no time is lost at its edges, and the values they depend on."""
+    def _expected_scan(self) -> tuple[float | None, tuple[Value, ...]]:
+        # a lower bound: the time lost at the edges of a scan is not known
         extent = tuple(self.values.get(name, 0.0) for name in setting_groups.EXTENT)
         with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
             if all(extent) and names.SCAN_SPEED in self._driver.table:
@@ -212,7 +211,7 @@ class Observer:
 
 
 def _live_lines_s(microscope: DriverBase) -> float | None:
-    """Return how often, in experiment seconds, lines of a running scan are published; None: never."""
+    # experiment seconds; None: never
     if microscope.common.live_lines_s is not None:
         return microscope.common.live_lines_s or None
     real_s = microscope.live_real_s

@@ -69,5 +69,5 @@ def _header(content: str, facts: FileFacts) -> dict[str, str | float]:
 
 
 def _identifier(name: str) -> str:
-    """Return a name that every reader of the format takes; the real one is the attribute `long_name`."""
+    # not every reader of NetCDF takes spaces or non-ASCII characters; the attribute `long_name` has the real name
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()

@@ -333,7 +333,7 @@ def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: b
 
 
 def _with_numbers(row: ParameterSpec, values: PlainMapping, where: str) -> ParameterSpec:
-    """The row with its numbers in SI: plain ones are in the row's unit, texts carry their own."""
+    # plain numbers are in the row's unit, texts carry their own
 
     def number(value: Any) -> float:
         given, unit = units.parse_quantity(value) if isinstance(value, str) else (float(value), "")

@@ -67,7 +67,7 @@ class RequestHandler:
         self._is_connected = is_connected
         self._reply = reply
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
-        self.commands = Commands(driver, state.sequence, temporary, self._about_to_act, log)
+        self.commands = Commands(driver, state.sequence, temporary, self._record_begin, log)
         self._acting: Request | None = None
         self._commander = b""
         self._last_refusal = ""
@@ -75,7 +75,7 @@ class RequestHandler:
     def refuses(self, arrived: RequestReceived) -> bool:
         """Answer a peer that is not obeyed, and return True; False: it is obeyed."""
         before, epoch = self._commander, Epoch.decode(arrived.epoch)
-        why = self._fence.refusal(epoch, _run_in(arrived.frames), lambda: self._is_connected(before))
+        why = self._fence.refusal(epoch, _run_of(arrived.frames), lambda: self._is_connected(before))
         if not why:
             self._commander = arrived.connection if epoch is not None else before
             return False
@@ -115,7 +115,7 @@ class RequestHandler:
     def _carry_out(self, request: Request) -> None:
         connection, observer = self._connection, self._observer
         # whether it is free is decided by what it does now, not at the last look
-        if connection.stands and not _only_asks(request):
+        if connection.stands and not _is_read_only(request):
             connection.guarded(partial(observer.observe, values=False))
         if request.subject == names.RETRACT:
             connection.reach()  # the way out is always open: a controller that is there will do, whatever else it says
@@ -132,8 +132,7 @@ class RequestHandler:
         if done.response.ok and (done.steps or done.announce):
             connection.guarded(partial(observer.observe, done.announce))
 
-    def _about_to_act(self, request: Request) -> None:
-        """Write down that a request is going to be carried out."""
+    def _record_begin(self, request: Request) -> None:
         self._driver.prove()
         self._acting = request
         TRACE.command(f"{request_name(request.kind)} {request.subject}")
@@ -145,7 +144,7 @@ class RequestHandler:
             self._state.save()
 
     def _finish(self, request: Request, response: Response) -> None:
-        """Write down what came of a request before anybody hears of it, and answer."""
+        # saved before the answer is sent: a retry after a kill gets the same answer
         if self._acting is request:
             self._acting = None
             if request.subject == names.RETRACT and response.ok:
@@ -158,13 +157,13 @@ class RequestHandler:
         self._reply(response, logging.INFO)
 
 
-def _run_in(frames: Sequence[bytes]) -> str:
-    """Return the run of a component, from the id of its request; empty: it says none."""
+def _run_of(frames: Sequence[bytes]) -> str:
+    # before decoding, so that a stranger costs little: the id of a component's request names its run
     request_id = frames[2].decode("utf-8", "replace") if len(frames) > 2 else ""
     return run_of(request_id.partition("/")[0], request_id)
 
 
-def _only_asks(request: Request) -> bool:
+def _is_read_only(request: Request) -> bool:
     if request.kind == ControlRequest.PARAM:
         return isinstance(request.subject, Parameter) and request.subject.value is None
     return request.kind == ControlRequest.ACTION_SUPPORT

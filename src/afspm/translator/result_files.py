@@ -92,13 +92,11 @@ class ResultFiles(ABC):
         self._kept["running"], self._kept["ended"] = None, {**self._kept["running"], **facts}
 
     def _add(self, result: str, measured: Entry, facts: Mapping[str, object], content: Content) -> None:
-        """It is a result, by this name."""
         taken = {key: measured[key] for key in _OF_A_RESULT if key in measured}
         self._kept["results"] = [*self._kept["results"], {"result": result, **taken, **facts}][-_LISTED:]
         self._content = {result: content}
 
     def _listed(self) -> list[str]:
-        """Return the last results, oldest first."""
         return [entry["result"] for entry in self._kept["results"]]
 
 

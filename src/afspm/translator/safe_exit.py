@@ -73,10 +73,10 @@ class SafeExit:
         is_told = False
         while is_told or self.is_owed():
             is_off = is_told or self._state.feedback.is_off
-            why_not = self._why_not_told() if is_off else f"the controller is lost: {self._connection.why_lost}"
+            why_not = self._retract_failure() if is_off else f"the controller is lost: {self._connection.why_lost}"
             if not why_not:
                 is_told = True
-                why_not = self._why_not_away(wait, until_s)
+                why_not = self._motion_failure(wait, until_s)
             if not why_not:
                 self._log.warning("the run is stopping with the feedback off: the tip was retracted")
                 return
@@ -87,11 +87,8 @@ class SafeExit:
                 return
             wait(RETRY_S)
 
-    def _why_not_away(self, wait: Callable[[float], None], until_s: float) -> str:
-        """Return why the tip that was told to retract may not be away; empty: it is seen to be.
-
-        A controller may not have heard yet what it was told, and would not any more without our connection.
-        """
+    def _motion_failure(self, wait: Callable[[float], None], until_s: float) -> str:
+        # a controller may not have read the command yet, and drops it when our connection closes
         sets_out = False
         while (state := self._state.sequence.said.state) is not ScopeState.FREE:
             sets_out = sets_out or state is ScopeState.COARSE_MOTOR
@@ -104,8 +101,7 @@ class SafeExit:
             wait(_LOOK_S)
         return ""
 
-    def _why_not_told(self) -> str:
-        """Return why the tip can't be told to retract; empty: it was."""
+    def _retract_failure(self) -> str:
         answered: list[Response] = []
         self._connection.guarded(lambda: answered.append(self._retract()))
         if not answered:
@@ -120,7 +116,6 @@ class SafeExit:
         return response
 
     def _stop_measuring(self) -> None:
-        """Stop a measurement: the tip does not go on scanning with nobody there."""
         said = self._state.sequence.said.state
         stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(said)
         if stop is not None and self._connection.stands:

@@ -58,11 +58,11 @@ class StatusSequence:
 
     def begin(self, state: ScopeState) -> list[SequenceStep]:
         """A request was accepted that leads to `state`, seen at the controller already or not."""
-        return self._say(ScopeStatus(state))
+        return self._publish(ScopeStatus(state))
 
     def interrupt(self) -> list[SequenceStep]:
         """Note that what is running was told to stop."""
-        return self._say(_INTERRUPTED)
+        return self._publish(_INTERRUPTED)
 
     def follow(self, *, is_whole: bool) -> list[SequenceStep]:
         """Publish the end of a measurement that was never seen to end, since another one followed at once.
@@ -74,8 +74,8 @@ class StatusSequence:
             return []
         free = ScopeStatus(ScopeState.FREE)
         if is_whole:
-            return [PublishResults(), *self._say(free)]
-        return [*self._say(_INTERRUPTED), DiscardResults(), *self._say(free)]
+            return [PublishResults(), *self._publish(free)]
+        return [*self._publish(_INTERRUPTED), DiscardResults(), *self._publish(free)]
 
     def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
         """The controller was looked at.
@@ -89,39 +89,39 @@ class StatusSequence:
             return self._after_interruption(seen, now_s)
         if seen == self.said:
             self._waiting_since_s = None
-            return self._unseen(results) if seen.state is ScopeState.FREE else []
+            return self._unseen_scan(results) if seen.state is ScopeState.FREE else []
         if self.said.state not in MEASURING or seen.state is self.said.state:
             # results that are there already belong to what began and ended between two looks
-            return (self._unseen(results) if seen.state is ScopeState.FREE else []) + self._say(seen)
+            return (self._unseen_scan(results) if seen.state is ScopeState.FREE else []) + self._publish(seen)
         return self._after_measuring(seen, results, now_s)
 
-    def _unseen(self, results: bool) -> list[SequenceStep]:
-        """Someone at the controller's panel took a scan between two looks at it."""
+    def _unseen_scan(self, results: bool) -> list[SequenceStep]:
+        # a person at the panel took a scan that began and ended between two looks
         if not results or self.said.state is ScopeState.UNDEFINED:
             return []
         after = self.said
-        return [*self._say(ScopeStatus(ScopeState.SCANNING)), PublishResults(), *self._say(after)]
+        return [*self._publish(ScopeStatus(ScopeState.SCANNING)), PublishResults(), *self._publish(after)]
 
     def _after_measuring(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:
-            return self._say(seen)
+            return self._publish(seen)
         if results:
-            return [PublishResults(), *self._say(seen)]
+            return [PublishResults(), *self._publish(seen)]
         if not self._timed_out(now_s):
             return []
         text = "a scan or spectrum ended without a result: it was stopped at the controller, or its file is missing"
-        return [LogError(text), *self._say(_INTERRUPTED), DiscardResults(), *self._say(seen)]
+        return [LogError(text), *self._publish(_INTERRUPTED), DiscardResults(), *self._publish(seen)]
 
     def _after_interruption(self, seen: ScopeStatus, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:
             return []
         if seen.state not in MEASURING:
-            return [DiscardResults(), *self._say(seen)]
+            return [DiscardResults(), *self._publish(seen)]
         if self._broken_off in MEASURING and seen.state is not self._broken_off:
-            return [DiscardResults(), *self._say(seen)]  # of the other kind: somebody began it
+            return [DiscardResults(), *self._publish(seen)]  # of the other kind: somebody began it
         if not self._timed_out(now_s):
             return []
-        return [LogError("the controller keeps measuring after it was told to stop"), *self._say(seen)]
+        return [LogError("the controller keeps measuring after it was told to stop"), *self._publish(seen)]
 
     def _timed_out(self, now_s: float) -> bool:
         if self._waiting_since_s is None:
@@ -132,7 +132,7 @@ class StatusSequence:
         """When `observe` should be called again at the latest, experiment time."""
         return None if self._waiting_since_s is None else self._waiting_since_s + self._timeout_s
 
-    def _say(self, status: ScopeStatus) -> list[SequenceStep]:
+    def _publish(self, status: ScopeStatus) -> list[SequenceStep]:
         self._waiting_since_s = None
         if status == self.said:
             return []

@@ -35,7 +35,7 @@ def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | No
     Raises:
         Refused: PARAM_NOT_SUPPORTED or PARAM_ERROR.
     """
-    asked = _asked(request.subject)
+    asked = _values_in(request.subject)
     values: dict[str, Value] = {}
     for name, given in asked.items():
         spec = driver.table.find(name)
@@ -86,8 +86,8 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
             raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
 
 
-def _asked(subject: object) -> dict[str, Parameter | Value]:
-    """Return what the subject of a request sets, by generic names: a parameter's text, else values in SI."""
+def _values_in(subject: object) -> dict[str, Parameter | Value]:
+    # a parameter keeps its text and unit; all other values are in SI
     if isinstance(subject, Parameter):
         return {} if subject.value is None else {subject.name: subject}
     if isinstance(subject, ScanParameters):

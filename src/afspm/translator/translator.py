@@ -186,19 +186,18 @@ def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[.
         if driver.common.trace:
             _begin_trace(driver, context)
             stack.callback(TRACE.end)
-        return _run_alone(driver, context, partial(make, controller=controller))
+        return _run_locked(driver, context, partial(make, controller=controller))
 
 
 def _begin_trace(driver: DriverBase, context: ProcessContext) -> None:
-    """Keep what is said to the controller; a process that is started again keeps it in a file of its own."""
+    # a restarted process gets a file of its own, so that the first trace is not overwritten
     folder = Path(context.launch.run_dir or ".")
     file = next(one for i in itertools.count() if not (one := folder / (f"{i}-{FILE}" if i else FILE)).exists())
     began = datetime.fromtimestamp(context.clock.now_s(), UTC).isoformat(timespec="seconds")
     TRACE.begin(file, TraceHeader(type(driver).__name__, version("afspm"), began), context.clock)
 
 
-def _run_alone(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator]) -> int:
-    """Open the sockets and the memory, and run the translator."""
+def _run_locked(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator]) -> int:
     from afspm.transport.zmq_server import open_server_port
 
     launch = context.launch

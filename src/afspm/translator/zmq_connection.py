@@ -108,7 +108,6 @@ class ZmqConnection:
         self._context.destroy(linger=0)
 
     def _await_connection(self, monitor: zmq.Socket[bytes]) -> None:
-        """Return once the connection stands. Raises ControllerLost."""
         with monitor:
             came = monitor.poll(max(1, round(self._timeout_s * 1000)))
             stands = bool(came) and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED

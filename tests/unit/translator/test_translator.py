@@ -841,7 +841,7 @@ def test_a_restarted_translator_does_not_repeat_what_was_done(bench: Any) -> Non
 
 def test_what_a_kill_left_half_done_is_not_done_again(bench: Any) -> None:
     request = wire.decode_request(wire.encode_request(_request("me/1/1")))
-    bench.translator.requests._about_to_act(request)  # killed right here
+    bench.translator.requests._record_begin(request)  # killed right here
     bench.start()
     response = bench.ask(ACTION, names.START_SCAN, "me/1/1")
     assert response.code == ControlResponse.NO_RESPONSE

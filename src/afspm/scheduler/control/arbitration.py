@@ -239,8 +239,7 @@ def _accept(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cau
     return Transition(when, ControlResponse.SUCCESS, do, why, cause)
 
 
-def _happen(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
-    """A row without an answer of the scheduler's: the translator answers, or nobody asked."""
+def _without_answer(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
     return Transition(when, None, do, why, cause)
 
 
@@ -317,14 +316,14 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _accept(OTHERWISE, (_D.END,), "all receivers close"),
     ),
     ArbitrationEvent.COMMAND: (
-        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
-        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
+        _without_answer(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _without_answer(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
     ),
     ArbitrationEvent.ADJUST: (
-        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
-        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
-        _happen(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
+        _without_answer(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _without_answer(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
+        _without_answer(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
         _refuse(
             OTHERWISE,
             _R.NOT_IN_CONTROL,
@@ -332,14 +331,16 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
             " and while no problem is flagged",
         ),
     ),
-    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "reading disturbs nothing, and is always allowed"),),
+    ArbitrationEvent.READ: (
+        _without_answer(OTHERWISE, (_D.FORWARD,), "reading disturbs nothing, and is always allowed"),
+    ),
     ArbitrationEvent.DEAD: (
-        _happen(ASKER_HOLDS, (_D.TAKE,), "a component that has died does not keep control", Cause.DEAD),
-        _happen(OTHERWISE, (), "it was not in control"),
+        _without_answer(ASKER_HOLDS, (_D.TAKE,), "a component that has died does not keep control", Cause.DEAD),
+        _without_answer(OTHERWISE, (), "it was not in control"),
     ),
     ArbitrationEvent.IDLE: (
-        _happen(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
-        _happen(OTHERWISE, (), "it was not in control"),
+        _without_answer(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
+        _without_answer(OTHERWISE, (), "it was not in control"),
     ),
 }
 

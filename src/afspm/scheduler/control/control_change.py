@@ -71,7 +71,7 @@ def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None)
     if after != before:
         granted_to = draft.lease.token
         is_other_life = None not in (token, granted_to) and token != granted_to
-        _follow(draft, _Change(before, after, ask, row, is_other_life and ask.who == before.holder))
+        _carry_out(draft, _Change(before, after, ask, row, is_other_life and ask.who == before.holder))
     if after.ended and not before.ended:
         begin_end(draft)
     if event is not None and row.response is not None:
@@ -102,14 +102,14 @@ def answer_unless_ending(
         answers.answer(draft, event, code, why, detail=detail)
 
 
-def _follow(draft: StateDraft, change: _Change) -> None:
-    """Act and tell, before whoever asked is answered."""
+def _carry_out(draft: StateDraft, change: _Change) -> None:
+    # all of it precedes the answer to the request that caused the change
     before, after = change.before, change.after
     problems = draft.env.settings.rules.problems
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
-    _tell_people(draft, change, _have_watched(draft, change))
+    _log_change(draft, change, _alert_watchdog(draft, change))
     if after.ended:
         answers.call_back(draft, None, Cause.ENDED)
     elif before.holder is not None and after.holder is None:
@@ -121,8 +121,7 @@ def _follow(draft: StateDraft, change: _Change) -> None:
         publish_control(draft)
 
 
-def _have_watched(draft: StateDraft, change: _Change) -> list[str]:
-    """Have the watchdog see to a microscope that may be left to itself. Returns what it wants because of that."""
+def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
     cause, former, ask = change.cause, change.before.holder, change.ask
     malfunction = Problem.DEVICE_MALFUNCTION
     if malfunction in change.before.problems.keys() - change.after.problems.keys() and ask.who != TRANSLATOR:
@@ -150,7 +149,7 @@ def _have_watched(draft: StateDraft, change: _Change) -> list[str]:
     return draft.watchdog.newly_wanted(before)
 
 
-def _tell_people(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
+def _log_change(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
     before, after, ask, cause = change.before, change.after, change.ask, change.cause
     routine = is_routine(before, after, ask, draft.lease.announced)
     draft.log("DEBUG" if routine else "INFO", said(before, after, ask, change.row, draft.env.settings.rules))

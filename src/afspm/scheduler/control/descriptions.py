@@ -65,7 +65,7 @@ def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, r
 
 
 def _ended_control(holder: str, cause: Cause) -> str:
-    """Return how a holder lost control; what caused it stands before, unless it is its own end."""
+    # the text before this one names the cause, except where the holder itself is the cause
     match cause:
         case Cause.RELEASED:
             return f"{holder} gave control back"
@@ -129,7 +129,7 @@ def _parameter(subject: object, problems: ProblemNames) -> str:
 
 
 def _value(text: str, unit: str) -> str:
-    """Return a value with a prefix that reads well where its unit is SI, else in the unit that was sent."""
+    # a prefix is chosen where the unit is SI; any other unit stays as it was sent
     try:
         return quantity(float(text), unit, 6) if unit in PREFIXABLE else f"{text} {unit_text(unit)}".strip()
     except ValueError:

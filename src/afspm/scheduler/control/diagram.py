@@ -63,7 +63,7 @@ def _label(ask: ControlInput, before: ArbitrationState, after: ArbitrationState)
 
 
 def _states() -> list[ArbitrationState]:
-    """One of each kind of state that can be reached, with up to two problems and two components."""
+    # two problems and two components suffice to reach each kind of state
     states = []
     for mode in _MODES:
         for flagged in ({}, {1: "b"}, {1: "b", 2: "b"}):

@@ -80,13 +80,13 @@ class PacketCache:
         if source_ns is not None:
             if source_ns in self._sources:
                 return None
-            self._saw(source_ns)
+            self._note_source(source_ns)
         envelope, history = self._envelopes.of(header)
         first_ns = None if source_ns is None else self._first_times.pop(source_ns, None)
         if first_ns == _NEVER_NS:
             return None
         if source_ns is not None and first_ns is not None:
-            return self._again(Packet(envelope, packet.payload, first_ns), source_ns, history)
+            return self._keep_again(Packet(envelope, packet.payload, first_ns), source_ns, history)
         said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
         out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
         kept = self._keep(out, source_ns, history)
@@ -99,7 +99,7 @@ class PacketCache:
         if packet.time_ns is None:
             return True
         is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS
-        self._saw(packet.time_ns)
+        self._note_source(packet.time_ns)
         self._recent.append((packet.time_ns, _NEVER_NS))
         return is_new
 
@@ -127,7 +127,7 @@ class PacketCache:
             newest_ns = packet.time_ns
             self.not_before(newest_ns)
             if source_ns is not None:
-                self._saw(source_ns)
+                self._note_source(source_ns)
             self._keep(packet, source_ns, history)
 
     def holds(self, envelope: str, payload: bytes) -> bool:
@@ -148,7 +148,7 @@ class PacketCache:
             if time_ns > since_ns and kept.packet.envelope.startswith(starts)
         )
 
-    def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, int]:
+    def _keep_again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, int]:
         assert packet.time_ns is not None
         self._recent.append((source_ns, packet.time_ns))
         kept = self._keep(packet, source_ns, history)
@@ -167,7 +167,7 @@ class PacketCache:
         self._last_ns = max(time_ns, self._last_ns + TIME_STEP_NS)
         return self._last_ns
 
-    def _saw(self, source_ns: int) -> None:
+    def _note_source(self, source_ns: int) -> None:
         self._newest_source_ns = source_ns
         self._sources[source_ns] = None
         if len(self._sources) > _TIMES_REMEMBERED:
@@ -187,11 +187,11 @@ class PacketCache:
         while len(times) > history:
             self._drop(times[0])
         while self._bytes > self._max_bytes:
-            self._drop(self._least_needed())
+            self._drop(self._next_to_evict())
         return history
 
-    def _least_needed(self) -> int:
-        """The oldest packet that its envelope has a newer one of; else the oldest."""
+    def _next_to_evict(self) -> int:
+        # the oldest packet with a newer one under its envelope, so that a late joiner gets the newest of each envelope
         if self._several:
             return next(t for t, kept in self._kept.items() if len(self._times[kept.packet.envelope]) > 1)
         return next(iter(self._kept))

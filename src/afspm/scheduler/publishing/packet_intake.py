@@ -35,14 +35,14 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
     told = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
     if move is not None and move.hides(told):
         if draft.env.cache.pass_over(event.packet):
-            _learn(draft, told)
+            _update_state(draft, told)
         return
     published = _published(draft, event.packet, event.header)
     if published is None:
         return
     draft.effects.append(published)
     if told is not None:
-        _learn(draft, told)
+        _update_state(draft, told)
 
 
 def _is_state(message: str) -> bool:
@@ -70,9 +70,9 @@ def _log_once(draft: StateDraft, level: str, text: str) -> None:
         draft.log(level, text)
 
 
-def _learn(draft: StateDraft, told: object) -> None:
+def _update_state(draft: StateDraft, told: object) -> None:
     if isinstance(told, ScopeStatus):
-        _take_state(draft, told.state)
+        _update_scope_state(draft, told.state)
     elif isinstance(told, Feedback):
         before, draft.microscope = draft.microscope, draft.microscope.with_feedback(told)
         is_manual = draft.control.mode is ControlMode.MANUAL
@@ -83,7 +83,7 @@ def _learn(draft: StateDraft, told: object) -> None:
         draft.limits = draft.limits.published(told, draft.now_ns)
 
 
-def _take_state(draft: StateDraft, state: ScopeState) -> None:
+def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     was_free = draft.microscope.is_free
     draft.microscope = draft.microscope.with_state(state, draft.now_s)
     draft.watchdog = draft.watchdog.state_told(draft.microscope)

@@ -100,13 +100,13 @@ def admit(draft: StateDraft, event: RequestIn) -> bool:
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False
-    if not _may_speak(draft, event):
+    if not _owns_its_name(draft, event):
         return False
     outcome = draft.idempotency.look_up(event.name, event.request)
-    return outcome is None or not _repeated(draft, event, outcome)
+    return outcome is None or not _answers_repeated(draft, event, outcome)
 
 
-def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
+def _owns_its_name(draft: StateDraft, event: RequestIn) -> bool:
     name, request_id, run = event.name, event.request.id, draft.env.settings.run.name
     if not name:
         answers.refuse_peer(draft, event, "a client without a name: set the socket's identity to the component's name")
@@ -133,8 +133,7 @@ def refuse_second(draft: StateDraft, event: RequestIn) -> None:
     answers.refuse_peer(draft, event, _TWO_OF_A_NAME.format(name=event.name))
 
 
-def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Response) -> bool:
-    """Answer a request that comes again with its id, without doing it again. False: it may be done."""
+def _answers_repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Response) -> bool:
     name, request = event.name, event.request
     if isinstance(outcome, Response):
         draft.effects.append(Reply(event.connection, name, outcome, request.kind))
@@ -177,7 +176,7 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
     elif kind == RESTART_REQUEST:
         publishing.order_restart(draft, event)
     elif kind == CLOCK_REQUEST:
-        _tell_time(draft, event)
+        _answer_clock_request(draft, event)
     elif kind == LEASE_REQUEST:
         _renew_lease(draft, event)
     elif kind <= 0:
@@ -199,7 +198,7 @@ def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
 
 
 def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
-    """Begin the lease of the holder anew; that is not written down, as it is done again and again."""
+    # successes are not in the event log: a client of the gateway renews its lease again and again
     name, holder = event.name, draft.control.holder
     if name != holder:
         why = f"{name} is not in control, {holder or 'nobody'} is"
@@ -210,17 +209,16 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
     draft.effects.append(Reply(event.connection, name, response, LEASE_REQUEST))
 
 
-def _tell_time(draft: StateDraft, event: RequestIn) -> None:
-    """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
+def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
     run = draft.env.settings.run
-    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
+    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _reason_to_stay(draft)}
     told = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
 
-def _in_use(draft: StateDraft) -> str:
-    """Return why an experiment without a plan is not to end now; empty: nothing keeps it."""
+def _reason_to_stay(draft: StateDraft) -> str:
+    # why a supervisor with nothing left to run may not end the experiment now; empty: it may
     if draft.control.mode is ControlMode.MANUAL:
         return "the mode is MANUAL"
     return f"{draft.control.holder} is in control" if draft.control.holder else ""
@@ -232,7 +230,7 @@ def _in_use(draft: StateDraft) -> str:
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
     """Queue a request, or refuse it if nothing can be sent now."""
     name, request, is_command = event.name, event.request, not reads(event.request)
-    if is_command and (why := _tip_comes_first(draft)) is not None:
+    if is_command and (why := _refusal_for_tip(draft)) is not None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
         return
     is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
@@ -283,14 +281,14 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         _answer_unsent(draft, job, refusal)
         return
     turn = draft.pending.turn or Turn(job.number)
-    if turn.awaited is None and _reads_first(draft, job, turn):
+    if turn.awaited is None and _starts_reads(draft, job, turn):
         return
-    _take_values(draft, turn)
+    _apply_read_values(draft, turn)
     mapped = _mapped(draft, job)
     if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
         return
     if job.request.kind == _ACTION:
-        if turn.move is None and _moves_first(draft, job, turn):
+        if turn.move is None and _starts_move(draft, job, turn):
             return
         if (refusal := draft.limits.check_place(job.request)) is not None:
             _refuse(draft, job, refusal)
@@ -306,7 +304,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     if job.command:
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
         draft.pending = replace(draft.pending, turn=None)
-        _use_lease(draft, name)
+        _restart_lease(draft, name)
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
     if not request.id:
         return
@@ -329,8 +327,8 @@ def _answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response)
     answers.answer_unsent(draft, job, response)
 
 
-def _use_lease(draft: StateDraft, client: str) -> None:
-    """Begin the lease anew; what a person adjusts beside the holder is no sign of life of the holder."""
+def _restart_lease(draft: StateDraft, client: str) -> None:
+    # an adjustment by a person beside the holder is no sign of life of the holder
     if client == draft.control.holder:
         draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
 
@@ -342,13 +340,12 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
     if ControlChange.FORWARD not in row.do:
         code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
         return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
-    if (why := _tip_comes_first(draft)) is not None:
+    if (why := _refusal_for_tip(draft)) is not None:
         return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
     return None
 
 
-def _tip_comes_first(draft: StateDraft) -> str | None:
-    """Return why nobody commands, since the tip was left in danger; None: whoever is in control may."""
+def _refusal_for_tip(draft: StateDraft) -> str | None:
     dog, sees_to_tip = draft.watchdog, draft.control.sees_to_tip
     if dog.tip.may_come and draft.forwarder.up:
         return "a retract of before the scheduler's restart may still be carried out, until the translator answers"
@@ -385,7 +382,7 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
     return refusal is None
 
 
-def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+def _starts_reads(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     needed = draft.limits.depends_on(job.request, is_mapped=draft.frame.maps(draft.now_ns))
     if not needed:
         return False
@@ -395,7 +392,7 @@ def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     return True
 
 
-def _was_read(draft: StateDraft, number: int, name: str, response: Response) -> None:
+def _take_read_value(draft: StateDraft, number: int, name: str, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or job is None or turn.number != number:
         return  # it was called back
@@ -410,7 +407,7 @@ def _was_read(draft: StateDraft, number: int, name: str, response: Response) -> 
         draft.pending = replace(draft.pending, turn=turn.was_read(name, told))
 
 
-def _take_values(draft: StateDraft, turn: Turn) -> None:
+def _apply_read_values(draft: StateDraft, turn: Turn) -> None:
     # only now: packets that arrived while the values were read may be older than these
     if not turn.values:
         return
@@ -438,7 +435,7 @@ def _read(draft: StateDraft, name: str, purpose: OwnPurpose) -> None:
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, purpose)
 
 
-def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+def _starts_move(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     if draft.idempotency.was_sent(job.client, job.request):
         return False
     draft.frame, move = draft.frame.move_before(str(job.request.subject), draft.now_ns)
@@ -455,7 +452,7 @@ def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     return True
 
 
-def _moved(draft: StateDraft, number: int, response: Response) -> None:
+def _take_move_result(draft: StateDraft, number: int, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or turn.move is None or job is None or turn.number != number:
         return  # the action was called back
@@ -476,7 +473,7 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
     if end in (ForwardOutcome.ANSWERED, ForwardOutcome.LATE):
         response = answers.with_id(response, job.request)
         if response.ok and (job.command or job.request.kind == _PARAM):
-            response = _learn(draft, job, response)
+            response = _apply_success(draft, job, response)
     if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
         draft.limits = draft.limits.unknown(job.outgoing)
     if not job.client:
@@ -492,7 +489,7 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
     else:
         if end is ForwardOutcome.UNKNOWN and job.request.kind == _ACTION:
             _action_started(draft, job, is_certain=False)
-        _see_feedback(draft, job, response)
+        _track_feedback(draft, job, response)
         answers.finish(draft, job, response, _unknown_status(response))
 
 
@@ -508,9 +505,9 @@ def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, r
 def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -> None:
     match purpose:
         case ReadForTurn():
-            _was_read(draft, purpose.number, purpose.name, response)
+            _take_read_value(draft, purpose.number, purpose.name, response)
         case MoveForTurn():
-            _moved(draft, purpose.number, response)
+            _take_move_result(draft, purpose.number, response)
         case AskForFrame():
             draft.raised.append(FrameAnswered(purpose.purpose, response))
         case ReadAhead() if not response.ok:
@@ -518,8 +515,8 @@ def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -
 
 
 def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Take an answer after its client was told that none had come: asked again, it gets that answer."""
-    _see_feedback(draft, job, response)
+    # the client has got "no response" already: only a retry under the same id gets this answer
+    _track_feedback(draft, job, response)
     status = _unknown_status(response)
     draft.idempotency = draft.idempotency.noted(job.client, job.request, status or response)
     if status is None and not response.ok:
@@ -528,7 +525,7 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
     draft.log("WARNING", f"the translator answered {job.client} late; the answer is kept for its retry")
 
 
-def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+def _track_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     feedback = feedback_of(job.request)
     if feedback is None or feedback.on is not False or response.ok:
         return
@@ -538,8 +535,7 @@ def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) 
         draft.microscope = draft.microscope.feedback_was_left()
 
 
-def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
-    """Take what a success changed, or told. Returns the answer, in the coordinates of its client."""
+def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
     request, now_ns = job.request, draft.now_ns
     told = None
     if request.kind == _PARAM and response.payload:
@@ -554,7 +550,7 @@ def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Resp
     elif (feedback := feedback_of(request)) is not None:
         draft.microscope = draft.microscope.with_feedback(feedback)
     if job.command:
-        _use_lease(draft, job.client)
+        _restart_lease(draft, job.client)
         if draft.control.mode is ControlMode.MANUAL:
             draft.by_hand = draft.by_hand.requested(request)
     return response
@@ -568,7 +564,7 @@ def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: boo
 
 
 def _names_meant(job: ForwardedRequest) -> tuple[str, ...] | None:
-    """Return the parameters that the asker means to set; None: all that are sent."""
+    # None: all parameters of the request
     return None if job.mapped is None else tuple(job.mapped.names)
 
 
@@ -581,7 +577,7 @@ def _was_not_sent(response: Response) -> bool:
 
 
 def _unknown_status(response: Response) -> RequestStatus | None:
-    """Return UNKNOWN where the controller did not answer its translator: that one can say more when asked again."""
+    # a request of unknown outcome is forwarded again: the translator knows its id, and may know the outcome by then
     return RequestStatus.UNKNOWN if response.code == ControlResponse.NO_RESPONSE else None
 
 

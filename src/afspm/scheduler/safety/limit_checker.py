@@ -157,7 +157,7 @@ class LimitChecker:
 
     def forget(self, name: str) -> LimitChecker:
         """Drop the value of a parameter that could not be read."""
-        return self._using(self.state.usage.forget(name))
+        return self._with_usage(self.state.usage.forget(name))
 
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
         """Count what a request uses: it was checked, and is about to be sent.
@@ -165,24 +165,24 @@ class LimitChecker:
         The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
         """
         usage = self.state.usage
-        for name in self._uses(request, used):
+        for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
         for name in self.limits.rated.intersection(self._names_set_by(request)) if self.limits.rated else ():
             usage = usage.changing(name)
-        return self._using(usage)
+        return self._with_usage(usage)
 
     def counts(self, request: Request) -> bool:
         """Return whether the interval between two such requests is limited."""
-        return bool(self._uses(request, None))
+        return bool(self._counted_uses(request, None))
 
     def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
         """Take back what a request used: it was not carried out, for sure."""
         usage = self.state.usage
-        for name in self._uses(request, used):
+        for name in self._counted_uses(request, used):
             usage = usage.use_undone(name, who, request.id)
         for name in self._names_set_by(request):
             usage = usage.unchanged(name)
-        return self._using(usage)
+        return self._with_usage(usage)
 
     def carried_out(
         self,
@@ -194,30 +194,34 @@ class LimitChecker:
     ) -> LimitChecker:
         """Take a request that succeeded; `told` is the parameter as the translator answered it."""
         if is_get(request):
-            if told is None or not _tells_of(told, request.subject):
+            if told is None or not _has_value_of(told, request.subject):
                 return self.forget(request.subject.name)
             return self.in_force(told, now_ns, was_read=True)
         usage = self.state.usage
-        for name in self._uses(request, used):
+        for name in self._counted_uses(request, used):
             usage = usage.use_done(name, LastUse(now_ns, who, request.id))
-        checker = self._using(usage)
+        checker = self._with_usage(usage)
         for subject in self._set_by(request):
             # what was set is what the microscope says it is now
-            said = told if isinstance(subject, Parameter) and told is not None and _tells_of(told, subject) else subject
+            said = (
+                told
+                if isinstance(subject, Parameter) and told is not None and _has_value_of(told, subject)
+                else subject
+            )
             checker = checker.in_force(said, now_ns)
         return checker
 
     def published(self, subject: object, now_ns: int) -> LimitChecker:
         """Learn places, and the times at which values with a limited rate change, from a published message."""
         usage = self.state.usage
-        for name, value in numbers(self._sensible(subject)):
+        for name, value in numbers(self._valid_values(subject)):
             if name in self.limits.rated:
                 usage = usage.learn(name, value, now_ns)
-        return self._with(usage, self.state.position.learn(subject))
+        return self._with_state(usage, self.state.position.learn(subject))
 
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
         """Learn values that were set or read: a ScanParameters, Feedback, Parameter …"""
-        values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
+        values, usage, position = numbers(self._valid_values(subject)), self.state.usage, self.state.position
         if isinstance(subject, Parameter):
             if not values:  # what a microscope tells is not ours to judge
                 usage = usage.forget(subject.name)
@@ -225,18 +229,17 @@ class LimitChecker:
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
-        return self._with(usage, position.learn(subject))
+        return self._with_state(usage, position.learn(subject))
 
-    def _with(self, usage: Usage, position: KnownPosition) -> LimitChecker:
+    def _with_state(self, usage: Usage, position: KnownPosition) -> LimitChecker:
         if usage is self.state.usage and position is self.state.position:
             return self
         return replace(self, state=LimitState(usage, position))
 
-    def _using(self, usage: Usage) -> LimitChecker:
+    def _with_usage(self, usage: Usage) -> LimitChecker:
         return self if usage is self.state.usage else replace(self, state=replace(self.state, usage=usage))
 
-    def _uses(self, request: Request, used: Collection[str] | None) -> list[str]:
-        """Return what a request uses of that which may be used every so often only."""
+    def _counted_uses(self, request: Request, used: Collection[str] | None) -> list[str]:
         counted = self.limits.counted
         if not counted:
             return []
@@ -246,18 +249,18 @@ class LimitChecker:
         return [name for name in uses if name in counted]
 
     def _names_set_by(self, request: Request) -> list[str]:
-        """Return the parameters that a request sets, each once; none if it makes no sense."""
-        values = [value for subject in self._set_by(request) for value in self._sensible(subject)]
+        # malformed values have no name: `check` refuses such a request
+        values = [value for subject in self._set_by(request) for value in self._valid_values(subject)]
         return list(dict.fromkeys(value.name for value in values))
 
-    def _sensible(self, subject: object) -> list[ParameterValue]:
+    def _valid_values(self, subject: object) -> list[ParameterValue]:
         try:
             return values_of(subject, self.limits.parameters)
         except ParameterValueError:
             return []
 
     def _number(self, told: Parameter) -> float | None:
-        return next((value.number for value in self._sensible(told)), None)
+        return next((value.number for value in self._valid_values(told)), None)
 
     # --- checks ---
 
@@ -292,7 +295,7 @@ class LimitChecker:
                 self._check_value(name, value, limit, use.now_ns)
 
     def _set_by(self, request: Request) -> Collection[object]:
-        """Return what a request sets: its subject, or for an action what the microscope does as that."""
+        # an action of the experiment file sets parameters at the microscope
         if request.kind == ControlRequest.ACTION:
             return self.limits.sets.get(str(request.subject), ())
         return () if is_get(request) else (request.subject,)
@@ -423,5 +426,5 @@ def is_get(request: Request) -> bool:
     return isinstance(request.subject, Parameter) and request.subject.value is None
 
 
-def _tells_of(told: Parameter, asked: Parameter) -> bool:
+def _has_value_of(told: Parameter, asked: Parameter) -> bool:
     return told.value is not None and told.name == asked.name

@@ -69,7 +69,7 @@ def number_of(parameter: Parameter) -> float | None:
 
 
 def _number(parameter: Parameter, text: str, limit: Limit | None) -> float | None:
-    """None if it may be a text, and is one."""
+    # None for a text where a text is allowed
     name = parameter.name
     try:
         value = float(text)

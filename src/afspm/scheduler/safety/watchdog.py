@@ -156,7 +156,7 @@ class Watchdog:
         if not self.tip.may_come:
             return self
         dog = replace(self, tip=replace(self.tip, may_come=False))
-        return dog if dog.owes_retract else dog._see(TipEvent.RETRACTED_LATE)
+        return dog if dog.owes_retract else dog._after(TipEvent.RETRACTED_LATE)
 
     def begun(self, now_s: float) -> Watchdog:
         """Wait: what has happened meanwhile is heard of first, and the translator may not be there."""
@@ -197,7 +197,9 @@ class Watchdog:
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
         """Leave a tip in danger: the run is stopped, and the translator sees to it as it leaves."""
-        return self._see(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
+        return (
+            self._after(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
+        )
 
     # --- events of the microscope ---
 
@@ -260,11 +262,11 @@ class Watchdog:
         tip = replace(self.tip, for_feedback=microscope.endangered_by_feedback)
         # whoever was there to see to a tip that was put off is gone
         due_s = None if self.put_off else self.due_s
-        return replace(self, tip=tip, due_s=due_s)._see(TipEvent.ENDANGERED)
+        return replace(self, tip=tip, due_s=due_s)._after(TipEvent.ENDANGERED)
 
     def seen_to(self) -> Watchdog:
         """Leave the tip to whoever sees to it: it is not retracted any more, unless it is just being."""
-        return self._see(TipEvent.SEEN_TO)
+        return self._after(TipEvent.SEEN_TO)
 
     def hurry(self, now_s: float) -> Watchdog:
         """Wait for nothing longer than a moment: the experiment ends."""
@@ -287,10 +289,10 @@ class Watchdog:
             return dog, None
         action = dog.wanted[0]
         dog = replace(dog, sent=action, due_s=None, told_to_stop=dog.told_to_stop or action == runs)
-        return (dog if dog.tip.stops else dog._see(TipEvent.SENT)), action
+        return (dog if dog.tip.stops else dog._after(TipEvent.SENT)), action
 
     def _waits_for_stop(self, microscope: MicroscopeStatus) -> bool:
-        """True while what was told to stop still runs: the tip is retracted when it has stopped."""
+        # a retract is sent only once the scan has stopped
         return not self.tip.stops and microscope.state in STOPS and not self.unstoppable
 
     def answered(self, code: int, microscope: MicroscopeStatus, now_s: float) -> tuple[Watchdog, SafetyResult]:
@@ -299,28 +301,28 @@ class Watchdog:
         if code == ControlResponse.SUCCESS:
             dog = replace(dog, starting=None)
             if is_retract:
-                return dog._see(TipEvent.RETRACTED), SafetyResult.DONE
+                return dog._after(TipEvent.RETRACTED), SafetyResult.DONE
             due_s = now_s + dog._wait_s if dog.owes_retract else None
             return replace(dog._without_stop(action), due_s=due_s), SafetyResult.DONE
         if code == ControlResponse.NOT_FREE:
             dog = replace(dog, refused_at=microscope.states_seen, due_s=now_s + dog._wait_s)
-            return dog._see(TipEvent.NOT_YET), SafetyResult.AGAIN
+            return dog._after(TipEvent.NOT_YET), SafetyResult.AGAIN
         dog = replace(dog, attempts=dog.attempts + 1)
         if code == ControlResponse.NO_RESPONSE and dog.attempts < dog.settings.attempts:
-            return dog._see(TipEvent.NOT_YET), SafetyResult.AGAIN
+            return dog._after(TipEvent.NOT_YET), SafetyResult.AGAIN
         if not is_retract:
             return replace(dog, unstoppable=True)._without_stop(action), SafetyResult.FAILED
         if code == ControlResponse.ACTION_NOT_SUPPORTED:
-            return dog._see(TipEvent.IMPOSSIBLE), SafetyResult.FAILED
+            return dog._after(TipEvent.IMPOSSIBLE), SafetyResult.FAILED
         return dog._retract_later(now_s), SafetyResult.FAILED
 
     def done_late(self, action: str) -> Watchdog:
         """Take what the translator did when nobody waited any more: a tip withdrawn late is left to people, too."""
-        return self._see(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
+        return self._after(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
 
     def unsent(self, now_s: float) -> Watchdog:
         """Take back what `next_action` gave: the translator is not connected. It is sent when that is."""
-        dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._see(TipEvent.NOT_YET)
+        dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._after(TipEvent.NOT_YET)
         return replace(dog, due_s=now_s + dog._wait_s) if dog.owes_retract and dog.due_s is None else dog
 
     def translator_is_there(self, now_s: float) -> Watchdog:
@@ -342,7 +344,7 @@ class Watchdog:
         """
         dog = replace(self, due_s=None)
         if dog.put_off:
-            return replace(dog, refused_at=-1)._see(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE), None
+            return replace(dog, refused_at=-1)._after(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE), None
         if not dog.wanted or dog.sent is not None:
             return dog, None
         if dog.tip.stops:
@@ -363,7 +365,7 @@ class Watchdog:
     def _retract_later(self, now_s: float) -> Watchdog:
         wait_s = min(self._wait_s * 2**self.retries, self.settings.longest_s)
         due_s = now_s + (_SOON_S if self.in_haste else wait_s)
-        dog = self._see(TipEvent.FAILED)
+        dog = self._after(TipEvent.FAILED)
         return replace(dog, due_s=due_s, retries=min(self.retries + 1, 32), attempts=0)
 
     def _with_stops(self, stops: tuple[str, ...]) -> Watchdog:
@@ -373,8 +375,7 @@ class Watchdog:
         stops = tuple(other for other in self.tip.stops if other != action)
         return replace(self, attempts=0)._with_stops(stops)
 
-    def _see(self, event: TipEvent) -> Watchdog:
-        """Go on by the table; what was waited for is forgotten where nothing is owed any more."""
+    def _after(self, event: TipEvent) -> Watchdog:
         *after, calls = _TABLE[event]
         duty = after[list(TipDuty).index(self.tip.duty)]
         tip = replace(self.tip, duty=duty, calls_people=self.tip.calls_people or calls)
