@@ -1,4 +1,4 @@
-"""`SchedulerCore`: all that a scheduler decides, composed of the parts beside this module."""
+"""`SchedulerCore`: all decisions of a scheduler, composed of the parts beside this module."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ _AT_ONCE_S = 0.0  # in real monotonic time: always past
 def step(
     state: SchedulerState, event: Input, env: Environment, now_s: float, now_ns: int
 ) -> tuple[SchedulerState, list[Effect]]:
-    """Return the state after an event, and what is to be done, in order."""
+    """Return the state after an event, and the effects in their order."""
     draft = StateDraft(state, env, now_s, now_ns)
     _dispatch(draft, event)
     while draft.raised:
@@ -93,7 +93,7 @@ def _dispatch(draft: StateDraft, event: Input) -> None:
 
 
 def due_s(state: SchedulerState) -> float | None:
-    """Return when, in real monotonic time, a Tick is due at the latest."""
+    """Return when a Tick is due at the latest, in real monotonic time; None: no deadline."""
     dues = (
         state.due_s(),
         _malfunction_due(state)[0],
@@ -112,14 +112,14 @@ class SchedulerCore:
         effects = core.start(now_s, now_ns)                  # then, for each input:
         effects = core.step(RequestIn(...), now_s, now_ns)
 
-    The host carries out the effects in their order, and steps with `Tick()` when `deadline_s` or `deadline_ns` has
-    come, however much else there is to do.
+    The host carries out the effects in their order. At `deadline_s` or `deadline_ns` it steps with `Tick()`, even while
+    other inputs wait.
 
     Args:
         frame: the coordinates of components, if they differ from those of the microscope.
 
     Attributes:
-        state: all that it decides by; replaced by every step.
+        state: all that decisions depend on, except the cache; replaced by every step.
     """
 
     def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame = TIP_FRAME) -> None:
@@ -128,7 +128,7 @@ class SchedulerCore:
         self._restored: SavedState | None = None
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Begin. The control state is published as soon as the translator's packets have been caught up with."""
+        """Begin. The control state is published once the translator's missed packets have come."""
         draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
         draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
         draft.watchdog = draft.watchdog.begun(now_s)
@@ -150,7 +150,7 @@ class SchedulerCore:
         return effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
-        """Take an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
+        """Process an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
         self.state, effects = step(self.state, event, self._env, now_s, now_ns)
         return effects
 
@@ -162,51 +162,51 @@ class SchedulerCore:
                 yield from found.entries if isinstance(found, JournalEntries) else ()
 
     def deadline_s(self) -> float | None:
-        """Return when, in real monotonic time, a Tick is due at the latest; None: no deadline."""
+        """Return when a Tick is due at the latest, in real monotonic time; None: no deadline."""
         return due_s(self.state)
 
     def deadline_ns(self) -> int | None:
-        """Return when, in experiment time, a Tick is due at the latest; None: no deadline (only a lease makes one)."""
+        """Return when a Tick is due at the latest, in experiment time; None: no deadline (only a lease makes one)."""
         return self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
 
     def snapshot(self) -> SavedState:
-        """Return what must survive a kill, but for the cache."""
+        """Return the state that must survive a kill, without the cache."""
         return saved_state(self.state, self._env)
 
     def restore(self, saved: SavedState) -> None:
-        """Take up what `snapshot` gave and a file of plain data returned, before `start`."""
+        """Restore the state of `snapshot`, read back from plain data, before `start`."""
         self._restored = saved
         self.state = restored_state(saved, self._env.settings, self.state.frame)
         self._env.cache.not_before(saved.last_ns)
 
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
-        """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
+        """Restore published packets (with their `source_ns`), oldest first, before `start`."""
         logged = list(packets)
         self._env.cache.restore(logged)
         self.state = replace(self.state, frame=self.state.frame.recalled(logged))
 
     def cached(self) -> Iterable[LoggedPacket]:
-        """Return what is cached now (with `source_ns`), oldest first."""
+        """Return the packets in the cache (with `source_ns`), oldest first."""
         return self._env.cache
 
     @property
     def newest_source_ns(self) -> int:
-        """The translator's newest packet that was taken in: where to subscribe from; -1 if there is none."""
+        """The time of the translator's newest packet in the cache, to subscribe from; -1 if there is none."""
         return self._env.cache.newest_source_ns
 
     @property
     def leave_at_s(self) -> float:
-        """When, in real monotonic time, the scheduler may leave after the end; inf: it has not ended."""
+        """When the scheduler leaves after the end, in real monotonic time; inf: the experiment has not ended."""
         return self.state.end.leave_at_s
 
     @property
     def control(self) -> ArbitrationState:
-        """The state of control: its holder, for which problem, and who flagged which."""
+        """The state of control: the holder, its problem, and the flagged problems with their authors."""
         return self.state.control
 
     @property
     def control_state(self) -> ControlState:
-        """The same as all peers are told it."""
+        """The state of control as it is published."""
         return self.control.published()
 
 
@@ -227,8 +227,8 @@ def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
     timeout = draft.peers.timeout
     if waiting is not None:
         request_pipeline.handle(draft, waiting)
-    elif name == draft.control.holder and draft.now_s >= timeout.told_again_s:
-        draft.peers = replace(draft.peers, timeout=timeout.told(draft.now_s))
+    elif name == draft.control.holder and draft.now_s >= timeout.next_loss_log_s:
+        draft.peers = replace(draft.peers, timeout=timeout.loss_logged(draft.now_s))
         draft.log(
             "WARNING", f"lost contact with {name}, which is in control; it has {timeout.grace_s:g} s to come back"
         )
@@ -255,7 +255,7 @@ def _on_problem(draft: StateDraft, event: ProblemSeen) -> None:
 
 
 def _on_announced(draft: StateDraft, event: Announced) -> None:
-    # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
+    # a time just before the packet's own, so that the packet keeps its time when it comes again after a kill
     time_ns = None if event.before_ns is None else event.before_ns - TIME_STEP_NS
     publishing.publish(draft, event.envelope, event.payload, time_ns)
 
@@ -340,7 +340,8 @@ def _end_when_safe(draft: StateDraft) -> None:
         draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
     for event, code, why, detail in kept:
         newest = draft.peers.sessions.connection_of(event.name)
-        if event.request.id and newest is not None:  # a client that lost its connection asks again by another
+        # a client that lost its connection repeats its request over a new one
+        if event.request.id and newest is not None:
             event = replace(event, connection=newest)
         answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()
@@ -356,7 +357,7 @@ def _on_tick(draft: StateDraft, event: Tick) -> None:
 
 
 def _handle_deadlines(draft: StateDraft) -> None:
-    # one change of control in a step: it is saved and told before the next is decided
+    # at most one change of control in a step: it is saved and published before the next is decided
     for see_to in (_open_barrier, _flag_malfunction, _run_watchdog):
         if see_to(draft):
             return
@@ -366,7 +367,7 @@ def _handle_deadlines(draft: StateDraft) -> None:
     is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _is_due(_lease_ends_at_s(draft), draft.now_s)
     if (holder := draft.control.holder) is not None and is_idle:
         control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
-    for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
+    for name in draft.pending.still_unclear(draft.now_s):  # both connections stay open: they belong to two processes
         draft.pending, waiting = draft.pending.clear_up(name)
         if waiting is not None:
             request_pipeline.refuse_second(draft, waiting)
@@ -465,4 +466,4 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     FrameAnswered: _on_frame_input,
     ControlChanged: _on_frame_input,
 }
-"""By the type of an input or of a frame's output."""
+"""The handler for each type of input and of frame output."""

@@ -1,4 +1,4 @@
-"""Sockets and disk around the scheduler's decisions: what comes in becomes inputs, effects are carried out."""
+"""Sockets and disk around the scheduler's decisions: messages become inputs, and effects are carried out."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
 
 _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
-"""How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
-them do."""
+"""How late a deadline may be noticed while messages come: computing the next deadline after each message would cost as
+much as processing some of them."""
 _TOGETHER_BYTES = 1 << 20
-"""Packets are written down together up to this size: a first one must not wait long for the others."""
+"""Packets are written together up to this size: the first one must not wait long for the others."""
 _WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBLM]))
-"""Requests that are still written down after the end."""
+"""Requests that are still recorded after the end."""
 
 
 class FrameWorker(Protocol):
-    """The worker of a coordinate frame. It has threads or processes of its own: no call waits.
+    """The worker of a coordinate frame. It has threads or processes of its own, so no call waits.
 
     Attributes:
         wake: called from any thread when there is a report.
@@ -57,16 +57,16 @@ class FrameWorker(Protocol):
         ...
 
     def reports(self) -> Iterable[object]:
-        """Yield the reports since the last call, oldest first; the next one once the last was handled."""
+        """Yield the reports since the last call, oldest first; a report is handled before the next is taken."""
         ...
 
     def close(self) -> None:
-        """End it."""
+        """Stop the worker."""
         ...
 
 
 class SchedulerShell:
-    """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
+    """A running scheduler: `start`, then `handle` the result of `wait` until it is `over`."""
 
     def __init__(
         self,
@@ -97,18 +97,18 @@ class SchedulerShell:
         self._carry_out(self._core.start(self._clock.monotonic_s(), self._clock.now_ns()))
 
     def wait(self) -> list[Source]:
-        """Wait for whatever comes first, a message or a deadline."""
+        """Wait for a message or a deadline, and return the sources that are ready."""
         next_s = min(self._core.leave_at_s if self.ended else self._next_deadline_s, self._sockets.router.due_s)
         timeout_s = next_s - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
     @property
     def over(self) -> bool:
-        """The experiment has ended, and nobody is waited for any more."""
+        """The experiment has ended, and the grace period after it."""
         return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
     def handle(self, ready: list[Source]) -> None:
-        """See to what has come, and to the deadlines."""
+        """Process incoming messages, then expired deadlines."""
         if self.ended:
             self._handle_after_end(ready)
             return
@@ -137,7 +137,7 @@ class SchedulerShell:
         if now_s >= self._next_deadline_s:
             self._deadlines(now_s)
         elif now_s + _LATE_S < self._next_deadline_s:
-            self._next_deadline_s = now_s + _LATE_S  # what has come may have set an earlier one
+            self._next_deadline_s = now_s + _LATE_S  # the messages may have set an earlier deadline
 
     def _handle_after_end(self, ready: list[Source]) -> None:
         # after the end no request is decided: each is answered that the experiment has ended
@@ -177,12 +177,12 @@ class SchedulerShell:
         self._answer(asked, Response(ControlResponse.FAILURE, b"", HAS_ENDED, wire.id_of(asked.frames), ended))
 
     def stop(self) -> None:
-        """See to what must be known to whoever resumes the run, unless the experiment is over."""
+        """Save the duty towards a tip in danger for a resumed run, unless the experiment has ended."""
         if not self.ended:
             self._step_with(events.Stopped())
 
     def close(self) -> None:
-        """End the frame's worker, and make sure of what was written."""
+        """Stop the frame's worker, and flush the files."""
         if self._worker is not None:
             self._worker.close()
         self._write_ahead.close()
@@ -287,7 +287,7 @@ class SchedulerShell:
                     assert self._worker is not None, "a frame with jobs has a worker"
                     self._worker.take(effect.job)
                 case events.Kill():
-                    sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
+                    sockets.publisher.serve()  # a subscriber that connects at this moment gets the end, too
                     sockets.publisher.kill()
                     self._tip_is_safe = effect.tip_is_safe
                     self._close_translator()
@@ -304,7 +304,7 @@ class SchedulerShell:
             if isinstance(effect, events.SaveState):
                 state = effect.state
             elif isinstance(effect, events.Publish):
-                # last words are recorded; a scheduler that is started again must not find the end in its cache
+                # packets after the end are recorded, but not cached: a resumed run must not replay its end
                 entries.append(LoggedPacket(effect.packet, effect.source_ns, 0 if over else effect.history))
             elif isinstance(effect, events.Kill):
                 over = True

@@ -1,4 +1,4 @@
-"""The wire, as far as the scheduler's decisions need it."""
+"""The wire format, as far as the scheduler's decisions need it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from afspm.model import Parameter
 
 
 class WireCodec:
-    """The wire as `scheduler.events.Codec` asks for it."""
+    """The codec of the wire format for `scheduler.events.Codec`."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         try:

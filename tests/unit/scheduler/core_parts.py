@@ -57,7 +57,7 @@ class Dog:
 
     def state(self, state: ScopeState) -> None:
         self.microscope = self.microscope.with_state(state, 0.0)
-        self.watchdog = self.watchdog.state_told(self.microscope)
+        self.watchdog = self.watchdog.state_reported(self.microscope)
 
     def feedback(self, *, on: bool) -> None:
         self.microscope = self.microscope.with_feedback(Feedback(on=on))

@@ -26,7 +26,7 @@ from afspm.model import (
     ScanParameters,
     ShapeChange,
 )
-from afspm.scheduler.control.descriptions import asked
+from afspm.scheduler.control.descriptions import request_text
 from afspm.scheduler.events import Effect, Forward, Kill, Publish, SaveState, Tick, Unreadable
 from afspm.scheduler.publishing import event_log
 
@@ -311,4 +311,4 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
     ],
 )
 def test_requests_in_words(kind: int, subject: Any, words: str) -> None:
-    assert asked(Request(int(kind), subject), ProblemNames()) == words
+    assert request_text(Request(int(kind), subject), ProblemNames()) == words

@@ -177,7 +177,7 @@ def test_an_unknown_process_is_refused_with_those_that_are_known(lab: Lab) -> No
 def test_a_supervisor_that_is_silent_is_given_no_orders(lab: Lab) -> None:
     tell(lab, states("a"))
     lab.later(SILENT_S + 1.0)
-    assert "has not been heard of for 11 s" in order(lab, "a").reason
+    assert "has sent no report for 11 s" in order(lab, "a").reason
 
 
 def test_it_takes_the_role_to_order() -> None:

@@ -1,4 +1,4 @@
-"""Requests and changes of control in words, for people."""
+"""Requests, changes of control, and settings made in MANUAL mode, in words for people."""
 
 from __future__ import annotations
 
@@ -38,15 +38,17 @@ from afspm.scheduler.control.arbitration import (
 _FEEDBACK_WORDS = {"on": "feedback", "proportional_gain": "P gain", "integral_gain": "I gain", "setpoint": "setpoint"}
 
 
-def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_told: str | None) -> bool:
-    """Return whether a change is routine: control is given back, or taken again by the holder logged last."""
+def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_logged: str | None) -> bool:
+    """Return whether a change is routine: a holder gives control back, or the last holder in the log takes it again."""
     if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
         return False
-    return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_told
+    return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_logged
 
 
-def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules) -> str:
-    """A change of control in words, for the log."""
+def change_text(
+    before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules
+) -> str:
+    """Return a change of control in words, for the log."""
     parts = []
     if after.holder != before.holder and after.holder is not None:
         parts.append(f"{after.holder} is in control")
@@ -77,11 +79,12 @@ def _ended_control(holder: str, cause: Cause) -> str:
 
 @dataclass(frozen=True)
 class HandSettings:
-    """Settings that were changed in MANUAL mode: parameters by requests, the z feedback also at the panel.
+    """Settings changed in MANUAL mode: parameters set by requests, and the z feedback, also when changed at the panel.
 
     Attributes:
-        parameters: value, with its unit, by name.
-        before: the feedback in force when MANUAL began, and now.
+        parameters: value with its unit, by name.
+        before: the feedback in force when MANUAL began; None: not known.
+        now: the feedback in force; None: not known.
     """
 
     parameters: Mapping[str, str] = field(default_factory=dict)
@@ -89,7 +92,7 @@ class HandSettings:
     now: Feedback | None = None
 
     def requested(self, request: Request) -> HandSettings:
-        """Take a request that was carried out in MANUAL mode."""
+        """Add a request that was carried out in MANUAL mode."""
         parameter = request.subject
         if not isinstance(parameter, Parameter) or parameter.value is None:
             return self
@@ -97,11 +100,11 @@ class HandSettings:
         return replace(self, parameters={**self.parameters, parameter.name: value})
 
     def published(self, feedback: Feedback, *, is_manual: bool) -> HandSettings:
-        """Take the feedback that is in force."""
+        """Store the feedback in force."""
         return replace(self, now=feedback, before=self.before if is_manual and self.before else feedback)
 
     def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:
-        """Return the settings that stay in force, in words; the mode is automated again."""
+        """Return the settings that stay in force after MANUAL, in words, and start over."""
         told = [f"{name} = {value}" for name, value in self.parameters.items()]
         for name, word in _FEEDBACK_WORDS.items():
             value = getattr(self.now, name, None)
@@ -110,8 +113,8 @@ class HandSettings:
         return HandSettings(before=self.now, now=self.now), tuple(told)
 
 
-def asked(request: Request, problems: ProblemNames) -> str:
-    """A request in words, with units; those that flag a problem begin with "flags", and name it."""
+def request_text(request: Request, problems: ProblemNames) -> str:
+    """Return a request in words, with units."""
     words = _WORDS.get(request.kind)
     return request_name(request.kind) if words is None else words(request.subject, problems)
 

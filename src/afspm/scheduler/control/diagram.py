@@ -1,4 +1,4 @@
-"""The state diagram of control, found by trying the table on every kind of state: it can't differ from the table."""
+"""The state diagram of control, computed from the arbitration table, so that both always agree."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _MODES = (ControlMode.AUTOMATED, ControlMode.MANUAL)
 
 
 def kind(control: ArbitrationState) -> str:
-    """The node of the diagram that a state belongs to."""
+    """Return the node of the diagram for a state."""
     if control.ended:
         return "ended"
     if control.mode is ControlMode.MANUAL:
@@ -22,7 +22,7 @@ def kind(control: ArbitrationState) -> str:
 
 
 def edges() -> list[tuple[str, str, str]]:
-    """All (from, label, to) between different nodes, in the order of the table."""
+    """Return all (from, label, to) between different nodes, in the order of the table."""
     found: dict[tuple[str, str, str], None] = {}
     for event in ArbitrationEvent:
         for control in _states():
@@ -36,7 +36,7 @@ def edges() -> list[tuple[str, str, str]]:
 
 
 def mermaid() -> str:
-    """The diagram as text for mermaid, as the documentation shows it."""
+    """Return the diagram as text for mermaid, as the documentation shows it."""
     names = {"free": "Free", "in control": "Held", "flagged, nobody in control": "Flagged"}
     names |= {"solver in control": "Solving", "manual": "Manual", "ended": "Ended"}
     lines = ["stateDiagram-v2", "    [*] --> Free"]

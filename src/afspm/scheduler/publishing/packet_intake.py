@@ -1,4 +1,4 @@
-"""Packets of the translator: each gets its envelope, its time and its coordinates, and tells of the microscope."""
+"""Packets of the translator: each gets an envelope, a time and its coordinates, and updates the microscope's state."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 
 
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
-    """Publish a packet, and learn from it what the microscope does."""
+    """Publish a packet, and update the state of the microscope from it."""
     message, codec, move = event.header.message, draft.env.codec, draft.pending.move
-    # all other messages pass unread: they change nothing that the scheduler decides by
+    # only states are decoded: no decision depends on other messages, and scans are large
     told = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
     if move is not None and move.hides(told):
         if draft.env.cache.pass_over(event.packet):
@@ -86,7 +86,7 @@ def _update_state(draft: StateDraft, told: object) -> None:
 def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     was_free = draft.microscope.is_free
     draft.microscope = draft.microscope.with_state(state, draft.now_s)
-    draft.watchdog = draft.watchdog.state_told(draft.microscope)
+    draft.watchdog = draft.watchdog.state_reported(draft.microscope)
     if draft.microscope.is_free != was_free:
         draft.lease = draft.lease.used(draft.now_ns)
     flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)

@@ -5,19 +5,19 @@
 | 1. admitted | at arrival | session, idempotency |
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
 | 3. queued | at arrival | the forwarder: one line to the translator, in order |
-| 4. within limits | as its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
+| 4. within limits | when its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
 | 5. settled | at the answer, or when it is overdue | |
 
-Nothing is done twice, and every request gets an answer.
+No request is executed twice, and every request gets an answer.
 
-**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and requests before it
-in the queue change these. So a request is decided as its turn comes: no other command is on its way, all earlier ones
+**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and earlier requests in
+the queue change these. So a request is decided when its turn comes: no other command is on its way, all earlier ones
 have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
-special case: the values that it may have changed are read before the next request that depends on them, or that one is
-refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
-that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
-place is in its coordinates, values are read again. Meanwhile requests that only read pass, and the scheduler's own
-(`safety_commands`) always go first.
+special case: the values that it may have changed are read before the next request that depends on them; if a value
+can't be read, that request is refused. An overdue request may still be carried out. Since the translator serves one
+request after the other, a value that it answers later is newer. A turn takes up to three steps: values are read, the
+microscope is moved to the mapped place, values are read again. Meanwhile requests that only read pass, and the
+scheduler's own (`safety_commands`) always go first.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 _LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
-"""The answers of a translator that has no such parameter, or none at all."""
+"""The answers of a translator without this parameter, or without parameters."""
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
     int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
@@ -92,11 +92,11 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
         enqueue(draft, event)
 
 
-# --- 1. admitted: the peer may speak for its name, and the request is new -------------------------------------------
+# --- 1. admitted: the name belongs to the peer, and the request is new -----------------------------------------------
 
 
 def admit(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is new and to be decided; if not, it was answered, or waits."""
+    """Return whether a request is new; if not, it was answered, or waits."""
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False
@@ -129,7 +129,7 @@ def _owns_its_name(draft: StateDraft, event: RequestIn) -> bool:
 
 
 def refuse_second(draft: StateDraft, event: RequestIn) -> None:
-    """Refuse a second process under one name."""
+    """Refuse a second process with the same name."""
     answers.refuse_peer(draft, event, _TWO_OF_A_NAME.format(name=event.name))
 
 
@@ -147,7 +147,7 @@ def _answers_repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatu
     if outcome is RequestStatus.FORGOTTEN:
         answers.reply(draft, event, _unknown(request, TOO_OLD))
         return True
-    # the translator, which knows its id, answers what became of it
+    # sent again with its id: the translator knows the outcome, and does not execute it twice
     if draft.control.holder == name or reads(request):
         return False
     answers.reply(draft, event, _unknown(request, "it was sent once, and is not sent again"))
@@ -159,19 +159,19 @@ def _unknown(request: Request, why: str) -> Response:
     return Response(int(ControlResponse.NO_RESPONSE), b"", f"outcome unknown: {why}", request.id, detail)
 
 
-# --- 2. authorised: the scheduler answers by itself, or who asks may command the microscope -------------------------
+# --- 2. authorised: the scheduler answers itself, or the client may command the microscope --------------------------
 
 
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is for the translator, and its client may ask for it; if not, it was answered."""
+    """Return whether to forward a request to the translator; if not, it was answered."""
     kind, subject = event.request.kind, event.request.subject
-    if kind == RELAY_REQUEST:  # a supervisor's last words come after the end
+    if kind == RELAY_REQUEST:  # also after the end: final process states belong in the record
         publishing.publish_for_process(draft, event)
     elif draft.control.ended:
         control_change.answer_unless_ending(
             draft, event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED
         )
-        if kind == ControlRequest.ADD_EXP_PRBLM:  # seen too late to be flagged: the record is to show it
+        if kind == ControlRequest.ADD_EXP_PRBLM:  # too late to be flagged, but the record must show it
             publishing.publish_entries(draft)
     elif kind == RESTART_REQUEST:
         publishing.order_restart(draft, event)
@@ -224,7 +224,7 @@ def _reason_to_stay(draft: StateDraft) -> str:
     return f"{draft.control.holder} is in control" if draft.control.holder else ""
 
 
-# --- 3. queued: it waits for its turn -------------------------------------------------------------------------------
+# --- 3. queued: the request waits -----------------------------------------------------------------------------------
 
 
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
@@ -242,14 +242,14 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
         answers.answer_unsent(draft, job, refused.response)
 
 
-# --- 4. within limits: as its turn comes, nothing forbids it, and the microscope is where it has to be ---------------
+# --- 4. within limits: decided when its turn comes, with the microscope at its place --------------------------------
 
 
 def send_next(draft: StateDraft) -> None:
     """Decide and send waiting requests in their order, until one is in flight."""
     turn = draft.pending.turn
     if turn is not None and draft.forwarder.waiting(turn.number) is None:
-        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
+        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its deadline has passed
     send_own(draft)
     while draft.forwarder.is_free and (job := _next_job(draft)) is not None:
         _decide(draft, job)
@@ -257,7 +257,7 @@ def send_next(draft: StateDraft) -> None:
 
 
 def send_own(draft: StateDraft) -> None:
-    """Send the first of the scheduler's own requests, which are decided already."""
+    """Send the first of the scheduler's own requests, which need no decision."""
     forwarder = draft.forwarder
     if forwarder.is_free and forwarder.own:
         draft.forwarder = forwarder.sent(forwarder.own[0], draft.now_s)
@@ -269,6 +269,7 @@ def _next_job(draft: StateDraft) -> ForwardedRequest | None:
         return queue[0] if queue else None
     if turn.is_ready(draft.microscope, draft.now_s):
         return draft.forwarder.waiting(turn.number)
+    # reads change nothing, so they need not wait for the turn of a command
     return next((job for job in queue if not job.command), None)
 
 
@@ -280,6 +281,7 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
     if (refusal := _not_allowed_now(draft, job)) is not None:
         _answer_unsent(draft, job, refusal)
         return
+    # decided again: since its arrival the holder may have changed, and earlier requests the values in force
     turn = draft.pending.turn or Turn(job.number)
     if turn.awaited is None and _starts_reads(draft, job, turn):
         return
@@ -312,7 +314,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     if is_kept or (job.command and draft.limits.counts(job.outgoing)):
         draft.idempotency = draft.idempotency.sent(name, request)
     elif mapped is not None:
-        draft.save()  # with what it was mapped to: asked again, it is sent the same
+        draft.save()  # the frame with this mapping: a retry after a kill must send the same bytes
 
 
 def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
@@ -408,7 +410,7 @@ def _take_read_value(draft: StateDraft, number: int, name: str, response: Respon
 
 
 def _apply_read_values(draft: StateDraft, turn: Turn) -> None:
-    # only now: packets that arrived while the values were read may be older than these
+    # only now: packets that arrived during the reads may be older than the values read
     if not turn.values:
         return
     draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
@@ -424,7 +426,7 @@ def _failed_before(response: Response) -> Response:
 
 
 def read_ahead(draft: StateDraft) -> None:
-    """Ask for the values of which it counts for how long they hold."""
+    """Read the parameters with a limited rate: a rate is checked from the time since which a value is known."""
     for name in draft.limits.to_be_known():
         _read(draft, name, ReadAhead(name))
 
@@ -448,7 +450,7 @@ def _starts_move(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     assert own is not None  # the line is free
     own = own._replace(deadline_s=job.deadline_s)
     draft.pending = replace(draft.pending, turn=turn.moving(PrePositioner(own, draft.microscope.states_seen)))
-    draft.save()  # with where it is sent: what is told of it is then known after a restart
+    draft.save()  # the frame with this move: packets about it can then be mapped after a restart
     return True
 
 
@@ -468,7 +470,7 @@ def _take_move_result(draft: StateDraft, number: int, response: Response) -> Non
 
 
 def settle(draft: StateDraft, settled: SettledRequest) -> None:
-    """Take the end of a request: tell, and remember, its outcome."""
+    """Process the end of a request: remember its outcome, and answer the client."""
     job, end, response = settled.job, settled.end, settled.response
     if end in (ForwardOutcome.ANSWERED, ForwardOutcome.LATE):
         response = answers.with_id(response, job.request)
@@ -498,7 +500,7 @@ def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, r
         answers.write_down(draft, SCHEDULER, job.request, response, job.heard_s)
     if job.purpose is None:
         safety_commands.settle(draft, job, end, response)
-    elif end is not ForwardOutcome.LATE:  # its purpose had the answer before that none had come
+    elif end is not ForwardOutcome.LATE:  # after its timeout the purpose has ended already
         _serve_purpose(draft, job.purpose, response)
 
 
@@ -542,7 +544,8 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
         told = draft.env.codec.decode_parameter(response.payload)
     draft.limits = draft.limits.carried_out(job.outgoing, now_ns, told, _names_meant(job), job.client)
     draft.frame = draft.frame.carried_out(job.outgoing, told, now_ns)
-    is_asked = request.kind == _PARAM and bool(job.client)  # the scheduler itself needs the microscope's values
+    # not for the scheduler's own reads: limits are in the coordinates of the microscope
+    is_asked = request.kind == _PARAM and bool(job.client)
     if is_asked and (mapped := draft.frame.answer(request, told, now_ns)) is not None:
         response = replace(response, payload=draft.env.codec.encode(mapped))
     if request.kind == _ACTION:
@@ -582,5 +585,5 @@ def _unknown_status(response: Response) -> RequestStatus | None:
 
 
 def reads(request: Request) -> bool:
-    """Return whether a request disturbs nothing."""
+    """Return whether a request is read-only."""
     return request.kind == ControlRequest.ACTION_SUPPORT or (request.kind == _PARAM and is_get(request))

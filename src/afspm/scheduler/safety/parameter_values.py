@@ -1,4 +1,4 @@
-"""The parameters that a request sets, or that the microscope tells, each in one unit."""
+"""The parameters in a request or a packet, each in one unit."""
 
 from __future__ import annotations
 
@@ -22,14 +22,15 @@ class ParameterValue(NamedTuple):
 
 
 class ParameterValueError(Exception):
-    """A value that its parameter can't have, and why. Never leaves `logic`."""
+    """A value that its parameter can't have, and why. Does not leave this package."""
 
 
 def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterValue]:
-    """All that a subject sets, by the names of the parameters.
+    """Return all parameters that a subject sets, by name.
 
     Raises:
-        ParameterValueError: a text where there must be a number, one that is not finite, a unit of another dimension.
+        ParameterValueError: a text where there must be a number, a number that is not finite, a unit of another
+            dimension.
     """
     if isinstance(subject, Parameter):
         if subject.value is None:
@@ -56,12 +57,11 @@ def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterVal
 
 
 def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
-    """Those that are numbers."""
     return [(name, number) for name, number in values if number is not None]
 
 
 def number_of(parameter: Parameter) -> float | None:
-    """Return the value of a single parameter in SI; None if it is not a finite number of the right kind."""
+    """Return the value of a single parameter in SI; None if it is not a finite number of the right dimension."""
     try:
         return _number(parameter, parameter.value or "", None)
     except ParameterValueError:
