@@ -1,4 +1,4 @@
-"""One run at a time commands a controller: its translator holds a lock, which the system takes back from the dead."""
+"""One run at a time commands a controller: its translator holds a lock, which ends with its process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import BinaryIO, cast
 from afspm.basics.errors import AfspmError
 from afspm.basics.file_lock import lock
 
-_LOCKED_BYTES = 1  # where a lock covers what is read (Windows), who holds it is told behind it
+_LOCKED_BYTES = 1  # Windows lets no other process read locked bytes: the holder's name stands behind them
 
 
 class ControllerTaken(AfspmError):
@@ -27,21 +27,21 @@ class ControllerTaken(AfspmError):
 
 @contextlib.contextmanager
 def commanding(address: str, run: str) -> Iterator[None]:
-    """This process alone, of all on this computer, whoever's, commands the controller while in the block.
+    """Give this process the only right, on this computer and among all users, to command the controller.
 
     Args:
-        address: where the controller is; empty: nobody else can command it (a simulated one).
-        run: in which run, for whoever is refused.
+        address: of the controller; empty: no other process can command it (a simulated one).
+        run: the name of this run, for the refusal of others.
 
     Raises:
-        ControllerTaken: another process does.
+        ControllerTaken: another process commands it.
     """
     if not address:
         yield
         return
     path = _lock_file(address)
     with _open_and_lock(path, address) as file:
-        # a full disk, or the file is another user's: who holds it can't be told, and it is held all the same
+        # a full disk, or a file of another user: the holder's name is missing, but the lock is held all the same
         with contextlib.suppress(OSError):
             file.truncate(0)
             file.write(b" " * _LOCKED_BYTES + f"{run or 'another run'}, process {os.getpid()}".encode())
@@ -49,7 +49,7 @@ def commanding(address: str, run: str) -> Iterator[None]:
         try:
             yield
         finally:
-            with contextlib.suppress(OSError):  # Windows keeps it while it is open, a folder for all that of others
+            with contextlib.suppress(OSError):  # Windows keeps an open file; a sticky folder keeps another user's
                 path.unlink()
 
 
@@ -58,7 +58,7 @@ def _open_and_lock(path: Path, address: str) -> BinaryIO:
         try:
             file = _open_lock_file(path)
         except FileNotFoundError:
-            continue  # whoever had it has just taken it away
+            continue  # its former holder has just deleted it
         except OSError as error:
             told = f"the lock file of this controller can't be opened: {error.strerror or error}"
             raise ControllerTaken(
@@ -101,7 +101,10 @@ def _lock_file(address: str) -> Path:
 def _lock_folder() -> Path:
     # common to all users: each may add files, and delete only their own (sticky bit). A link in its place is refused:
     # it may lead into a folder chosen by another user
-    in_common = {"win32": os.environ.get("PROGRAMDATA"), "darwin": "/tmp"}  # where the usual one is each user's own
+    in_common = {
+        "win32": os.environ.get("PROGRAMDATA"),
+        "darwin": "/tmp",
+    }  # where the temporary folder is each user's own
     folder = Path(in_common.get(sys.platform) or tempfile.gettempdir()) / "afspm-controllers"
     try:
         with contextlib.suppress(FileExistsError):

@@ -22,10 +22,10 @@ from afspm.translator.result_files import (
 
 
 class FolderFiles(ResultFiles):
-    """The measurement that is running or has just ended, and the results.
+    """The running measurement, or the one just ended, and the results.
 
     Attributes:
-        pattern: of the names of its files, as of `Path.glob`.
+        pattern: of the names of its files, as in `Path.glob`.
         precision: of its files.
     """
 
@@ -33,7 +33,7 @@ class FolderFiles(ResultFiles):
     precision: FilePrecision
 
     def begin(self, what: str, folder: Path, taken: PlainMapping) -> None:
-        """A measurement begins.
+        """Record the start of a measurement.
 
         Args:
             taken: "frame" of a scan, "position" of a spectrum.
@@ -41,12 +41,12 @@ class FolderFiles(ResultFiles):
         self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
 
     def end(self, now_ns: int) -> None:
-        """It has ended."""
+        """Record the end of the measurement."""
         if self._kept["running"] is not None:
             self._ends({"end_ns": now_ns})
 
     def has_file(self) -> bool:
-        """Return True if a file of what is running has appeared."""
+        """Return True if the running measurement has a file."""
         running = self._kept["running"]
         return running is not None and self._file(running) is not None
 
@@ -67,19 +67,19 @@ class FolderFiles(ResultFiles):
                 raise FileError("was overwritten or deleted", where=str(path))
         return self._content_of([path for path, _ in files], entry)
 
-    # -- what a controller may have otherwise
+    # --- to be overridden for a controller with other files ---
 
     def result_name(self, path: Path) -> str:
         """Return the name of the result in a file."""
         return str(path)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return the files of what was measured, and when they were written; none: not all are there."""
+        """Return the files of a measurement with their times of writing, ns; empty: some are missing."""
         path = self._file(measured)
         return [] if path is None else [(str(path), modified_ns(path))]
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Look at the first of a file that is taken."""
+        """Check the first scan or spectrum of a new file."""
 
     def _goes_on(self, running: Entry) -> None:
         # the controller repeats scans: only a newer file belongs to the next image
@@ -92,10 +92,10 @@ class FolderFiles(ResultFiles):
         try:
             content = self._content_of(paths, measured) if paths else ()
         except (AfspmError, OSError):
-            return False  # not yet whole
+            return False  # still being written
         if not content or [modified_ns(path) for path in paths] != [written_ns for _, written_ns in files]:
             return False
-        if lines_missing(content):  # it was saved when the scan was broken off
+        if lines_missing(content):  # the controller saved an interrupted scan
             self.broken_off = True
             return True
         self.check(paths[0], content[0], measured)

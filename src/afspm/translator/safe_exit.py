@@ -1,4 +1,4 @@
-"""Sees to the tip when a run ends: nothing goes on measuring, and a tip without feedback is retracted."""
+"""Makes the end of a run safe: the measurement is stopped, and a tip without feedback is retracted."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from afspm.translator.temporary_settings import TemporarySettings
 
 _LOOK_S = 0.1
 _TIP_S = 8.0
-"""Real time in which the tip is tried to be retracted when the run is stopped: a controller may be lost just then, or
-refuse. A little less than `transport.process.parent` leaves."""
+"""Real time for attempts to retract the tip when the run is stopped: the controller may be lost just then, or refuse. A
+little less than `transport.process.parent` allows."""
 
 
 class SafeExit:
-    """Stops what is measuring, and retracts the tip where that is owed.
+    """Stops the running measurement, and retracts the tip where that is owed.
 
     Args:
-        retracts: True if the tip is to be retracted when nobody is left to switch the feedback on again that a request
-            has switched off.
-        act: does an action that nobody has asked for.
-        observe: publishes what is new.
+        retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch
+            it on again.
+        act: executes an action of the translator itself.
+        observe: publishes all changes.
     """
 
     def __init__(
@@ -55,16 +55,16 @@ class SafeExit:
         return self._retracts and self._state.feedback.in_danger
 
     def end(self) -> None:
-        """End as the scheduler says, which has seen to the tip."""
+        """End on the scheduler's request; the scheduler has made the tip safe."""
         with contextlib.suppress(*LOST):
             self._stop_measuring()
             self._temporary.end()
 
     def leave(self, wait: Callable[[float], None]) -> None:
-        """End with nobody left. A feedback that is off at the panel is for the person at the panel.
+        """End without a scheduler. A feedback that was switched off at the panel is left to the person there.
 
         Args:
-            wait: lets so many real seconds pass, and looks at the controller then.
+            wait: lets a time in real seconds pass, and then looks at the controller.
         """
         self._connection.guarded(self._stop_measuring)
         if self._connection.stands:
@@ -90,7 +90,7 @@ class SafeExit:
     def _motion_failure(self, wait: Callable[[float], None], until_s: float) -> str:
         # a controller may not have read the command yet, and drops it when our connection closes
         sets_out = False
-        while (state := self._state.sequence.said.state) is not ScopeState.FREE:
+        while (state := self._state.sequence.published.state) is not ScopeState.FREE:
             sets_out = sets_out or state is ScopeState.COARSE_MOTOR
             if not self._connection.stands:
                 return f"the controller is lost: {self._connection.why_lost}"
@@ -116,8 +116,8 @@ class SafeExit:
         return response
 
     def _stop_measuring(self) -> None:
-        said = self._state.sequence.said.state
-        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(said)
+        published = self._state.sequence.published.state
+        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(published)
         if stop is not None and self._connection.stands:
             self._act(stop)
             self._observe()

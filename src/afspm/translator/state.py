@@ -1,4 +1,4 @@
-"""The state that a translator keeps on disk, so that a restarted one tells the same story and does nothing twice."""
+"""The state that a translator keeps on disk, so that a restart repeats no action and no state."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FeedbackWatch:
         return self.is_off or bool(self._kept.get("may_have_switched"))
 
     def saw(self, on: bool | None) -> bool:
-        """Note the feedback as it is now. Return True if a request was just seen to have switched it off."""
+        """Store the observed feedback. Return True if a request has just switched it off."""
         kept = self._kept
         switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
         kept["feedback_off"] = on is False and (switched_off or self.is_off)
@@ -42,19 +42,19 @@ class FeedbackWatch:
         return switched_off
 
     def may_switch(self, request: Request) -> bool:
-        """Note that a request is about to act. Return True if a kill must not make this be forgotten."""
+        """Record that a request is about to be executed. Return True if this must be saved first."""
         affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
         in_doubt = affects and not self._kept.get("may_have_switched")
         self._kept["may_have_switched"] = True
         return in_doubt
 
     def retracted(self) -> None:
-        """Note that the tip is away, and needs no feedback."""
+        """Record that the tip is withdrawn, and needs no feedback."""
         self._kept["may_have_switched"] = self._kept["feedback_off"] = False
 
 
 class TranslatorState:
-    """The kept values, with the times and the order of what is published.
+    """The values on disk, with the times and the order of published packets.
 
     Args:
         result_timeout_s: see `StatusSequence`.
@@ -72,13 +72,13 @@ class TranslatorState:
         self.sequence = StatusSequence(ScopeStatus(ScopeState(self.kept["said"])), result_timeout_s)
 
     def save(self) -> None:
-        """Write everything to disk. On a full disk it is logged, and the tip is looked after all the same."""
-        self.kept["said"] = int(self.sequence.said.state)
-        self.kept["seen_ns"] = self._clock.now_ns()  # a run that is resumed goes on after it
+        """Write everything to disk. A full disk is logged, and the translator goes on protecting the tip."""
+        self.kept["said"] = int(self.sequence.published.state)
+        self.kept["seen_ns"] = self._clock.now_ns()  # a resumed run continues after this time
         self._memory.save()
 
     def stamp(self, count: int = 1) -> list[int]:
-        """Return strictly increasing times for so many packets, ns."""
+        """Return `count` strictly increasing times for packets, ns."""
         first = max(self._clock.now_ns(), int(self.kept.get("last_ns", 0)) + 1)
         self.kept["last_ns"] = first + count - 1
         return list(range(first, first + count))

@@ -1,7 +1,7 @@
 """`Translator`: the process between the scheduler and one microscope, the same for every microscope.
 
-One loop waits for requests and for the moment to look at the controller again. Four parts around the driver do the
-work: `Connection`, `Observer`, `RequestHandler` and `SafeExit`.
+One loop waits for requests and for the next look at the controller. Four parts around the driver do the work:
+`Connection`, `Observer`, `RequestHandler` and `SafeExit`.
 """
 
 from __future__ import annotations
@@ -58,15 +58,15 @@ class TranslatorRun:
 
 
 class Translator:
-    """Answers requests to a microscope and publishes what happens at it.
+    """Answers requests to a microscope and publishes its states, settings and results.
 
     Args:
-        driver: already made with its settings, not yet connected.
+        driver: constructed with its settings, not yet connected.
         port: to the network.
         memory: kept over a restart.
         step: entered around everything that takes time, so that a busy process is not taken for a frozen one.
         controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver
-            knows where its controller is.
+            knows the address of its controller.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class Translator:
         self.state = state = TranslatorState(memory, clock, 2 * driver.patience_s(driver.common.result_timeout_s / 2))
         temporary = TemporarySettings(driver, state, log)
         self.observer = observer = Observer(driver, port, state, temporary, log)
-        # what it was doing is remembered: it may still be at it when it is found again
+        # the sequence keeps its state: the microscope may still be scanning when it is reconnected
         undefined = partial(observer.publish, ScopeStatus(ScopeState.UNDEFINED))
         self._connection = connection = Connection(driver, controller, clock, log, on_lost=undefined)
         self.requests = RequestHandler(
@@ -110,7 +110,7 @@ class Translator:
         self._ended = False
 
     def run(self) -> ExitCode:
-        """Run until the experiment ends, or the parent has gone or wants it to stop."""
+        """Run until the experiment ends, or until the parent process has gone or stops this one."""
         try:
             while not self._ended:
                 with self._step():
@@ -120,7 +120,7 @@ class Translator:
                     if not isinstance(one, ParentGone):
                         with self._step():
                             self.handle(one)
-                # if the scheduler has said that the experiment is over, it has seen to the tip
+                # after CLOSE there is nothing to do: the scheduler has made the tip safe
                 if not self._ended and any(isinstance(one, ParentGone) for one in arrived):
                     with self._step():
                         self._safe_exit.leave(self._wait_and_look)
@@ -131,11 +131,11 @@ class Translator:
             self._port.close()
 
     def leaves_danger(self) -> bool:
-        """Return True if it has to retract the tip before it ends. May be called from another thread."""
+        """Return True if the tip has to be retracted before this process ends. May be called from another thread."""
         return self._safe_exit.is_owed()
 
     def handle(self, arrived: RequestReceived | SubscriberJoined) -> None:
-        """Handle one thing that came over the network."""
+        """Handle one message from the network."""
         if not isinstance(arrived, RequestReceived):
             if self._connection.stands:
                 self.observer.publish_all()
@@ -148,15 +148,15 @@ class Translator:
                 self.requests.answer(arrived.frames)
 
     def look(self) -> None:
-        """See what has changed at the controller and publish it."""
+        """Publish the changes at the controller since the last look."""
         self._connection.guarded(self._look)
 
     def wait_s(self) -> float:
-        """Return the real seconds until the controller should be looked at again."""
+        """Return the real seconds until the next look is due."""
         return self.observer.wait_s() if self._connection.stands else self._connection.wait_s()
 
     def reply(self, response: Response, level: int = logging.INFO) -> None:
-        """Answer the request in hand, and log a refusal."""
+        """Answer the current request, and log a refusal."""
         if response.code != ControlResponse.SUCCESS:
             self._log.log(level, "refused, %s: %s", ControlResponse(response.code).name, response.reason)
         self._port.reply(wire.encode_response(response))
@@ -169,20 +169,24 @@ class Translator:
         self.observer.look()
 
     def _wait_and_look(self, wait_s: float) -> None:
-        self._port.poll(wait_s)  # a peer that asks for something now gets no answer
+        self._port.poll(wait_s)  # requests that arrive now are not answered
         self.look()
 
 
 def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[..., Translator] = Translator) -> int:
-    """Run a translator as the host does. While another run commands the controller, say which, and end."""
+    """Run a translator (called by the host of processes); end if another run commands the controller."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
-        address = "" if controller else driver.controller_at  # a real controller of this address is left alone
+        address = (
+            "" if controller else driver.controller_at
+        )  # a real controller of this address is not touched, so not locked
         try:
             stack.enter_context(commanding(address, context.launch.run_dir or ""))
         except ControllerTaken as error:
             context.log.error("%s", error)
-            return ExitCode.CRASHED  # to be tried again a few times: that run may be just ending
+            return (
+                ExitCode.CRASHED
+            )  # CRASHED, so that the supervisor retries a few times: the other run may be just ending
         if driver.common.trace:
             _begin_trace(driver, context)
             stack.callback(TRACE.end)
@@ -201,7 +205,8 @@ def _run_locked(driver: DriverBase, context: ProcessContext, make: Callable[...,
     from afspm.transport.zmq_server import open_server_port
 
     launch = context.launch
-    # saved several times with each request: all of it is for a kill, after a power cut no request is waiting any more
+    # not synced: it is saved several times for each request, and only a kill matters, since after a power cut no
+    # request is waiting any more
     memory = Memory(Path(launch.state_dir) / f"{launch.name}.json" if launch.state_dir else None, synced=False)
     if memory.damage:
         context.log.error("the newest saved state is damaged, the one before it is used: %s", memory.damage)

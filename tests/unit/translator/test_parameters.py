@@ -35,7 +35,7 @@ def test_a_value_comes_back_from_the_controller_as_it_was_asked_for(number: floa
     value = spec.parse(repr(given_number), unit[0])
     back = spec.from_vendor(spec.to_vendor(value))
     assert spec.same(back, value)
-    assert float(spec.told(back, unit[0])[0]) == pytest.approx(given_number, rel=1e-14)
+    assert float(spec.for_peer(back, unit[0])[0]) == pytest.approx(given_number, rel=1e-14)
 
 
 @given(st.text(max_size=20), st.one_of(st.none(), st.text(max_size=10)))
@@ -68,7 +68,7 @@ def test_angles_are_degrees_unless_said_otherwise_and_may_run_the_other_way() ->
     assert spec.parse("90") == pytest.approx(math.pi / 2)
     assert spec.parse("1.5", "rad") == 1.5
     assert spec.to_vendor(math.pi / 2) == pytest.approx(-90)
-    assert spec.told(math.pi / 2) == ("90", "deg")
+    assert spec.for_peer(math.pi / 2) == ("90", "deg")
 
 
 def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:

@@ -40,7 +40,7 @@ def test_a_measurement_ends_with_its_results_or_as_interrupted_and_with_nothing_
                 said, delivered = step.status.state, False
             else:
                 assert isinstance(step, DiscardResults | LogError)
-        assert said is sequence.said.state
+        assert said is sequence.published.state
 
 
 @given(st.lists(LOOKS, max_size=20))
@@ -53,7 +53,7 @@ def test_a_controller_that_comes_to_rest_is_told_as_free(looks: list[tuple[Scope
     for _ in range(3):
         now_s += 11.0
         sequence.observe(ScopeStatus(ScopeState.FREE), False, now_s)
-    assert sequence.said.state is ScopeState.FREE
+    assert sequence.published.state is ScopeState.FREE
 
 
 def test_the_deadline_is_told_while_something_is_waited_for() -> None:
