@@ -1,4 +1,4 @@
-"""The invariants can fail: what is broken on purpose is found within a few nights."""
+"""The invariants can fail: decisions broken on purpose are found within a few nights."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _FEW = ("experiment", "classifier", "corrector", "feedback", "person")
 
 
 def _bad_night(seed: int) -> Plan:
-    """A night in which much goes wrong, in some with a greedy client."""
+    # many faults; in some nights also a greedy client
     away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
     drawn = plan(seed, hours=4.0)
     if seed % 4 == 3:  # few others and slow, so that control stays where it is
@@ -352,7 +352,7 @@ def _nights() -> None:
 
 
 def _drift_nights() -> None:
-    """Nights of a client that does not wait, and little else: a move takes the microscope's time."""
+    # nights of a client that does not wait, and little else: a move takes the microscope's time
     for seed in range(2, 26, 4):
         night = replace(_bad_night(seed), cast=("person", "burster", "adjuster"), hours=2.0, ends=True, faults=())
         DriftNight(night).run()
@@ -377,7 +377,7 @@ def test_limits_decided_at_arrival_are_found_in_sample_coordinates(monkeypatch: 
 
 
 def test_actions_that_are_not_saved_are_found_in_sample_coordinates(monkeypatch: Patch) -> None:
-    """Where the sample moves, a repeated action is sent to another place: no translator knows that it is the same."""
+    """Where the sample moves, a repeated action is sent to another place: to a translator it is a new one."""
 
     def nights() -> None:
         for seed in range(12, 15):
