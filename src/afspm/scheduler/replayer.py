@@ -19,7 +19,7 @@ from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, Router
 
-REASON = "this is a replay of a recorded run: nothing can be asked of it"
+REASON = "this is a replay of a recorded run: it takes no requests"
 FAREWELL_S = 0.5  # real: for the end to reach all subscribers
 MOST_AT_ONCE = 200
 

@@ -135,9 +135,9 @@ def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
             core.restore(saved)
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(
-            f"what was in force before the restart can't be understood: {error!r}",
+            f"the state saved before the restart can't be read: {error!r}",
             where=str(state.path),
-            hint="delete the file to begin with nobody in control",
+            hint="delete the file to start with control free and no problem flagged",
         ) from error
     if log is not None:
         core.restore_cache(cached_packets(log))

@@ -270,6 +270,7 @@ class SchedulerShell:
     def _carry_out(self, effects: Iterable[events.Effect]) -> None:
         sockets = self._sockets
         effects = [*effects]
+        # first: a kill between two effects must leave nothing published that a restart does not know
         self._persist(effects)
         for effect in effects:
             match effect:

@@ -23,7 +23,7 @@ class StateFile:
         self.path = path
         self._generations = None if path is None else CheckpointFile(path)
         self._log = log
-        self._outage = OutageLog("a restart would not know what is in force now", log)
+        self._outage = OutageLog("a restart would not know the present state", log)
 
     def load(self) -> SavedState | None:
         """Return the state saved last; None if none was.

@@ -66,6 +66,7 @@ def _open_and_lock(path: Path, address: str) -> BinaryIO:
             ) from error
         try:
             lock(file)
+            # between open and lock its former holder may have deleted it: then the lock is on no file of this name
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         except FileNotFoundError:
@@ -81,6 +82,7 @@ def _open_and_lock(path: Path, address: str) -> BinaryIO:
 
 def _open_lock_file(path: Path) -> BinaryIO:
     # a link is not followed; a file of another user can be locked, but not written
+    # O_NONBLOCK: a FIFO in its place must not block the open
     flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
     try:
         descriptor, mode = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o644), "r+b"

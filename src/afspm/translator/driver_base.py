@@ -406,7 +406,7 @@ class DriverBase(ABC):
         for name in wanted:
             value = found[name]
             if isinstance(value, float) and not math.isfinite(value):
-                raise InvalidValue(f"the controller says that {name} is {value}")
+                raise InvalidValue(f"the controller returned {value} for {name}")
         return {
             name: told[name] if name in told and self.same(name, found[name], told[name], found) else found[name]
             for name in wanted

@@ -88,7 +88,7 @@ class EmulatedController:
         try:
             microscope.connect()
             self.prove()
-        except BaseException:
+        except BaseException:  # raised again: a connection to another controller must not stay open
             microscope.close()
             raise
 

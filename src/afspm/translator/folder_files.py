@@ -93,6 +93,7 @@ class FolderFiles(ResultFiles):
             content = self._content_of(paths, measured) if paths else ()
         except (AfspmError, OSError):
             return False  # still being written
+        # a file that changed while it was read is still being written
         if not content or [modified_ns(path) for path in paths] != [written_ns for _, written_ns in files]:
             return False
         if lines_missing(content):  # the controller saved an interrupted scan

@@ -103,6 +103,7 @@ class Observer:
         is_over = self._state.sequence.published.state in MEASURING and status.state not in MEASURING
         if is_over:
             self._polling.over(self._clock.monotonic_s())
+        # a fast simulated clock waits here: otherwise much experiment time would pass before the results are published
         with self._clock.late() if is_over else nullcontext():
             results = self._outbox.look()
             is_whole = self._driver.followed()
@@ -157,7 +158,7 @@ class Observer:
         return Outgoing(*wire.encode(thing), self._state.stamp()[0])
 
     def _status(self) -> ScopeStatus:
-        # while temporary settings are in force the microscope counts as busy, whatever the controller reports
+        # while temporary settings are in force the microscope counts as busy, even if the controller reports FREE
         return self._temporary.status or self._driver.status()
 
     def _observe_values(self, announce: Sequence[str]) -> None:

@@ -86,6 +86,7 @@ class Outbox:
         """Return the packets of the new results, to be published after the memory was saved."""
         packets = []
         for result, messages in self._read.items():
+            # one time each: subscribers recognise a duplicate by its time
             times = self._stamp(len(messages))
             packets += _packets(messages, times)
             self._kept["known"].append(result)

@@ -153,13 +153,13 @@ class ParameterSpec:
         try:
             number = float(value) * self.sign
         except (ValueError, TypeError):
-            raise refuse_value(self.name, f"the controller says {value!r}, which is not a number") from None
+            raise refuse_value(self.name, f"the controller returned {value!r}, which is not a number") from None
         number = units.convert(self._finite(number), self.unit, self.si_unit)
         return round(number) if self.type == "int" else number
 
     def _finite(self, number: float) -> float:
         if not math.isfinite(number):
-            raise refuse_value(self.name, f"the controller says {number}, which is not a finite number")
+            raise refuse_value(self.name, f"the controller returned {number}, which is not a finite number")
         return number
 
     def for_peer(self, value: Value, unit: str | None = None) -> tuple[str, str]:

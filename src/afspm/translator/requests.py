@@ -186,6 +186,7 @@ class RequestOutcomes:
         self._shelves: tuple[dict[str, str], ...] = kept.setdefault("ledger", {}), kept.setdefault("unnumbered", {})
         self._kept = kept
         kept.setdefault("forgotten", {})
+        # begun and without an outcome: the microscope's state is in the same file, so nothing was done
         if all_or_nothing:
             for shelf in self._shelves:
                 for request_id in [key for key, entry in shelf.items() if " " not in entry]:

@@ -95,9 +95,9 @@ class SafeExit:
             if not self._connection.stands:
                 return f"the controller is lost: {self._connection.why_lost}"
             if sets_out and state is ScopeState.INTERRUPTED:
-                return "it was broken off"
+                return "the retract was interrupted"
             if self._clock.monotonic_s() >= until_s:
-                return f"it was told to, and is still {state.name}"
+                return f"a retract was sent, and the state is still {state.name}"
             wait(_LOOK_S)
         return ""
 

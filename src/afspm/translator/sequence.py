@@ -120,7 +120,7 @@ class StatusSequence:
             return [DiscardResults(), *self._publish(seen)]  # of the other kind: it was begun at the panel
         if not self._timed_out(now_s):
             return []
-        return [LogError("the controller keeps measuring after it was told to stop"), *self._publish(seen)]
+        return [LogError("the controller keeps measuring after a stop"), *self._publish(seen)]
 
     def _timed_out(self, now_s: float) -> bool:
         if self._waiting_since_s is None:

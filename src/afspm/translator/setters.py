@@ -75,7 +75,7 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
         after = driver.in_force(whole)
     except LOST:
         raise
-    except Exception:
+    except Exception:  # a driver may raise anything, and must not leave a frame half set
         with contextlib.suppress(Exception):  # a driver may raise anything; the first error is reported
             driver.put_in_force(former)
         raise

@@ -166,6 +166,7 @@ def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixel
         if name in table:
             low, high = table[name].range
             reached = region.corners_m()[:, axis]
+            # the corners are computed, so their last bits may miss a bound that the frame touches
             slack = 1e-9 * max(abs(reached).max(), region.size_m[axis])
             if reached.min() < low - slack or reached.max() > high + slack:
                 extent = " to ".join(table[name].quantity(float(end)) for end in (reached.min(), reached.max()))

@@ -12,7 +12,7 @@ from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20
-_SLOWEST_BYTES_PER_S: Final = 1e6
+_SLOWEST_BYTES_PER_S: Final = 1e6  # a whole scan may take longer than the timeout of a small answer
 
 T = TypeVar("T")
 
@@ -87,6 +87,7 @@ class TcpConnection:
             self._socket = socket.create_connection(address, timeout_s)
         except OSError as error:
             raise ControllerLost(f"no connection: {error}", where=self.where, hint=hints[0]) from error
+        # a small question must not wait for more data to fill a segment
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.peer = "{}:{}".format(*self._socket.getpeername()[:2])
         self._trace = TRACE.connection(TCP)

@@ -43,7 +43,7 @@ class TemporarySettings:
                 apply(self._driver, values)
         except LOST:
             raise  # the outcome is unknown: the former values are restored when the controller is reconnected
-        except Exception:
+        except Exception:  # raised again: `apply` has restored the former values
             self._forget()
             raise
         self._kept[_KEY]["until_s"] = self._driver.clock.now_s() + for_s
@@ -75,7 +75,7 @@ class TemporarySettings:
                 apply(self._driver, found["former"])
         except LOST:
             raise
-        except Exception as error:
+        except Exception as error:  # a driver may raise anything; a person must learn the values to restore
             self._log.critical("can't restore %s: %s; set it by hand", found["former"], error)
         self._forget()
 

@@ -182,7 +182,7 @@ class TracedConnection:
         lost = ""
         try:
             yield answer
-        except BaseException as error:
+        except BaseException as error:  # raised again; the trace shows any end of an exchange, also an interruption
             lost = "" if answer.is_whole else f"{type(error).__name__}: {error}"
             raise
         finally:
@@ -194,7 +194,7 @@ class TracedConnection:
         """Record that the last question could not be sent, if the block raises."""
         try:
             yield
-        except BaseException as error:
+        except BaseException as error:  # raised again; the trace shows any end of an exchange, also an interruption
             self._write(b"", f"{type(error).__name__}: {error}")
             raise
 

@@ -300,8 +300,8 @@ def test_no_sequence_of_events_breaks_the_invariants(story: list[ControlInput]) 
 def test_the_diagram_is_drawn_from_the_table() -> None:
     drawn = edges()
     assert ("free", "asks for control", "in control") in drawn
-    assert ("in control", "flags a problem", "flagged, nobody in control") in drawn
-    assert ("flagged, nobody in control", "asks for control", "solver in control") in drawn
+    assert ("in control", "flags a problem", "flagged, no component in control") in drawn
+    assert ("flagged, no component in control", "asks for control", "solver in control") in drawn
     assert ("solver in control", "the last flag is removed", "free") in drawn
     assert not any(before == "manual" and after == "in control" for before, _, after in drawn)
     assert mermaid().startswith("stateDiagram-v2")

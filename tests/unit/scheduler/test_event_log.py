@@ -120,7 +120,7 @@ def test_refusal_is_logged_with_its_reason(lab: Lab) -> None:
     lab.ask("stranger", R.ACTION, "start-scan")
     (entry,) = lab.entries()
     assert entry.refused
-    assert (entry.response, entry.reason) == (C.NOT_IN_CONTROL, "stranger is not in control, nobody is")
+    assert (entry.response, entry.reason) == (C.NOT_IN_CONTROL, "stranger is not in control, no component is")
 
 
 @pytest.mark.parametrize("flagged", [True, False])

@@ -259,7 +259,7 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         ),
         _refuse(OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, "{holder} is in control"),
         _accept(ASKER_HOLDS, (_D.GRANT,), "asked for again: it stays in control, for the problem it now names"),
-        _accept(OTHERWISE, (_D.GRANT,), "nobody is in control: the first to ask gets it"),
+        _accept(OTHERWISE, (_D.GRANT,), "no component is in control: the first to ask gets it"),
     ),
     ArbitrationEvent.RELEASE_CONTROL: (
         _accept(ASKER_HOLDS, (_D.TAKE,), "its own decision", Cause.RELEASED),
@@ -366,7 +366,7 @@ def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules:
         return ""
     return row.why.format(
         who=ask.who,
-        holder=control.holder or "nobody",
+        holder=control.holder or "no component",
         number=ask.number,
         problem=rules.problems.name(ask.number),
         problems=", ".join(map(rules.problems.name, sorted(control.problems))) or "none",

@@ -17,7 +17,7 @@ def kind(control: ArbitrationState) -> str:
     if control.mode is ControlMode.MANUAL:
         return "manual"
     if control.problems:
-        return "solver in control" if control.holder else "flagged, nobody in control"
+        return "solver in control" if control.holder else "flagged, no component in control"
     return "in control" if control.holder else "free"
 
 
@@ -37,7 +37,7 @@ def edges() -> list[tuple[str, str, str]]:
 
 def mermaid() -> str:
     """Return the diagram as text for mermaid, as the documentation shows it."""
-    names = {"free": "Free", "in control": "Held", "flagged, nobody in control": "Flagged"}
+    names = {"free": "Free", "in control": "Held", "flagged, no component in control": "Flagged"}
     names |= {"solver in control": "Solving", "manual": "Manual", "ended": "Ended"}
     lines = ["stateDiagram-v2", "    [*] --> Free"]
     lines += [f'    state "{text}" as {name}' for text, name in names.items()]

@@ -82,7 +82,8 @@ class CacheRule:
             message = self.message or "AnyMessage"
             if not tells(self.name(PacketHeader(message, "", (0.0, 0.0), "")), message):
                 raise InvalidValue(
-                    f"the envelope {self.envelope!r} does not begin with the name of its message: nobody could read it",
+                    f"the envelope {self.envelope!r} does not begin with the name of its message:"
+                    " no subscriber could decode it",
                     where="[cache]",
                     hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
                 )
@@ -178,7 +179,7 @@ class Envelopes:
             envelope = self._mapped(self._mapping, header)
             if not isinstance(envelope, str) or "\0" in envelope or not tells(envelope, header.message):
                 raise ConfigError(
-                    f"the mapping of envelopes gave {envelope!r} for {header.message}: nobody could read it",
+                    f"the mapping of envelopes gave {envelope!r} for {header.message}: no subscriber could decode it",
                     where="[cache]",
                     hint=f"a text without NUL: {header.message}, or what begins with {header.message}_",
                 )

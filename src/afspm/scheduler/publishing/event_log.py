@@ -37,11 +37,11 @@ LONGEST = 1000
 """Characters of a request in words, and of a reason."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
-LATE = "late: the client had been told that there was no answer"
+LATE = "late: the client had got no answer in time"
 """The reason of an answer that came after the client had given up."""
 SCHEDULER = "scheduler"
 """The author of requests of the scheduler itself."""
-_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
+_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
 _STARTS = frozenset({names.START_SCAN, names.START_SPEC})
 _STARTS_KEPT = 16
 """Starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
@@ -183,7 +183,7 @@ def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:
 def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> JournalEntry:
     if not is_restart:
         return JournalEntry(now_ns, CONTROL, SCHEDULER, "started", event=ControlEvent.STARTED)
-    what = f"started again; {control.holder or 'nobody'} is in control"
+    what = f"started again; {control.holder or 'no component'} is in control"
     return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
 
 

@@ -201,7 +201,7 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
     # successes are not in the event log: a client of the gateway renews its lease again and again
     name, holder = event.name, draft.control.holder
     if name != holder:
-        why = f"{name} is not in control, {holder or 'nobody'} is"
+        why = f"{name} is not in control, {holder or 'no component'} is"
         answers.answer(draft, event, ControlResponse.NOT_IN_CONTROL, why)
         return
     draft.lease = draft.lease.asked(event.request.subject, draft.now_s)
@@ -278,10 +278,10 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         if not isinstance(mapped := _mapped(draft, job), Response):
             _send(draft, job, mapped)
         return
+    # authorised again: control may have changed while the command waited
     if (refusal := _not_allowed_now(draft, job)) is not None:
         _answer_unsent(draft, job, refusal)
         return
-    # decided again: since its arrival the holder may have changed, and earlier requests the values in force
     turn = draft.pending.turn or Turn(job.number)
     if turn.awaited is None and _starts_reads(draft, job, turn):
         return
@@ -422,7 +422,7 @@ def _apply_read_values(draft: StateDraft, turn: Turn) -> None:
 
 
 def _failed_before(response: Response) -> Response:
-    return replace(response, reason=f"not sent: what had to come before it failed ({response.reason})")
+    return replace(response, reason=f"not sent: the read or move before it failed ({response.reason})")
 
 
 def read_ahead(draft: StateDraft) -> None:

@@ -335,7 +335,7 @@ class LimitChecker:
         known = self.state.usage.known.get(name)
         if known is None:
             raise _param_error(
-                f"{said}: the microscope does not tell the value now, so the step can't be checked ({limit.source})"
+                f"{said}: the microscope reports no value now, so the step can't be checked ({limit.source})"
             )
         change = abs(value - known.value)
         if limit.step is not None and change > limit.step * (1 + _REACH):

@@ -20,7 +20,7 @@ _SOON_S = 1.0
 
 
 class TipDuty(Enum):
-    """The duty of the scheduler towards a tip that its holder left in danger."""
+    """The duty of the scheduler towards a tip that its holder left in danger. Its values stand in saved states."""
 
     NONE = "nothing"
     OWED = "it is to be retracted"
@@ -32,11 +32,11 @@ class TipEvent(Enum):
     """An event that changes the duty."""
 
     ENDANGERED = "its holder lost control and left it in danger"
-    SEEN_TO = "somebody sees to it, or it is out of danger"
+    SEEN_TO = "a person or a solver attends to it, or it is out of danger"
     SENT = "the microscope is asked to retract it"
     NOT_YET = "the microscope could not be asked, was not free, or did not answer"
     RETRACTED = "the microscope has retracted it"
-    RETRACTED_LATE = "it has, when nobody waited for the answer any more"
+    RETRACTED_LATE = "the microscope has retracted it after the deadline"
     IMPOSSIBLE = "the microscope has no such action"
     FAILED = "the microscope refuses, or was waited for in vain"
     DUE = "it is time to try again"
@@ -356,7 +356,7 @@ class Watchdog:
             return dog, f"the microscope is never free to {action}"
         is_refused = dog.refused_at == microscope.states_seen
         if not is_refused and dog._waits_for_stop(microscope):
-            return replace(dog, unstoppable=True), "the microscope was told to stop, and does not"
+            return replace(dog, unstoppable=True), "the microscope does not stop, although a stop was sent"
         why = "the microscope is never free for that" if is_refused else "its translator is not there"
         told = None if dog.retries else f"the tip was left in danger and can't be retracted: {why}"
         return dog._retract_later(now_s), told
