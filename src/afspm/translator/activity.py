@@ -91,6 +91,7 @@ class Activity(ABC):
         Raises:
             Refused: ACTION_ERROR: the program did not start it, and reported no error.
         """
+        # without a pause: each look takes as long as the program's answer
         until_s = self._clock.monotonic_s() + self.settles_s
         while self._clock.monotonic_s() < until_s:
             if is_seen():

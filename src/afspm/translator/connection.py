@@ -10,7 +10,7 @@ from afspm.basics.errors import AfspmError, ConfigError
 from afspm.translator.driver_base import LOST, ControllerLost, DriverBase
 from afspm.translator.emulated_controller import EmulatedController
 
-RETRY_S = 1.0
+RETRY_S = 1.0  # real; decision 0016
 _STARTUP_S = 2.0
 """Real time in which a controller that starts together with its translator (an emulated one) may be missing: until then
 connecting is retried every `_STARTUP_RETRY_S`, and nothing is logged."""

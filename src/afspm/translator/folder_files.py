@@ -38,6 +38,7 @@ class FolderFiles(ResultFiles):
         Args:
             taken: "frame" of a scan, "position" of a spectrum.
         """
+        # only files newer than those of now can be its result
         self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
 
     def end(self, now_ns: int) -> None:

@@ -221,7 +221,7 @@ def _live_lines_s(microscope: DriverBase) -> float | None:
 
 
 class LiveLines:
-    """The lines of the running scan that were not published yet. Times are of the experiment.
+    """Reads the new lines of the running scan. Times are of the experiment.
 
     Args:
         microscope: its `live_lines_s` decides how often its lines are read.

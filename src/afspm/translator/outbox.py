@@ -57,6 +57,7 @@ class Outbox:
         Returns:
             the packets of the last results, which an earlier process has published or was going to.
         """
+        # at the first start of the experiment, all results listed are older
         if "known" not in self._kept:
             self._kept["known"] = list(self._microscope.results())
             self._kept["sent"] = []

@@ -56,7 +56,7 @@ class SafeExit:
 
     def end(self) -> None:
         """End on the scheduler's request; the scheduler has made the tip safe."""
-        with contextlib.suppress(*LOST):
+        with contextlib.suppress(*LOST):  # the process ends in any case
             self._stop_measuring()
             self._temporary.end()
 
@@ -69,6 +69,7 @@ class SafeExit:
         self._connection.guarded(self._stop_measuring)
         if self._connection.stands:
             self._connection.guarded(self._temporary.end)
+        # the feedback is not switched on instead: where the tip would land by then is not known (decision 0007)
         until_s = self._clock.monotonic_s() + _TIP_S
         is_told = False
         while is_told or self.is_owed():

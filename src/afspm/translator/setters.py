@@ -39,6 +39,7 @@ def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | No
     values: dict[str, Value] = {}
     for name, given in asked.items():
         spec = driver.table.find(name)
+        # first without bounds: a value out of bounds that is in force already is no change
         anything = replace(spec, range=_UNBOUNDED, choices=())
         value = (
             anything.parse(given.value or "", given.unit) if isinstance(given, Parameter) else anything.checked(given)

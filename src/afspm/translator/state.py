@@ -36,6 +36,7 @@ class FeedbackWatch:
     def saw(self, on: bool | None) -> bool:
         """Store the observed feedback. Return True if a request has just switched it off."""
         kept = self._kept
+        # off without a request in between: switched off at the panel, where a person takes care of it (decision 0007)
         switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
         kept["feedback_off"] = on is False and (switched_off or self.is_off)
         kept["feedback_was_on"], kept["may_have_switched"] = on, False
@@ -79,6 +80,7 @@ class TranslatorState:
 
     def stamp(self, count: int = 1) -> list[int]:
         """Return `count` strictly increasing times for packets, ns."""
+        # a clock that was set back must not give a time twice: subscribers would drop the packet as a duplicate
         first = max(self._clock.now_ns(), int(self.kept.get("last_ns", 0)) + 1)
         self.kept["last_ns"] = first + count - 1
         return list(range(first, first + count))

@@ -46,6 +46,7 @@ class TemporarySettings:
         except Exception:  # raised again: `apply` has restored the former values
             self._forget()
             raise
+        # counted again: setting the values has taken time
         self._kept[_KEY]["until_s"] = self._driver.clock.now_s() + for_s
 
     @property

@@ -132,7 +132,7 @@ class Trace:
         self._command = request
 
     def file(self, path: Path) -> None:
-        """Record a file of the controller, if it exists and is new."""
+        """Record a file of the controller, if it exists and is new or changed."""
         state = (path, path.stat().st_mtime_ns) if self.is_kept and path.is_file() else None
         if state is not None and state not in self._files:
             self._files.add(state)
@@ -158,7 +158,7 @@ class Trace:
     def _write(self, facts: Plain) -> None:
         if self._file is not None:
             self._file.write(json.dumps(facts, ensure_ascii=False) + "\n")
-            self._file.flush()
+            self._file.flush()  # a killed process leaves all its exchanges
             self._lines += 1
 
 

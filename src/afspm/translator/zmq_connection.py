@@ -41,7 +41,7 @@ class ZmqConnection:
         self._address, self._timeout_s, self._monotonic_s, self._hints = address, timeout_s, monotonic_s, hints
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket: zmq.Socket[bytes] = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.LINGER, 0)  # closing must not wait for a controller that reads no more
         # a request must not wait for an absent peer, and be executed when it is not expected any more
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
         self._socket.setsockopt(zmq.RECONNECT_IVL, _NEVER)

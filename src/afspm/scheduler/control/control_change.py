@@ -132,6 +132,7 @@ def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
         return []
     flight = draft.forwarder.flight
     feedback = None if flight is None else feedback_of(flight.request)
+    # a request in flight can't be called back: it may still switch the feedback off
     if feedback is not None and feedback.on is False:
         draft.microscope = draft.microscope.feedback_may_be_off()
     in_flight = None

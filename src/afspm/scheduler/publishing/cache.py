@@ -67,7 +67,7 @@ class PacketCache:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Size of all packets, in bytes."""
         return self._bytes
 
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:

@@ -169,7 +169,7 @@ class EventLog:
         return replace(self, starts=tuple(starts)).add(now_s, *lost)
 
     def take(self, problems: ProblemNames, now_ns: int) -> tuple[EventLog, JournalEntries]:
-        """Return an empty log, and the entries in words, oldest first, for the caller to publish."""
+        """Return the log without its entries, and the entries in words, oldest first, to be published."""
         entries = [one if isinstance(one, JournalEntry) else one.entry(problems) for one in self.gathered]
         if self.left_out:
             entries.append(JournalEntry(now_ns, REQUEST, SCHEDULER, f"{self.left_out} more requests are left out"))

@@ -73,6 +73,7 @@ def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> 
     """Answer over the client's newest connection; without a request id only over the connection of the request."""
     write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns)
     connection = draft.peers.sessions.connection_of(job.client)
+    # without an id a restarted client would take it for the answer to its own request
     if connection is not None and (job.request.id or connection == job.connection):
         draft.effects.append(Reply(connection, job.client, response, job.request.kind))
 

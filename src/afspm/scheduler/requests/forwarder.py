@@ -247,6 +247,7 @@ class Forwarder:
         return min(times, default=None)
 
     def _patience_ends_s(self, job: ForwardedRequest) -> float:
+        # not at once: the next request would only wait in the translator's queue, where it can't be called back
         assert job.sent_s is not None
         return job.sent_s + self.timeout_s + self.patience_s
 

@@ -114,6 +114,7 @@ def _owns_its_name(draft: StateDraft, event: RequestIn) -> bool:
     if event.user is not None and event.user != component_of(name):
         answers.refuse_peer(draft, event, f"the key is that of {event.user}, not of {name}")
         return False
+    # a component of another run at the same address must not act here
     if run and run_of(name, request_id) not in ("", run):
         answers.refuse_peer(draft, event, _ANOTHER_RUN, OTHER_RUN_RESPONSE)
         return False
@@ -310,6 +311,8 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
     if not request.id:
         return
+    # known after a restart: before an action that was done already the microscope must not be moved, and a repeated use
+    # must not count twice
     is_kept = request.kind == _ACTION and draft.frame.is_moving
     if is_kept or (job.command and draft.limits.counts(job.outgoing)):
         draft.idempotency = draft.idempotency.sent(name, request)
@@ -348,6 +351,7 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
 
 
 def _refusal_for_tip(draft: StateDraft) -> str | None:
+    # a component that does not know of the danger must not move, pulse or scan with such a tip (decision 0001)
     dog, sees_to_tip = draft.watchdog, draft.control.sees_to_tip
     if dog.tip.may_come and draft.forwarder.up:
         return "a retract of before the scheduler's restart may still be carried out, until the translator answers"
@@ -476,6 +480,7 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
         response = answers.with_id(response, job.request)
         if response.ok and (job.command or job.request.kind == _PARAM):
             response = _apply_success(draft, job, response)
+    # it may have been carried out: its values are read before the next request that depends on them
     if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
         draft.limits = draft.limits.unknown(job.outgoing)
     if not job.client:

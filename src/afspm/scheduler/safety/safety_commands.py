@@ -13,6 +13,7 @@ _ID = "scheduler/does-it-retract"
 def begin(draft: StateDraft) -> None:
     """Ask a new translator whether it can retract the tip."""
     action = draft.watchdog.question
+    # any answer also shows that a retract sent before a restart is done or lost (decision 0088)
     request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s)
     draft.watchdog = draft.watchdog.translator_is_there(draft.now_s)
