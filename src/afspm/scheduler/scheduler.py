@@ -47,8 +47,7 @@ class Coordinates:
 class Scheduler:
     """Lets one component at a time command the microscope, and republishes all packets.
 
-    After a kill and a restart it continues: mode, holder, problems and all packets are on disk before they are
-        published.
+    It continues after a kill and a restart. Mode, holder, problems and packets are on disk before they are published.
 
     Args:
         control: the section [control] of the experiment file: `ControlSettings` as plain data.

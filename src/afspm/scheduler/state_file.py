@@ -28,9 +28,8 @@ class StateFile:
     def load(self) -> SavedState | None:
         """Return the state saved last; None if none was.
 
-        If it is damaged, as a power cut may leave it, the generation before is used: its mode and its problems, but no
-            holder.
-        The holder may have changed since, and requests control again.
+        If a power cut has damaged it, the generation before is used, with its mode and problems, but without a holder:
+        the holder may have changed since, and requests control again.
 
         Raises:
             FileError: neither can be read. Starting without a flagged problem could cost a tip.

@@ -122,7 +122,6 @@ class Activity(ABC):
         self._results.forget()
 
     def forget(self) -> None:
-        """Expect no result."""
         self._results.forget()
 
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
@@ -154,7 +153,6 @@ class Activity(ABC):
         return None
 
     def watch(self, call: LongCall) -> None:
-        """Watch a call instead of the one before."""
         self.close()
         self.call = call
 

@@ -237,8 +237,7 @@ class DriverBase(ABC):
     def patience_s(self, of_s: float) -> float:
         """Return how long to wait, in experiment seconds, for a step that takes the controller `of_s` at most.
 
-        It is longer where the controller's program needs a large part of it (an emulated controller at sixty times the
-        speed).
+        It is at least `program_s` of real time: a fast clock leaves the program of an emulated controller little of it.
         """
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 

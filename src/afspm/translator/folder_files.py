@@ -42,7 +42,6 @@ class FolderFiles(ResultFiles):
         self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
 
     def end(self, now_ns: int) -> None:
-        """Record the end of the measurement."""
         if self._kept["running"] is not None:
             self._ends({"end_ns": now_ns})
 
@@ -71,7 +70,6 @@ class FolderFiles(ResultFiles):
     # --- to be overridden for a controller with other files ---
 
     def result_name(self, path: Path) -> str:
-        """Return the name of the result in a file."""
         return str(path)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:

@@ -184,7 +184,7 @@ class ParameterSpec:
         return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
     def range_text(self) -> str:
-        """The range for a person, and where it was set."""
+        """Return the range for a person, and where it was set."""
         text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
         return f"{text} (set in {self.where})" if self.where else text
 

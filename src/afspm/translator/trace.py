@@ -225,7 +225,6 @@ class TracedAnswer:
         self.content = bytearray()
 
     def add(self, part: bytes) -> None:
-        """Add a part of the answer."""
         if self.is_kept:
             self.content += part
 

@@ -100,7 +100,6 @@ class HandSettings:
         return replace(self, parameters={**self.parameters, parameter.name: value})
 
     def published(self, feedback: Feedback, *, is_manual: bool) -> HandSettings:
-        """Store the feedback in force."""
         return replace(self, now=feedback, before=self.before if is_manual and self.before else feedback)
 
     def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:

@@ -77,8 +77,7 @@ KeptAnswer = tuple[RequestIn, ControlResponse, str, ResponseDetail]
 class ExperimentEnd:
     """The end of the experiment, which waits until the tip is out of danger.
 
-    Answers that report the end are kept back until then: on such an answer components leave, and the supervisor with
-        them.
+    Answers that report the end are kept back until then: such an answer makes components leave, and the supervisor too.
     The scheduler itself stays for a grace period.
 
     Attributes:
@@ -101,7 +100,6 @@ class ExperimentEnd:
         return None if self.by_s is None else replace(self, kept=(*self.kept, answer))
 
     def is_due(self, now_s: float, *, owes_retract: bool) -> bool:
-        """Return whether the experiment can end now."""
         return self.by_s is not None and not (owes_retract and now_s < self.by_s)
 
     def ended(self, now_s: float) -> ExperimentEnd:

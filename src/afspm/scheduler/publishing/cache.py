@@ -57,7 +57,6 @@ class PacketCache:
 
     @property
     def last_ns(self) -> int:
-        """The time of the newest packet."""
         return self._last_ns
 
     @property
@@ -113,9 +112,8 @@ class PacketCache:
     def remember(self, recent: Iterable[tuple[int, int]]) -> None:
         """Store the times of packets that were published before a restart.
 
-        A packet that comes again, because it was not in the log yet, keeps its first time: by this time subscribers
-            recognise
-        a duplicate.
+        A packet that comes again, because it was not in the log yet, keeps its first time. Subscribers recognise a
+        duplicate by this time.
         """
         self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 

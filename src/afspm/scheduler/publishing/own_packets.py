@@ -27,7 +27,6 @@ def publish_control(draft: StateDraft) -> None:
 
 
 def publish_entries(draft: StateDraft) -> None:
-    """Publish the entries gathered since the last time."""
     draft.event_log, entries = draft.event_log.take(draft.env.settings.rules.problems, draft.now_ns)
     if entries.entries:
         publish(draft, JOURNAL.name, draft.env.codec.encode(entries))

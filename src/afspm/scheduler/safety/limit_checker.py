@@ -111,9 +111,8 @@ class LimitChecker:
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
         """Return the parameters to read before a request is checked.
 
-        The value set or published last is not enough: a request of unknown outcome or a person at the panel may have
-            changed
-        it, and an old packet may arrive after the answer to a newer request.
+        The value set or published last is not enough. A request of unknown outcome or a person at the panel may have
+        changed it, and an old packet may arrive after the answer to a newer request.
 
         Args:
             is_mapped: a mapped place is sent as a whole, even if the client set only a part of it.
