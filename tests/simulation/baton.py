@@ -1,4 +1,4 @@
-"""Blocking code in simulated time: each runs in a thread of its own, and only the thread with the baton runs.
+"""Blocking code in simulated time: each has a thread, and only the thread with the baton runs.
 
 The simulation gives the baton to a thread and waits until the thread returns it, by waiting for an event or by ending.
 So the timeline alone determines the order of events, and blocking code replays as exactly as any other.

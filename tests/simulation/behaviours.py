@@ -327,7 +327,7 @@ class Person(Operator):
 
 
 class Dawn(Person):
-    """The person who comes in the morning, attends to the tip, and then lets components go on or ends the experiment.
+    """The person who comes in the morning, attends to the tip, and then may end the experiment.
 
     Attributes:
         ends: whether to end the experiment.

@@ -1,4 +1,4 @@
-"""A translator and its microscope as a simulated process, ours or of version 1, that may be slow, hang and die."""
+"""A translator and its microscope as a simulated process that may be slow, hang and die."""
 
 from __future__ import annotations
 

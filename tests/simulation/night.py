@@ -36,7 +36,7 @@ _ENDED_S = 60.0
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault: its kind, the process, its time (as a part of the time before the calm), and its duration (real)."""
+    """A fault: kind, process, time (as a part of the time before the calm) and duration (real)."""
 
     what: str
     whom: str

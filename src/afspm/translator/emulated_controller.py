@@ -1,4 +1,4 @@
-"""The emulated controller of a run: its process writes its address to a file under a lock that ends with the process.
+"""The emulated controller of a run, whose process writes its address to a file that it keeps locked.
 
 The file lies in the folder of the run's state. While the lock is held, the process that wrote the address is alive and
 listens there, so no other process can. So a translator that reads the address connects to the emulator of its own run,

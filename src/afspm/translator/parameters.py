@@ -104,7 +104,7 @@ class ParameterSpec:
             raise refuse_value(self.name, str(error)) from error
 
     def checked(self, value: Value) -> Value:
-        """Return a value, in SI, if it is of the right type and within the range; a whole number becomes an int.
+        """Return a value in SI, checked for type and range; a whole number becomes an int.
 
         Raises:
             Refused: PARAM_ERROR.
@@ -163,7 +163,7 @@ class ParameterSpec:
         return number
 
     def for_peer(self, value: Value, unit: str | None = None) -> tuple[str, str]:
-        """Return a value in SI as (text, unit) for a peer, in the peer's unit or the unit of the wire."""
+        """Return a value in SI as (text, unit), in the peer's unit or the wire's."""
         if isinstance(value, bool):
             return ("true" if value else "false"), ""
         if isinstance(value, str):

@@ -147,7 +147,7 @@ def feedback(values: Mapping[str, Value]) -> Feedback:
 
 
 def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
-    """Check a frame as a whole: it is not empty, has not too many pixels, and lies within reach of the probe.
+    """Check a frame as a whole: its size, its number of pixels, and the reach of the probe.
 
     Raises:
         Refused: PARAM_ERROR.

@@ -1,4 +1,4 @@
-"""The trace of a controller: all exchanges with it, and the files that it writes, in one file of JSON lines.
+"""The trace of a controller: its exchanges and the files that it writes, as JSON lines.
 
 One process talks to one controller, so there is one trace in a process. `begin` opens it, and each vendor's connection
 adds an exchange as one line. Without `begin` nothing is recorded. A connection leaves out its own secrets. Text is

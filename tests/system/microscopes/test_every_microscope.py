@@ -67,7 +67,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Kept:
 
 
 def apart_m(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """Return the rms of the difference without its plane: z has no zero, and the tilt of the sample is arbitrary."""
+    """Return the rms of the difference without its plane: zero and tilt of z are arbitrary."""
     rows, columns = np.indices(a.shape).reshape(2, -1)
     plane = np.stack([rows, columns, np.ones(a.size)], axis=1)
     difference = (a - b).ravel()

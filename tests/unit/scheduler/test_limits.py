@@ -447,7 +447,7 @@ def test_value_stays_known_after_a_malformed_request() -> None:
 
 
 def test_a_rate_is_not_measured_from_when_the_value_was_read() -> None:
-    """A controller rounds the values it was set to; and a change at the panel is part of the total change."""
+    """A controller rounds its values, and a change at the panel is part of the total change."""
     g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
     get = Request(int(ControlRequest.PARAM), Parameter(BIAS))
     g.carried_out(set_("1", "V"), 0)

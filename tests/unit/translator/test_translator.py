@@ -884,7 +884,7 @@ POINTS_TO_DIE_AT = 4
 def test_finished_scan_is_complete_and_once_wherever_the_translator_is_killed(
     bench: Any, scan: Any, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
-    """The kill comes after each write to the disk and before each packet, from the end of a scan to its publication."""
+    """The kill comes after each write to the disk and before each packet of the scan."""
     cycle, published = Cycle(ScopeState.SCANNING, lambda result: True), dict[int, str]()
     reached = itertools.count()
 

@@ -39,7 +39,7 @@ _FEEDBACK_WORDS = {"on": "feedback", "proportional_gain": "P gain", "integral_ga
 
 
 def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_logged: str | None) -> bool:
-    """Return whether a change is routine: a holder gives control back, or the last holder in the log takes it again."""
+    """Return whether a change is routine: a release of control, or its return to the holder logged last."""
     if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
         return False
     return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_logged

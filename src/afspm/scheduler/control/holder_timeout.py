@@ -1,4 +1,4 @@
-"""When the holder loses control: its lease runs out while it is idle, or its grace period while it is disconnected."""
+"""When the holder loses control: after its lease if it is idle, after its grace period if disconnected."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ def tells(envelope: str, message: str) -> bool:
 
 
 def size_text(size_m: float) -> str:
-    """Return a length in nm, rounded, as a decimal number; below 1 nm with its digits, which would round to 0.0 or 1.0.
+    """Return a length in nm as a decimal number: rounded, but with its digits below 1 nm.
 
     >>> size_text(2e-6), size_text(2.5e-10)
     ('2000.0', '0.25')

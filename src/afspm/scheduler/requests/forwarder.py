@@ -1,4 +1,4 @@
-"""The line to the translator: one request in flight, the others wait, each has a deadline, and every one is answered.
+"""The line to the translator: one request is in flight, the others wait, and each has a deadline.
 
 A translator serves one request after the other and is silent meanwhile. So one is in flight. The others wait here,
 where they can still be removed; a request that has waited too long is answered unsent. The line keeps the order and

@@ -1,4 +1,4 @@
-"""The request whose turn it is, while values are read or the tip moves for it; requests of an unclear sender."""
+"""The request whose turn it is, during its reads and moves; and requests of an unclear sender."""
 
 from __future__ import annotations
 

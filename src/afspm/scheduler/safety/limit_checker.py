@@ -100,7 +100,7 @@ class LimitChecker:
         return None
 
     def check_place(self, request: Request) -> Response | None:
-        """Return the refusal of an action at the current place of the scan or probe: a person may have moved it."""
+        """Return the refusal of an action at its present place, which a person may have changed."""
         try:
             self._check_place(str(request.subject))
         except _Breach as breach:

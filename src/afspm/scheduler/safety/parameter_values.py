@@ -15,7 +15,7 @@ from afspm.scheduler.safety.limits import Limit
 
 
 class ParameterValue(NamedTuple):
-    """A value to set: a number in SI, or in the unit of its limit; None: a text or a switch."""
+    """A number to set, in SI or in the unit of its limit; None: a text or a switch."""
 
     name: str
     number: float | None
@@ -61,7 +61,7 @@ def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
 
 
 def number_of(parameter: Parameter) -> float | None:
-    """Return the value of a single parameter in SI; None if it is not a finite number of the right dimension."""
+    """Return the value of a parameter in SI; None if it is no finite number or of another dimension."""
     try:
         return _number(parameter, parameter.value or "", None)
     except ParameterValueError:
