@@ -33,12 +33,12 @@ class MappedRequest:
     Attributes:
         request: is sent in place of the original, with the same id.
         names: the parameters that the client sets; the others change by the mapping alone.
-        said: the place in both coordinates, for the reason of a refusal.
+        places_text: the place in both coordinates, for the reason of a refusal.
     """
 
     request: Request
     names: Collection[str]
-    said: str
+    places_text: str
 
 
 # --- outputs of a frame's step, beside inputs that are passed on ------------------------------------------------------

@@ -20,6 +20,7 @@ class WireCodec:
         return wire.encode(thing)[1]
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
+        # a malformed payload is published all the same: only decisions ignore it
         try:
             return wire.decode(message, payload)
         except AfspmError:

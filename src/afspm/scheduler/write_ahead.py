@@ -93,6 +93,7 @@ class WriteAhead:
         if missed_ns is None:
             return []
         new = {entry.packet.time_ns for entry in entries}
+        # the cache bounds how much a hanging disk may hold back
         since = [entry for entry in self._cached() if (entry.packet.time_ns or 0) >= missed_ns]
         return [entry for entry in since if entry.packet.time_ns not in new]
 

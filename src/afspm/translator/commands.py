@@ -132,6 +132,7 @@ class Commands:
 
     def _find_action(self, name: str) -> Action:
         if name not in self.actions:
+            # the name comes from a peer, and may be of any length
             near = difflib.get_close_matches(name[:100], self.actions, n=1)
             hint = f", perhaps {near[0]!r}" if near else ""
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"this microscope has no action {name[:100]!r}{hint}")

@@ -249,6 +249,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
             Refused: PARAM_NOT_SUPPORTED, with the nearest name.
         """
         if name not in self._rows:
+            # the name comes from a peer, and may be of any length
             near = difflib.get_close_matches(name[:100], self._rows, n=1)
             hint = f", perhaps {near[0]!r}" if near else ""
             reason = f"this microscope has no parameter {name[:100]!r}{hint}"

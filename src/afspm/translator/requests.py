@@ -80,6 +80,7 @@ class RequestHandler:
             self._commander = arrived.connection if epoch is not None else before
             return False
         last, self._last_refusal = self._last_refusal, why
+        # a peer that is not obeyed may repeat its request for hours: its refusal is logged once
         level = logging.DEBUG if last == why else logging.WARNING
         self._reply(Response(ControlResponse.FAILURE, reason=why, id=wire.id_of(arrived.frames)), level)
         return True

@@ -168,6 +168,7 @@ def lines_missing(content: Iterable[Scan | Spectrum]) -> int:
 
 def modified_ns(path: Path) -> int:
     """Return the time of the last write of a file; 0: the file does not exist."""
+    # the controller may delete or rename a file at any time
     try:
         return path.stat().st_mtime_ns
     except OSError:

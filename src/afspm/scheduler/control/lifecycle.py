@@ -17,6 +17,7 @@ end itself. Counted again from each report of a component that still runs."""
 LONGEST_GRACE_S = 20.0
 """How long (real) the scheduler stays at most: a supervisor takes this time at the end to find a silent component, kill
 it and restart it."""
+# bounded, since requests come from peers
 _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")
 

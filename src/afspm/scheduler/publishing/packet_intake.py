@@ -24,6 +24,7 @@ from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.state import StateDraft
 from afspm.wire.messages import CONTROL_STATE
 
+# bounded, since the texts contain names that come from a peer
 _MOST_LOGGED = 1000
 _STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 

@@ -382,7 +382,7 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
     else:
         refusal = check(job.client, mapped.request, now_ns, mapped.names, is_repeated=job.is_repeated)
         if refusal is not None:
-            refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.said}")
+            refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.places_text}")
     if refusal is not None:
         _refuse(draft, job, refusal)
     return refusal is None

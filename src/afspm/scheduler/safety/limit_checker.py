@@ -188,31 +188,31 @@ class LimitChecker:
         self,
         request: Request,
         now_ns: int,
-        told: Parameter | None = None,
+        answered: Parameter | None = None,
         used: Collection[str] | None = None,
         who: str = "",
     ) -> LimitChecker:
         """Store the values set or read by a successful request.
 
         Args:
-            told: the parameter in the translator's answer.
+            answered: the parameter in the translator's answer.
         """
         if is_get(request):
-            if told is None or not _has_value_of(told, request.subject):
+            if answered is None or not _has_value_of(answered, request.subject):
                 return self.forget(request.subject.name)
-            return self.in_force(told, now_ns, was_read=True)
+            return self.in_force(answered, now_ns, was_read=True)
         usage = self.state.usage
         for name in self._counted_uses(request, used):
             usage = usage.use_done(name, LastUse(now_ns, who, request.id))
         checker = self._with_usage(usage)
         for subject in self._set_by(request):
             # the value in the microscope's answer, rather than the one that was sent
-            said = (
-                told
-                if isinstance(subject, Parameter) and told is not None and _has_value_of(told, subject)
+            in_force = (
+                answered
+                if isinstance(subject, Parameter) and answered is not None and _has_value_of(answered, subject)
                 else subject
             )
-            checker = checker.in_force(said, now_ns)
+            checker = checker.in_force(in_force, now_ns)
         return checker
 
     def published(self, subject: object, now_ns: int) -> LimitChecker:

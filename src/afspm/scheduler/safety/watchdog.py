@@ -128,7 +128,7 @@ class Watchdog:
         refused_at: number of states seen at the last answer NOT_FREE.
         told_to_stop: a stop was sent for the running measurement.
         unstoppable: the running measurement did not stop.
-        due_s: when, real, `look_again` is to be called.
+        due_s: when `look_again` is due, real.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
@@ -219,6 +219,7 @@ class Watchdog:
 
         The answer may arrive before or after the state that the action leads to.
         """
+        # otherwise a state has overtaken this answer, and shows what is running
         is_new = states_seen == microscope.states_seen
         return replace(self, starting=STARTS.get(action, self.starting)) if is_new else self
 
