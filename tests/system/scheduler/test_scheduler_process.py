@@ -70,7 +70,7 @@ def test_reconnecting_component_gets_the_run_once_its_old_connection_closes(rig:
         assert asking.result().clock == rig.clock
 
 
-def test_a_packet_passes_as_it_is_under_its_envelope_with_times_that_increase(rig: Any) -> None:
+def test_packet_passes_unchanged_under_its_envelope_with_increasing_times(rig: Any) -> None:
     rig.start()
     component = rig.component("Component")
     small, large = scan(1), scan(2, 512)

@@ -190,7 +190,7 @@ def test_problems_may_be_flagged_and_cleared_in_manual() -> None:
     assert set(control.problems) == {FEEDBACK}
 
 
-def test_a_mode_that_is_none_is_refused() -> None:
+def test_unknown_mode_is_refused() -> None:
     control, row = after(mode(0))
     assert (control.mode, row.response) == (ControlMode.AUTOMATED, ControlResponse.WRONG_CONTROL_MODE)
 

@@ -62,7 +62,7 @@ def test_lines_of_a_running_scan_are_published_and_not_cached() -> None:
     assert [source_ns for source_ns, _ in cache.recent()] == [NOW]  # what is to keep its time after a kill is known
 
 
-def test_the_default_envelopes_are_those_of_the_wire_format() -> None:
+def test_default_envelopes_follow_the_wire_format() -> None:
     assert default_envelope(scan(2e-6, "Height Retrace")) == "Scan2d_2000.0_Height Retrace"
     assert default_envelope(scan(2e-6, "a_b_c")) == "Scan2d_2000.0_a_b_c"
     assert default_envelope(PacketHeader("Spec1d", kind="IV")) == "Spec1d_IV"
@@ -188,7 +188,7 @@ def test_packet_larger_than_the_cache_is_published_and_not_kept() -> None:
     assert len(cache) == 0
 
 
-def test_a_restart_brings_everything_back_and_goes_on_after_it() -> None:
+def test_restart_restores_the_cache_and_continues_after_it() -> None:
     cache = PacketCache()
     for n in range(1, 5):
         put(cache, scan(), n * NS)

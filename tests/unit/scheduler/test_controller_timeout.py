@@ -36,7 +36,7 @@ def problems(lab: Lab) -> dict[int, str]:
     return dict(lab.core.control.problems)
 
 
-def test_a_microscope_that_is_soon_found_again_costs_nothing(lab: Lab) -> None:
+def test_microscope_lost_for_a_moment_costs_nothing(lab: Lab) -> None:
     lose(lab, PATIENCE_S - 0.1)
     lab.scope_is(ScopeState.SCANNING)
     lab.later(100.0)
@@ -74,7 +74,7 @@ def test_the_flag_comes_again_as_long_as_the_microscope_is_lost(lab: Lab) -> Non
     assert problems(lab) == {LOST: "translator"}
 
 
-def test_a_restarted_scheduler_knows_whose_flag_it_is(lab: Lab) -> None:
+def test_restarted_scheduler_knows_the_author_of_a_flag(lab: Lab) -> None:
     lose(lab, 10.0)
     again = Lab(state=lab.core.snapshot())
     again.translator()

@@ -36,7 +36,7 @@ def test_a_port_of_this_computer_is_free_before_the_experiment_runs() -> None:
         (Handshake.SILENT, "key-mismatch"),
     ],
 )
-def test_a_key_that_is_not_known_differs_from_one_that_does_not_fit(handshake: Handshake, code: str) -> None:
+def test_unknown_key_differs_from_a_wrong_key(handshake: Handshake, code: str) -> None:
     assert diagnosis.of_handshake(ADDRESS, handshake, "supervisor", "scheduler").code == code
 
 

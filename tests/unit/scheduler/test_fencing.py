@@ -17,7 +17,7 @@ def gone() -> bool:
     return False
 
 
-def test_an_epoch_comes_back_from_its_frame_and_nothing_else_is_one() -> None:
+def test_epoch_is_decoded_from_its_frame_and_from_nothing_else() -> None:
     for epoch in (Epoch(OURS, 17), Epoch(OURS, 17, simulated=True)):
         assert Epoch.decode(epoch.encode()) == epoch
     for frame in (b"", b"17", b"run:", b"run:x", b":17:0", b"run:17:2", b"\xff" * 1000):
@@ -39,7 +39,7 @@ def test_restarted_scheduler_is_obeyed_and_its_former_process_is_not() -> None:
 
 
 @pytest.mark.parametrize("second", [Epoch(THEIRS, 1), None])
-def test_without_a_run_the_first_is_obeyed_while_it_is_connected(second: Epoch | None) -> None:
+def test_without_a_run_the_first_scheduler_is_obeyed_while_connected(second: Epoch | None) -> None:
     allegiance = SchedulerFence("", simulated=False)
     assert allegiance.refusal(Epoch(OURS, 1), "", there) == ""
     assert allegiance.refusal(second, "", there) != ""

@@ -54,7 +54,7 @@ def test_without_a_translator_every_request_is_answered_at_once() -> None:
     assert refused.response.detail is ResponseDetail.NOT_SENT
 
 
-def test_loss_tells_unknown_outcomes_from_unsent_requests() -> None:
+def test_loss_separates_unknown_outcomes_from_unsent_requests() -> None:
     forwarder = up()
     forwarder.ask(job("a"), 0.0)
     forwarder.ask(job("b"), 0.0)

@@ -360,7 +360,7 @@ def test_steps_rates_and_places_are_known_after_a_restart() -> None:
     assert again.state == g.state
 
 
-def test_a_setpoint_that_is_the_limit_is_not_above_it() -> None:
+def test_setpoint_at_the_limit_is_not_above_it() -> None:
     """The message has 32 bits, in which 0.1 is a little more."""
     limits = guard(zctrl_setpoint=Limit(0.0, 0.1))
     for setpoint, fits in ((0.1, True), (0.100001, False)):

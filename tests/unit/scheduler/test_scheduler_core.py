@@ -177,7 +177,7 @@ def test_silent_connection_does_not_keep_control(lab: Lab) -> None:
     assert lab.holder is None
 
 
-def test_a_holder_that_will_not_come_back_is_given_up_at_once(lab: Lab) -> None:
+def test_holder_given_up_by_its_supervisor_loses_control_at_once(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.give_up("other")
     assert lab.holder == "experiment"
@@ -381,7 +381,7 @@ def test_failing_mapping_is_logged_once_and_costs_only_its_own_packets() -> None
     assert len(effects) == 1
 
 
-def test_a_control_state_of_the_translator_s_is_dropped(lab: Lab) -> None:
+def test_control_state_of_a_translator_is_dropped(lab: Lab) -> None:
     assert published(lab.publish("ControlState", ControlState(ControlMode.AUTOMATED, "mallory"))) == []
 
 

@@ -123,7 +123,7 @@ def retracted() -> Dog:
     return dog
 
 
-def test_a_tip_that_is_away_is_in_no_danger_until_it_may_be_back() -> None:
+def test_withdrawn_tip_is_in_no_danger_until_it_may_be_back() -> None:
     dog = retracted()
     dog.started("start-scan", dog.states_seen)
     assert dog.danger is None

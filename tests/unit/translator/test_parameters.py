@@ -57,7 +57,7 @@ def _parsed(spec: ParameterSpec, text: str, unit: str | None) -> tuple[Value | N
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
-def test_numbers_that_are_none_are_refused(value: float) -> None:
+def test_malformed_numbers_are_refused(value: float) -> None:
     for name in ("scan-size-x", "scan-angle", "scan-resolution-x"):
         with pytest.raises(Refused):
             TABLE[name].checked(value)
@@ -110,7 +110,7 @@ def test_setpoint_of_a_current_is_in_si_for_any_unit_of_the_controller() -> None
     assert row.to_vendor(5e-10) == pytest.approx(0.5)
 
 
-def test_the_simulators_faults_are_those_that_can_be_demanded() -> None:
+def test_faults_of_the_simulator_equal_the_ones_that_can_be_demanded() -> None:
     assert Simulator(fault_action=True).table["x-fault-kind"].choices == tuple(FAULT_KINDS)
 
 

@@ -580,7 +580,7 @@ def test_controller_with_impossible_values_is_lost_until_they_are_valid(bench: A
     assert bench.ask(ACTION, names.START_SCAN).code == OK
 
 
-def test_a_controller_found_confused_by_a_request_does_nothing_of_it(bench: Any) -> None:
+def test_request_to_a_controller_with_impossible_values_is_not_executed(bench: Any) -> None:
     bench.microscope.confused = ValueError("0x1f")
     response = bench.ask(ACTION, names.START_SCAN)
     assert (response.code, bench.microscope.done) == (ControlResponse.NO_RESPONSE, [])
