@@ -20,7 +20,7 @@ from afspm.basics import entry_points
 from afspm.model import ControlRequest, Parameter, Region, Request, ScanParameters, ScopeState, names
 from afspm.storage.memory import Memory
 from afspm.translator.tcp import Receiver
-from afspm.translator.translator import Translator
+from afspm.translator.translator import Translator, TranslatorRun
 from afspm.translator.zmq_connection import ZmqConnection
 from afspm.transport.port import RequestReceived, Served
 from benchmarks.effort import effort
@@ -98,7 +98,7 @@ def translator(vendor: str, processes: Roles, folder: Path, port: Answers) -> Tr
     address = processes.start("emulator", vendor=vendor, folder=str(folder / "files"))
     microscope = entry_points.load(entry_points.DRIVERS, VENDORS[vendor])
     memory = Memory(folder / "state.json", synced=False)
-    made = Translator(microscope(address=address), port, memory, folder, logging.getLogger("benchmark"))
+    made = Translator(microscope(address=address), port, memory, TranslatorRun(folder), logging.getLogger("benchmark"))
     made.look()
     return made
 

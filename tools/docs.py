@@ -101,7 +101,7 @@ def _tried(reports: list[InstrumentReport], operation: str) -> str:
 def _done(do: arbitration.ControlChange) -> str:
     return {
         arbitration.ControlChange.GRANT: "it is in control",
-        arbitration.ControlChange.TAKE: "nobody is in control",
+        arbitration.ControlChange.TAKE: "no component is in control",
         arbitration.ControlChange.FLAG: "the problem is flagged",
         arbitration.ControlChange.UNFLAG: "the flag is removed",
         arbitration.ControlChange.SET_MODE: "the mode is set",

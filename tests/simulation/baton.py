@@ -1,8 +1,7 @@
-"""Code that blocks, in simulated time: each runs in a thread of its own, and only who has the baton runs.
+"""Blocking code in simulated time: each has a thread, and only the thread with the baton runs.
 
-The simulation gives the baton to a thread and waits until the thread gives it back, by waiting for something or by
-ending. So there is one order of events, which the timeline alone decides, and blocking code replays as exactly as any
-other.
+The simulation gives the baton to a thread and waits until the thread returns it, by waiting for an event or by ending.
+So the timeline alone determines the order of events, and blocking code replays as exactly as any other.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ _LONGEST_STEP_S = 60.0
 
 
 class Killed(BaseException):
-    """This life has ended: raised wherever the code waits, as often as it tries to."""
+    """Raised in code that waits when its process is killed, each time it waits."""
 
 
 class Baton:
     """One thread of blocking code.
 
     Args:
-        body: the code. What it raises, but for `Killed`, is kept in `error`.
+        body: the code. Its exception, other than `Killed`, is kept in `error`.
     """
 
     def __init__(self, name: str, body: Callable[[], int]) -> None:
@@ -56,7 +55,7 @@ class Baton:
     # --- on the side of the code ---
 
     def wait(self) -> None:
-        """Give the baton back, until it comes again."""
+        """Return the baton, and wait for it."""
         if self._killed:
             raise Killed
         self._to_simulation.release()
@@ -65,7 +64,7 @@ class Baton:
             raise Killed
 
     def die(self) -> None:
-        """End this life here and now."""
+        """End this process here and now."""
         self._killed = True
         raise Killed
 

@@ -1,4 +1,4 @@
-"""The cast: those who work well together, and those who do not."""
+"""The cast: components that work well together, and disruptive ones."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _IN_THE_MIDDLE = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
 class Experiment(Client):
-    """Scans over and over; waits for control, survives losing it.
+    """Scans over and over; waits for control, and survives losing it.
 
     Attributes:
-        done: scans that it saw through, in all lives.
+        done: number of complete scans, over all restarts.
     """
 
     done = 0
@@ -50,7 +50,7 @@ class Experiment(Client):
                 yield from self.sleep(self.some(120.0))
 
     def regain(self, solving: int) -> Generator[float, None, bool]:
-        """Ask for control; where it is refused, wait for something to change."""
+        """Request control; after a refusal, wait for a change of control."""
         before = self.control
         response = yield from self.ask(ControlRequest.REQUEST_CTRL, int(solving))
         if response.code == _OK:
@@ -87,7 +87,7 @@ class Experiment(Client):
 
 
 class ExperimentWithoutIds(Experiment):
-    """The same, without ids: what is not answered is not repeated."""
+    """The same, without ids: a request without an answer is not repeated."""
 
     knows_ids = False
 
@@ -137,7 +137,7 @@ class FeedbackCorrector(Corrector):
 
 
 class Greedy(Experiment):
-    """Gets control and does nothing with it."""
+    """Gets control and does not use it."""
 
     def behave(self) -> Doing:
         while True:
@@ -148,7 +148,7 @@ class Greedy(Experiment):
 
 
 class Crasher(Experiment):
-    """Gets control, begins something, and dies; now and then for good (exit code 0)."""
+    """Gets control, begins an action, and dies; sometimes for good (exit code 0)."""
 
     def behave(self) -> Doing:
         yield from self.sleep(self.some(1800.0))
@@ -159,7 +159,7 @@ class Crasher(Experiment):
 
 
 class Careless(Experiment):
-    """Switches the feedback off to measure something, and now and then is not there any more to switch it on.
+    """Switches the feedback off for a measurement, and sometimes disappears before it switches the feedback on.
 
     Attributes:
         gone_s: how long (real) its computer is away then.
@@ -187,7 +187,7 @@ class Careless(Experiment):
 
 
 class Burster(Experiment):
-    """Sends its commands without waiting for answers, as a program of its own may; all within reach of the limits."""
+    """Sends commands without waiting for answers; each alone is within the limits."""
 
     def behave(self) -> Doing:
         while True:
@@ -204,7 +204,7 @@ class Burster(Experiment):
             yield from self.sleep(self.some(1200.0))
 
     def _wish(self) -> tuple[int, Any]:
-        """Return a random request; sizes and corners are up to twice as large as fits."""
+        # sizes and corners are up to twice as large as the limits allow
         chance = self.timeline.random
         at_m, size_m = chance.uniform(-5e-6, 5e-6), chance.uniform(0.2e-6, 8e-6)
         small = Region((at_m / 3, chance.uniform(-1e-6, 1e-6)), (1e-6, 1e-6))
@@ -267,7 +267,7 @@ class Forgetful(Experiment):
 
 
 class Impostor(Client):
-    """Calls itself like another component, and commands, unasked, again and again."""
+    """Uses the name of another component, and sends commands again and again."""
 
     connects = False
 
@@ -282,7 +282,7 @@ class Impostor(Client):
 
 
 class Operator(Client):
-    """A person who takes over now and then."""
+    """A person who takes over from time to time."""
 
     def behave(self) -> Doing:
         while True:
@@ -299,11 +299,11 @@ class Operator(Client):
 
 
 class Person(Operator):
-    """Sees to a tip that was in danger, at the controller's panel, and says that it is well again.
+    """Attends to a tip that was in danger, at the controller's panel, and clears the malfunction.
 
     Attributes:
         approach: brings the tip back to the surface.
-        comes_s: how long (experiment) it takes to come.
+        comes_s: time until the person comes, experiment time.
         for_people: the problems that only people clear.
     """
 
@@ -327,10 +327,10 @@ class Person(Operator):
 
 
 class Dawn(Person):
-    """The person who comes in the morning, sees to the tip, and leaves everything to the components or ends it.
+    """The person who comes in the morning, attends to the tip, and then may end the experiment.
 
     Attributes:
-        ends: the experiment is to end.
+        ends: whether to end the experiment.
     """
 
     ends = False
@@ -345,7 +345,7 @@ class Dawn(Person):
 
 
 class Stranger(Client):
-    """Asks for whatever comes to its mind, be it allowed or not."""
+    """Sends random requests, allowed or not."""
 
     requests: tuple[tuple[int, Any], ...] = (
         (ControlRequest.RELEASE_CTRL, None),
@@ -372,12 +372,12 @@ class Stranger(Client):
 
 
 class Teller(Client):
-    """A supervisor, as far as it tells how it is with its processes, and restarts those that it is ordered to.
+    """The part of a supervisor that reports process states and carries out orders to restart.
 
     Attributes:
-        processes: says how it is with those that there are.
-        restart: starts one anew.
-        ordered: how often it was ordered to.
+        processes: returns the process states.
+        restart: restarts a process.
+        ordered: number of orders received.
     """
 
     def __init__(self, *args: Any, **named: Any) -> None:
@@ -400,7 +400,7 @@ class Teller(Client):
 
 
 class Listener(Client):
-    """Only listens, to everything, as a visualiser does."""
+    """Receives everything and sends nothing, as a visualiser does."""
 
     listens = ("",)
 

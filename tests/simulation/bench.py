@@ -1,4 +1,4 @@
-"""A microscope for simulations: it keeps everything in its memory, and takes pictures of nothing."""
+"""A microscope for simulations: all its state is in its memory, and it has no sample."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _AT_FIRST: dict[str, Value] = {
 
 
 class BenchMicroscope(Driver):
-    """Scans of 4 x 4 pixels, each with what it was taken with; no state outside of its memory.
+    """Scans of 4 x 4 pixels, each with the settings it was taken with; no state outside its memory.
 
     Args:
         scan_s: how long (experiment) a scan takes.
-        finished: each scan that came to its end is noted here, in all lives, by where it was taken.
+        finished: records each complete scan by its place, over all restarts.
     """
 
     parameters_file = Path(simulator.__file__).with_name("parameters.toml")

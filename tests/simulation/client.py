@@ -1,4 +1,4 @@
-"""Simulated components: what they do is a generator, so that they wait without threads and die at any point."""
+"""Simulated components: their behaviour is a generator, so that they wait without threads and can die at any point."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Client(Process):
     """A component. Subclasses write `behave`.
 
     Attributes:
-        identity: what it calls itself to the scheduler; an impostor's differs from its `name`.
-        knows_ids: it sends ids and repeats a request that is not answered; a program without ids does neither.
-        listens: how the envelopes begin that it subscribes to.
-        on_received: called with every packet that reaches it.
+        identity: its name for the scheduler; an impostor's differs from its `name`.
+        knows_ids: it sends ids and repeats an unanswered request; a program without ids does neither.
+        listens: the beginnings of the envelopes that it subscribes to.
+        on_received: called with every packet that it receives.
     """
 
     knows_ids = True
@@ -87,7 +87,7 @@ class Client(Process):
         self.later(0.0, self._go_on)
 
     def connect(self) -> None:
-        """Make the connection for requests."""
+        """Open the connection for requests."""
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.identity)
 
     def ended(self) -> None:
@@ -100,7 +100,7 @@ class Client(Process):
         self._doing = None
 
     def cut(self) -> None:
-        """Its connections break, and are made again."""
+        """Break its connections, which are then reopened."""
         self.cut_s = self.timeline.monotonic_s()
         if self._line is not None:
             self._line.cut()
@@ -108,14 +108,14 @@ class Client(Process):
             self._feed.cut()
 
     def fall_silent(self, for_s: float) -> None:
-        """Its connections lose what is sent before they break."""
+        """Let its connections lose all messages for a time before they break."""
         self.cut_s = self.timeline.monotonic_s() + for_s
         for connection in (self._line, self._feed):
             if connection is not None:
                 connection.fall_silent(for_s)
 
     def behave(self) -> Doing:
-        """What it does, from its start on."""
+        """Run the component from its start on."""
         raise NotImplementedError
 
     def _go_on(self) -> None:
@@ -173,7 +173,7 @@ class Client(Process):
         self._go_on()
 
     def caught_up(self, feed: Feed) -> None:
-        """All that was cached is here."""
+        """Note that the replay of the cache is complete."""
 
     def killed(self, feed: Feed) -> None:
         self.kill(80)
@@ -181,7 +181,7 @@ class Client(Process):
     # --- what behaviours are made of ---
 
     def ask(self, kind: int, subject: Any = None, key: str = "") -> Generator[float, None, Response]:
-        """Ask the scheduler, again if it is silent. NO_RESPONSE if it stays so."""
+        """Send a request, again if there is no answer; NO_RESPONSE if there never is."""
         request = self._request(kind, subject, key)
         for _ in range(TRIES if self.knows_ids else 1):
             yield from self.until(lambda: self._line is not None and self._line.up)
@@ -195,7 +195,7 @@ class Client(Process):
         return answer or Response(int(ControlResponse.NO_RESPONSE), b"", "silence", request.id)
 
     def tell(self, kind: int, subject: Any = None) -> None:
-        """Ask the scheduler, and wait for no answer."""
+        """Send a request without waiting for its answer."""
         if self._line is not None and self._line.up:
             self._line.ask(self._request(kind, subject))
 
@@ -205,7 +205,7 @@ class Client(Process):
         return Request(int(kind), subject, self.codec.encode(subject), request_id if self.knows_ids else "")
 
     def until(self, holds: Callable[[], bool], timeout_s: float = 1e9) -> Generator[float, None, bool]:
-        """Wait until something holds; False if the time is up first."""
+        """Wait for a condition; False after the timeout."""
         end_s = self.timeline.monotonic_s() + timeout_s
         while not holds():
             left_s = end_s - self.timeline.monotonic_s()
@@ -218,5 +218,5 @@ class Client(Process):
         yield from self.until(lambda: False, real_s)
 
     def some(self, experiment_s: float) -> float:
-        """A random real time, about as long as so many seconds of the experiment."""
+        """Return a random real time of the order of `experiment_s` in the experiment's time."""
         return self.timeline.real_s(experiment_s * (0.2 + 1.6 * self.timeline.random.random()))

@@ -1,4 +1,4 @@
-"""A stand-in for the wire: objects travel as numbers into a table. Quick, and blind to what the wire can get wrong."""
+"""A quick substitute for the wire format: objects travel as numbers into a table. It hides errors of encoding."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from afspm.model import Parameter
 
 
 class TableCodec:
-    """See `scheduler.events.Codec`; payloads are the numbers, in ASCII, of the objects that they stand for."""
+    """See `scheduler.events.Codec`; a payload is the number of its object, in ASCII."""
 
     def __init__(self) -> None:
         self._objects: dict[bytes, Any] = {}

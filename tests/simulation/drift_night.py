@@ -38,7 +38,7 @@ CERTAIN_M = 1e-12
 
 
 def drift_m(time_s: float) -> np.ndarray:
-    """Where the sample is: fast at first, then slower."""
+    """Return the position of the sample: it moves fast at first, then slower."""
     since_s = time_s - START_S
     settled = float(1.0 - np.exp(-since_s / 7200.0))
     return np.array([1e-6, -0.5e-6]) * settled + np.array([1e-11, 0.0]) * since_s
@@ -46,7 +46,7 @@ def drift_m(time_s: float) -> np.ndarray:
 
 @dataclass(frozen=True)
 class PlacedScan(FakeScan):
-    """A scan that knows where and until when it was taken."""
+    """A scan with its place and its end."""
 
     region: Region = WANTED
     begun_s: float = 0.0
@@ -56,7 +56,7 @@ class PlacedScan(FakeScan):
 
 
 class DriftTable(TableCodec):
-    """A stand-in for the wire that knows places."""
+    """A substitute for the wire format that knows places."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> Any:
         thing = self.decode(payload)
@@ -79,7 +79,7 @@ class DriftTable(TableCodec):
 
 
 class DriftingMicroscope(FakeMicroscope):
-    """Moving takes a moment."""
+    """A microscope whose moves take a moment."""
 
     region = Region((0.3e-6, 0.0), (2e-6, 2e-6))
     scan_began_s = 0.0
@@ -105,7 +105,7 @@ class DriftingMicroscope(FakeMicroscope):
 
 
 class PlayedWorker:
-    """Knows the truth, after a while, and what it has said before; dies and hangs now and then."""
+    """A worker with true registrations after a delay, and its earlier answers on disk; sometimes it dies or hangs."""
 
     def __init__(self, night: DriftNight) -> None:
         self._night = night
@@ -166,11 +166,11 @@ class PlayedWorker:
 
 
 class DriftNight(Night):
-    """Adds what must hold of places.
+    """Adds the invariants of places.
 
     Attributes:
         trouble: the chance that a registration fails.
-        answers, known: what the worker has on its disk.
+        answers, known: the content of the worker's disk.
     """
 
     def __init__(self, plan: Plan, trouble: float = 0.0) -> None:

@@ -17,7 +17,7 @@ from afspm.client.component import Component
 from afspm.model import Packet, Request, Response
 from afspm.storage.memory import Memory
 from afspm.translator.driver import Driver
-from afspm.translator.translator import Translator
+from afspm.translator.translator import Translator, TranslatorRun
 from afspm.transport.late_joiners import PublishedHistory
 from afspm.transport.port import (
     CaughtUp,
@@ -42,13 +42,13 @@ SOURCE = "memory://scheduler"
 
 
 class HostedProcess(Process):
-    """A process whose code blocks.
+    """A process with blocking code.
 
     Args:
-        dies_in_call: the chance that it is killed in a call to its port, before or after that does what it is to do.
+        dies_in_call: the chance that it is killed in a call to its port, before or after the call has its effect.
 
     Attributes:
-        ended_with: how its last life ended: an exit code, or what was raised; None if it was killed.
+        ended_with: the end of its last life: an exit code or an exception; None if it was killed.
     """
 
     def __init__(self, timeline: Timeline, name: str, *, dies_in_call: float = 0.0) -> None:
@@ -74,7 +74,7 @@ class HostedProcess(Process):
             baton.kill()
 
     def arrived(self) -> None:
-        """Something came that its code may wait for."""
+        """Note a message that its code may wait for."""
         if self._waits:
             self._go_on()
 
@@ -106,7 +106,7 @@ class HostedProcess(Process):
         self._baton.wait()
 
     def may_die(self) -> None:
-        """A moment in which it may be killed."""
+        """Kill the process by chance at this moment."""
         if self.dies_in_call and self.timeline.chance(self.dies_in_call):
             assert self._baton is not None
             self._baton.die()
@@ -114,18 +114,18 @@ class HostedProcess(Process):
     # --- for subclasses ---
 
     def body(self) -> int:
-        """What it does; returns its exit code."""
+        """Run the process; return its exit code."""
         raise NotImplementedError
 
     def connect(self) -> None:
-        """A life begins: make its connections."""
+        """Open the connections of a new life."""
 
     def disconnect(self) -> None:
-        """A life has ended."""
+        """Close the connections of the life that has ended."""
 
 
 class HostedComponent(HostedProcess):
-    """A `Component`, made anew for every life, on a `Port` in memory.
+    """A `Component`, made for every life, on a `Port` in memory.
 
     Args:
         make: makes the component.
@@ -180,7 +180,7 @@ class HostedComponent(HostedProcess):
         return self._make().run_process(context)
 
     def cut(self) -> None:
-        """Its connections break, and are made again."""
+        """Break its connections, which are then reopened."""
         self._line.cut()
         self._feed.cut()
 
@@ -259,11 +259,11 @@ class MemoryPort:
         return -1
 
     def close(self) -> None:
-        """Nothing is held open but by the process."""
+        """There is nothing to close: connections belong to the process."""
 
 
 class HostedTranslator(HostedProcess):
-    """A `Driver`, made anew for every life, behind the real `Translator`.
+    """A `Driver`, made for every life, behind the real `Translator`.
 
     Args:
         make: makes the microscope.
@@ -291,15 +291,15 @@ class HostedTranslator(HostedProcess):
     def body(self) -> int:
         memory = Memory(self._folder / "translator.json")
         log = logging.getLogger("afspm.translator")
-        return Translator(self._make(), MemoryServerPort(self), memory, self._folder, log).run()
+        return Translator(self._make(), MemoryServerPort(self), memory, TranslatorRun(self._folder), log).run()
 
     # --- what comes ---
 
     def peer_connected(self, line: ControlLine) -> None:
-        """Nothing is done until it asks."""
+        """Do nothing until the first request."""
 
     def peer_disconnected(self, line: ControlLine) -> None:
-        """Its answer will find nobody."""
+        """Do nothing: the answer is lost with the connection."""
 
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
         self._inbox.append((line, request, number))
@@ -367,7 +367,7 @@ class MemoryServerPort:
         self._host.reply(frames)
 
     def is_connected(self, connection: bytes) -> bool:
-        """Its one scheduler tells no epoch, so nobody asks."""
+        """Return True: its scheduler has no epoch, so the result is not used."""
         return True
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
@@ -377,4 +377,4 @@ class MemoryServerPort:
         self._host.wake(incoming)
 
     def close(self) -> None:
-        """Nothing is held open but by the process."""
+        """There is nothing to close: connections belong to the process."""

@@ -1,4 +1,4 @@
-"""What must hold after every step, checked from outside by other means than those it is decided by."""
+"""The invariants after every step, checked from outside and by other means than the decisions themselves."""
 
 from __future__ import annotations
 
@@ -54,13 +54,13 @@ NAME_TAKEN = "each needs a name of its own"
 
 
 class InvariantViolated(AfspmError):
-    """Something happened that must never happen."""
+    """An invariant does not hold."""
 
     code = "invariant"
 
 
 class Invariants:
-    """Watches the scheduler, the microscope and all components of one simulated night."""
+    """Observes the scheduler, the microscope and all components of one simulated night."""
 
     def __init__(
         self, timeline: Timeline, settings: SchedulerSettings, microscope: FakeMicroscope, codec: TableCodec
@@ -96,14 +96,14 @@ class Invariants:
         microscope.on_executed = self.executed
 
     def forgets(self) -> None:
-        """The scheduler may be killed before it could write down what it knows."""
+        """Note that the scheduler may be killed before it has saved its state."""
         self.times_are_certain = self.memory_is_certain = False
         self.written.is_certain = self.tip.memory_is_certain = self.limits.memory_is_certain = False
 
     # --- the scheduler ---
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
-        """Before each effect."""
+        """Check an effect before it is carried out."""
         self.written.carried_out(host, effect)
         if self._life != host.life:
             self._life = host.life
@@ -122,7 +122,7 @@ class Invariants:
             self._saved(host)
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
-        """After each step."""
+        """Check the state after a step."""
         self.checks += 1
         self._scheduler_since_s = host.since_s
         self._note(event, effects)
@@ -165,7 +165,7 @@ class Invariants:
         self._holder = control.holder
 
     def _presence(self, host: SchedulerHost) -> None:
-        """Control never stays with the dead."""
+        # a dead component does not keep control
         now_s = self._timeline.monotonic_s()
         for client in self.components:
             if client.identity != client.name:
@@ -184,7 +184,7 @@ class Invariants:
         )
 
     def _lease(self, host: SchedulerHost) -> None:
-        """Nobody keeps control by doing nothing."""
+        # an idle component does not keep control
         lease_s = self._settings.control.lease_s
         if lease_s is None:
             return
@@ -202,7 +202,7 @@ class Invariants:
         self._must(idle_s <= allowed_s, f"{self._holder} has done nothing for {idle_s:.0f} s, its lease is {lease_s} s")
 
     def _saved(self, host: SchedulerHost) -> None:
-        """What is told is on the disk already, unless that is full, which is said."""
+        # state is saved before it is published, unless the disk is full, which is logged
         if host.disk.stale or (host.core.control is self._saved_control and host.disk.state is self._saved_state):
             return
         self._saved_control, self._saved_state = host.core.control, host.disk.state
@@ -225,7 +225,7 @@ class Invariants:
             self._open[key] = (since_s, event.connection)
 
     def _reply(self, host: SchedulerHost, reply: Reply) -> None:
-        """One definite answer to each request, however often it is asked."""
+        # a request has one definite answer, also when it is repeated
         response = reply.response
         key = (reply.name, response.id)
         self._open.pop(key, None)
@@ -271,7 +271,7 @@ class Invariants:
             self._must(value != "nan", "a NaN is sent to the microscope")
 
     def executed(self, request: Request) -> None:
-        """The microscope carries out a command."""
+        """Check a command that the microscope executes."""
         self.tip.executed(request)
         self.written.executed(request)
         self.limits.executed(request)
@@ -283,7 +283,7 @@ class Invariants:
     # --- packets ---
 
     def _publish(self, effect: Publish) -> None:
-        """In order, and nothing under two times, so that nobody takes it for two."""
+        # in order, and no packet under two times, which would make it two packets
         packet, source_ns = effect.packet, effect.source_ns
         assert packet.time_ns is not None
         if source_ns is not None and self.times_are_certain:
@@ -302,7 +302,7 @@ class Invariants:
         self._last_ns = packet.time_ns
 
     def _replayed(self, host: SchedulerHost, event: ReplayRequested, effects: Sequence[Effect]) -> None:
-        """Exactly what is cached and it has not had, oldest first over all envelopes."""
+        # exactly the cached packets that the subscriber lacks, oldest first over all envelopes
         replay = next(effect for effect in effects if isinstance(effect, Replay))
         cached = [packet for packet, *_ in host.core.cached()]
         wanted = [p for p in cached if (p.time_ns or 0) > event.since_ns and p.envelope.startswith(event.prefixes)]
@@ -311,7 +311,7 @@ class Invariants:
         self._must(all(a < b for a, b in itertools.pairwise(times)), "a replay out of order")
 
     def received(self, client: Client, packet: Packet) -> None:
-        """A component got a packet that is new to it."""
+        """Check a packet that is new to a component."""
         assert packet.time_ns is not None
         published = self._published.get(packet.time_ns)
         self._must(
@@ -320,7 +320,7 @@ class Invariants:
         )
 
     def has_all(self, client: Client, cached: Sequence[Packet]) -> None:
-        """In calm weather a component has, of every envelope, what the cache held a moment ago."""
+        """Check that in calm weather a component has all packets that were cached a moment ago."""
         for packet in (packet for packet in cached if packet.envelope.startswith(client.listens)):
             have = client.newest.get(packet.envelope)
             self._must(
@@ -331,7 +331,7 @@ class Invariants:
     # --- answers as components get them ---
 
     def answered(self, client: Client, request: Request, response: Response) -> None:
-        """An impostor is not obeyed while the owner of the name is there."""
+        """Check that an impostor is not obeyed while the owner of the name is connected."""
         if client.identity == client.name or response.code != _SUCCESS:
             return
         owner = next((c for c in self.components if c.name == client.identity), None)
@@ -352,7 +352,7 @@ class Invariants:
             self.fail(what)
 
     def fail(self, what: str) -> None:
-        """Say what was violated, and what led to it."""
+        """Raise the violation, with the last steps before it."""
         trace = "\n".join(f"{time_s:12.4f} {event} -> {list(effects)}"[:600] for time_s, event, effects in self._trace)
         raise InvariantViolated(f"at {self._timeline.monotonic_s():.4f} s: {what}\n{trace}")
 

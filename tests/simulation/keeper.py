@@ -1,4 +1,4 @@
-"""The supervisor as far as it decides: the real `ChildWatch` for each process, with beats that freeze with it."""
+"""The decisions of the supervisor: the real `ChildWatch` for each process, with heartbeats that freeze with it."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Beat:
 
 
 class Keeper:
-    """Starts all processes and keeps them going.
+    """Starts all processes and restarts them.
 
     Attributes:
-        given_up: names of those that it gave up.
+        given_up: names of processes that it gave up.
     """
 
     def __init__(self, timeline: Timeline, processes: Iterable[Process], policy: ChildPolicy) -> None:
@@ -48,12 +48,12 @@ class Keeper:
         self._beat()
 
     def restart(self, name: str) -> None:
-        """Start a process anew, as somebody ordered."""
+        """Restart a process by order."""
         process, watch = self._children[name]
         self._do(process, watch.restart(self._timeline.monotonic_s()))
 
     def states(self) -> tuple[ProcessState, ...]:
-        """How it is with all processes, as far as anything follows from that."""
+        """Return the states of all processes, with the fields that decisions use."""
         return tuple(
             ProcessState(process.name, "", _OVER.get(watch.phase, ProcessCondition.ALIVE), 0, starts=process.life)
             for process, watch in self._children.values()

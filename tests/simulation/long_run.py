@@ -1,6 +1,6 @@
 """Many simulated nights: `python -m tests.simulation.long_run --hours 10000 --seed 1`.
 
-A seed that fails is printed with what was violated and what led to it; `--seed S --nights 1` replays it exactly.
+A failing seed is printed with the violated invariant and the last steps; `--seed S --nights 1` replays it exactly.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tests.simulation.night import Night, plan
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Returns 1 if an invariant was violated."""
+    """Return 1 if an invariant was violated."""
     parser = argparse.ArgumentParser(prog="python -m tests.simulation.long_run", description=__doc__)
     parser.add_argument("--hours", type=float, default=3000.0, help="experiment hours in all")
     parser.add_argument("--nights", type=int, help="instead: how many nights")

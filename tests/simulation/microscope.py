@@ -1,4 +1,4 @@
-"""A translator and its microscope as a simulated process, ours or of version 1, that may be slow, hang and die."""
+"""A translator and its microscope as a simulated process that may be slow, hang and die."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 @dataclass(frozen=True)
 class FakeScan:
-    """What stands for the values of a scan: which one, and whether the tip was good."""
+    """Stands for the values of a scan: its number, and whether the tip was good."""
 
     number: int
     channel: str
@@ -66,15 +66,15 @@ class FakeScan:
 
 @dataclass
 class Habits:
-    """How the translator behaves; may be changed while it runs.
+    """The behaviour of the translator; may be changed while it runs.
 
     Attributes:
-        service_s: the longest a request takes, mostly much less.
-        hangs: the chance that one takes up to `hang_s`.
+        service_s: the longest time for a request, mostly much less.
+        hangs: the chance that a request takes up to `hang_s`.
         loses_answer: the chance that an answer never comes.
         scan_s: how long (experiment) a scan takes.
         tip_breaks: the chance that a scan damages the tip.
-        clock_error_s: of its clock; may go back.
+        clock_error_s: of its clock; may decrease.
         retracts: whether it has an action that withdraws the tip.
     """
 
@@ -89,13 +89,13 @@ class Habits:
 
 
 class FakeMicroscope(Process):
-    """Serves one request at a time, as REP does; publishes what it does.
+    """Serves one request at a time, as REP does, and publishes its states and scans.
 
     Attributes:
-        executed: how often each command (client's id, or scheduler's number, and kind) was carried out, in all lives.
-        scans_done: in all lives.
-        feedback_on, tip_is_away, region, probe_m, values: the controller's, which outlives its translator.
-        on_changed: called with a parameter, its value before and now.
+        executed: how often each command (client's id, or scheduler's number, and kind) was executed, over all restarts.
+        scans_done: over all restarts.
+        feedback_on, tip_is_away, region, probe_m, values: of the controller, which outlives its translator.
+        on_changed: called with a parameter, its former value and its new one.
         on_placed: called after the scan's region or the probe was set.
     """
 

@@ -1,4 +1,4 @@
-"""The in-memory network: lines that keep the order, take their time, break, and are made again."""
+"""The in-memory network: lines that keep the order, delay messages, break, and are reopened."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Deliver = Callable[..., None]
 
 @dataclass
 class Weather:
-    """What the network is like; all may be changed while it runs.
+    """The quality of the network; may be changed while it runs.
 
     Attributes:
-        delay_s: the longest that a message takes, mostly much less.
+        delay_s: the longest delay of a message, mostly much less.
         doubles: the chance that a request arrives twice.
-        reconnect_s: until a broken line is tried again.
+        reconnect_s: time until a broken line is retried.
     """
 
     delay_s: float = 0.01
@@ -28,7 +28,7 @@ class Weather:
 
 
 class Host(Protocol):
-    """A process, as far as lines see it: whether it is there, and what it gets."""
+    """A process as lines see it: whether it is alive, and what it receives."""
 
     @property
     def alive(self) -> bool: ...
@@ -67,7 +67,7 @@ class Pipe:
 
 
 class ControlServer(Host, Protocol):
-    """Whoever answers requests: scheduler or translator."""
+    """Answers requests: scheduler or translator."""
 
     def peer_connected(self, line: ControlLine) -> None: ...
     def peer_disconnected(self, line: ControlLine) -> None: ...
@@ -75,7 +75,7 @@ class ControlServer(Host, Protocol):
 
 
 class ControlClient(Host, Protocol):
-    """Whoever asks."""
+    """Sends requests."""
 
     def line_up(self, line: ControlLine) -> None: ...
     def line_down(self, line: ControlLine) -> None: ...
@@ -83,13 +83,13 @@ class ControlClient(Host, Protocol):
 
 
 class ControlLine:
-    """A connection for requests from one client to one server, made again whenever it breaks.
+    """A connection for requests from one client to one server, reopened whenever it breaks.
 
     Attributes:
-        name: what the client calls itself.
+        name: the name that the client uses.
 
     Args:
-        doubling: whether requests may arrive twice on it, as those of an impatient client do.
+        doubling: whether requests may arrive twice, as those of an impatient client do.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class ControlLine:
         return self._there is not None
 
     def ask(self, request: Request, number: int = 0) -> None:
-        """Dropped while the line is down."""
+        """Send a request; it is dropped while the line is down."""
         if self._there is None:
             return
         self._there.send(self._server.peer_asked, self, _copy(request), number)
@@ -130,7 +130,7 @@ class ControlLine:
             self._back.send(self._client.answered, self, number, response)
 
     def cut(self) -> None:
-        """Break it: what is under way is lost, both ends hear of it, and it is made again."""
+        """Break the line: messages on their way are lost, both ends notice it, and it is reopened."""
         if self._there is None or self._back is None:
             return
         there, back = self._there, self._back
@@ -142,12 +142,12 @@ class ControlLine:
         self._retry()
 
     def fall_silent(self, for_s: float) -> None:
-        """Lose all that is sent, in one direction or both; neither end hears of that before `for_s` have passed."""
+        """Lose all messages, in one direction or both; neither end notices it before `for_s` have passed."""
         _fall_silent(self._timeline, (self._there, self._back))
         self._timeline.after(for_s, self.cut)
 
     def close(self) -> None:
-        """The client is gone for good, or dead."""
+        """Close the line of a client that has ended or died."""
         self._closed = True
         self.cut()
 
@@ -169,14 +169,14 @@ class ControlLine:
 
 
 class Publisher(Host, Protocol):
-    """Whoever publishes, and keeps what it published for those who come late."""
+    """Publishes packets, and keeps them for late joiners."""
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]: ...
     def left(self, feed: Feed) -> None: ...
 
 
 class Listener(Host, Protocol):
-    """Whoever subscribes."""
+    """Subscribes to packets."""
 
     def since_ns(self, feed: Feed) -> int: ...
     def received(self, feed: Feed, packet: Packet) -> None: ...
@@ -185,7 +185,7 @@ class Listener(Host, Protocol):
 
 
 class Feed:
-    """A subscription of one listener to one publisher, with a replay for it alone whenever it is made."""
+    """A subscription of one listener to one publisher, with a replay for this listener at each connection."""
 
     def __init__(
         self,
@@ -246,7 +246,7 @@ class Feed:
         self._there.send(self._join, self._listener.since_ns(self), self._back)
 
     def _join(self, since_ns: int, back: Pipe) -> None:
-        """At the publisher: the replay first, all that is published from now on after it, so that there is no gap."""
+        # at the publisher: the replay first, then all later packets, so that there is no gap
         if back is not self._back:
             return
         for packet in self._publisher.joined(self, self._prefixes, since_ns):

@@ -1,4 +1,4 @@
-"""A simulated night: who takes part, under which settings, and what befalls them. All of it follows from the seed."""
+"""A simulated night: its cast, its settings and its faults. All of it follows from the seed."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _ENDED_S = 60.0
 
 @dataclass(frozen=True)
 class Fault:
-    """Something bad: what, to whom, when (as a part of the time before the calm), for how long (real)."""
+    """A fault: kind, process, time (as a part of the time before the calm) and duration (real)."""
 
     what: str
     whom: str
@@ -74,21 +74,21 @@ _LONGEST_SILENCE_S = 8.0
 
 @dataclass(frozen=True)
 class Plan:
-    """What a night is made of.
+    """The plan of a night.
 
     Attributes:
-        seed: of all that is left to chance.
-        hours: experiment time, but for the calm.
+        seed: of all random choices.
+        hours: experiment time, without the calm at the end.
         speed: experiment seconds in a real one.
-        cast: who takes part.
-        impostor: somebody calls himself "experiment" as well.
-        lease_s: None for none; then nobody greedy takes part.
-        faults: what befalls them.
+        cast: the components.
+        impostor: another client uses the name "experiment", too.
+        lease_s: None for none; then no greedy component takes part.
+        faults: in their order.
         doubles: the chance that a request arrives twice.
         hangs, loses_answer: see `Habits`.
         dies_in_step: see `SchedulerHost`.
         retracts: see `Habits`.
-        ends: the experiment is ended in the morning, whatever goes on; if not, all must come right.
+        ends: the experiment is ended in the morning, at any state; if not, all components must recover.
     """
 
     seed: int
@@ -108,22 +108,22 @@ class Plan:
 
     @property
     def length_s(self) -> float:
-        """Real time in which bad things happen."""
+        """Real time with faults."""
         return self.hours * 3600.0 / self.speed
 
     @property
     def calm_s(self) -> float:
-        """Real time after that, in which all comes right."""
+        """Real time after the faults, in which all components recover."""
         return max(self.length_s * _CALM, 4 * 3600.0 / self.speed, 200.0)
 
     @property
     def hours_to_the_end(self) -> float:
-        """Experiment time with what comes after."""
+        """Experiment time including the calm."""
         return (self.length_s + (_ENDED_S if self.ends else self.calm_s)) * self.speed / 3600.0
 
 
 def plan(seed: int, hours: float = 8.0) -> Plan:
-    """A night as the seed has it: from a quiet one to one where nearly everything goes wrong."""
+    """Return the night of a seed: from a quiet one to one with nearly all faults."""
     chance = Timeline(seed * 7919 + 1).random
     others = [name for name in CAST if name not in _ALWAYS]
     lease_s = chance.choice((None, 900.0, 1800.0))
@@ -161,7 +161,7 @@ def plan(seed: int, hours: float = 8.0) -> Plan:
 
 @dataclass
 class Outcome:
-    """What came of a night: experiment hours, scans, steps of the scheduler."""
+    """The outcome of a night: experiment hours, scans, steps of the scheduler."""
 
     hours: float
     scans: int
@@ -208,7 +208,7 @@ class Night:
         return FakeMicroscope(self.timeline, self.codec, habits)
 
     def make_core(self) -> Callable[[], Any] | None:
-        """Makes the core of the scheduler's next life; None: a plain one."""
+        """Return a factory for the core of the scheduler's next life; None: a plain core."""
         return None
 
     def _components(self) -> dict[str, Client]:
@@ -226,7 +226,7 @@ class Night:
         return made
 
     def _teller(self) -> behaviours.Teller:
-        """Whoever tells the scheduler of the processes; it is not among those that befalls something."""
+        # reports the processes to the scheduler; no fault befalls it
         teller = behaviours.Teller(
             self.timeline, self.weather, self.codec, self.scheduler, "teller", "supervisor:night"
         )
@@ -243,10 +243,10 @@ class Night:
         return PacketHeader(packet.envelope)
 
     def run(self) -> Outcome:
-        """From dusk to dawn.
+        """Run the night.
 
         Raises:
-            InvariantViolated: with the seed to replay it.
+            InvariantViolated: with the seed that replays it.
         """
         try:
             return self._run()
@@ -310,7 +310,7 @@ class Night:
             self.microscope.habits.clock_error_s = self.timeline.random.choice((-100.0, 0.0, 100.0, 10_000.0))
 
     def _silence(self, process: Process, for_s: float) -> None:
-        """Half-open connections: those of a component, or those between scheduler and translator."""
+        # half-open connections: those of a component, or those between scheduler and translator
         if isinstance(process, Client):
             process.fall_silent(for_s)
             return
@@ -323,7 +323,7 @@ class Night:
         self.timeline.after(for_s, setattr, self.scheduler.disk, "full", False)
 
     def _storm(self, for_s: float) -> None:
-        """Messages take long, and all connections break at its beginning."""
+        # long delays, and all connections break at its beginning
         self.invariants.tip.disturbed(for_s + _SETTLED_S)
         self.weather.delay_s = 3.0
         self.invariants.times_are_certain = False  # a restarted scheduler can't wait for what comes that late
@@ -333,7 +333,7 @@ class Night:
         self.timeline.after(for_s, setattr, self.weather, "delay_s", 0.01)
 
     def _hang(self, for_s: float) -> None:
-        """The translator takes ages."""
+        # the translator is slow
         habits = self.microscope.habits
         self.invariants.tip.disturbed(for_s + _SETTLED_S)
         habits.service_s = for_s
@@ -351,7 +351,7 @@ class Night:
         self.scheduler.banned = self.microscope.banned = False
 
     def _come_right(self, scans: int) -> None:
-        """In calm weather the experiment goes on, and everybody has what the cache holds."""
+        # in calm weather the experiment goes on, and each component has all cached packets
         if not self.keeper.given_up and scans == 0:
             self.invariants.fail(f"nothing was scanned in the calm; control: {self.scheduler.core.control}")
         cached = [packet for packet, *_ in self.scheduler.core.cached()]
@@ -363,7 +363,7 @@ class Night:
                 self.invariants.has_all(client, cached)
 
     def _end(self) -> Outcome:
-        """End the experiment in the middle of whatever goes on: all leave, and nobody stays behind."""
+        # at any state: all processes must leave
         self.dawn.ends = True
         self._calm()
         self.timeline.run_until(self.plan.length_s + _ENDED_S)

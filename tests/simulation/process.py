@@ -1,4 +1,4 @@
-"""Simulated processes: they can be killed and frozen, and only they know what they know."""
+"""Simulated processes: they can be killed and frozen, and a kill loses their memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME_S = 1e-6
 
 
 class Alarm:
-    """Rings for a process at a time that may change again and again; where it stays the same, nothing is done."""
+    """Calls a process at a time that may change again and again; setting the same time costs nothing."""
 
     def __init__(self, process: Process, ring: Callable[[], None]) -> None:
         self._process = process
@@ -28,7 +28,7 @@ class Alarm:
         self._at_s = 0.0
 
     def set(self, delay_s: float | None) -> None:
-        """Ring in `delay_s`, if this life lasts that long, and not when it was to ring before; None: not at all."""
+        """Ring in `delay_s`, if this life lasts that long, and cancel the former time; None: cancel only."""
         at_s = math.inf if delay_s is None else self._process.timeline.monotonic_s() + delay_s
         if self._timer is not None:
             if abs(at_s - self._at_s) < _SAME_S:
@@ -43,15 +43,15 @@ class Alarm:
 
 
 class Process:
-    """A process over all its lives. Subclasses set up what one life knows in `begin`.
+    """A process over all its lives. Subclasses set up the memory of one life in `begin`.
 
     Attributes:
         alive: there is a life.
         banned: it can't be started.
-        frozen: it does nothing, and what comes waits.
-        sockets: the connections that others have made to it, whether it has noticed or not.
-        since_s: since when it has been at work: its start, or the end of its last freeze.
-        step_age_s: for how long, by its own words, the current step has been running.
+        frozen: it does nothing, and messages wait.
+        sockets: the connections that others have made to it, noticed or not.
+        since_s: since when it has been running: its start, or the end of its last freeze.
+        step_age_s: the age of its current step, as it reports it.
     """
 
     def __init__(self, timeline: Timeline, name: str) -> None:
@@ -83,7 +83,7 @@ class Process:
         self.begin()
 
     def kill(self, code: int = -9) -> None:
-        """End this life at once: nothing of it is left but what it put on its disk."""
+        """End this life at once: only its disk survives."""
         if not self.alive:
             return
         self.alive = self.frozen = False
@@ -121,7 +121,7 @@ class Process:
             do(*args)
 
     def later(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
-        """In `delay_s`, if this life lasts that long."""
+        """Call `do` in `delay_s`, if this life lasts that long."""
         return self.timeline.after(delay_s, self._if_same_life, self.life, do, args)
 
     def _if_same_life(self, life: int, do: Callable[..., None], args: tuple[Any, ...]) -> None:
@@ -131,7 +131,7 @@ class Process:
     # --- for subclasses ---
 
     def begin(self) -> None:
-        """A new life begins."""
+        """Set up a new life."""
 
     def ended(self) -> None:
-        """A life has ended: close what it held open."""
+        """Close the resources of a life that has ended."""

@@ -53,12 +53,12 @@ from tests.simulation.timeline import Timeline
 
 @dataclass
 class Disk:
-    """What survives a kill of the scheduler.
+    """The data that survives a kill of the scheduler.
 
     Attributes:
-        state: what was last saved; it is frozen, and made into plain data only for a restart.
+        state: saved last; it is frozen, and converted to plain data only for a restart.
         full: nothing can be written.
-        stale: something could not be written, and nothing has been since.
+        stale: a write has failed, and none has succeeded since.
     """
 
     state: SavedState | None = None
@@ -72,37 +72,37 @@ class Disk:
             self.state = state
 
     def keep(self, entry: LoggedPacket) -> None:
-        """A packet, before it is published."""
+        """Store a packet before it is published."""
         if self.full:
             self.stale = True
             return
         self.journal = (*self.journal, entry)
 
     def saved(self) -> SavedState | None:
-        """As it comes out of a JSON file; None if nothing was saved."""
+        """Return the state as read back from a JSON file; None if none was saved."""
         if self.state is None:
             return None
         return restored(SavedState, json.loads(json.dumps(snapshot(self.state, KIND, VERSION))), KIND, VERSION)
 
 
 class Observer(Protocol):
-    """Whoever checks the scheduler."""
+    """Checks the scheduler."""
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None: ...
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None: ...
 
 
 class SchedulerHost(Process):
-    """See `afspm.scheduler.shell`, which does the same with sockets.
+    """The counterpart of `afspm.scheduler.shell`, without sockets.
 
     Attributes:
-        writes_ahead: a packet is on the disk before it is published, as in the shell. Without that, the translator's
-            newest packets are forgotten by a kill, which is harder on the scheduler.
+        writes_ahead: a packet is on disk before it is published, as in the shell. If False, a kill loses the
+            translator's newest packets, which is harder on the scheduler.
 
     Args:
         journal_s: how long after a packet the journal is written.
         dies_in_step: the chance that it is killed between two effects of one step.
-        make_core: makes the core of each life, if it is not to be a plain one.
+        make_core: makes the core of each life, if it is not a plain one.
     """
 
     def __init__(
@@ -156,7 +156,7 @@ class SchedulerHost(Process):
         self._carry_out(None, self.core.start(self.timeline.monotonic_s(), self.timeline.now_ns()))
 
     def fall_silent(self, for_s: float) -> None:
-        """The connections to the translator lose what is sent before they break."""
+        """Let the connections to the translator lose all messages before they break."""
         if self.alive:
             self._link.fall_silent(for_s)
             self._from_translator.fall_silent(for_s)
@@ -219,7 +219,7 @@ class SchedulerHost(Process):
         self._step(TranslatorCaughtUp())
 
     def killed(self, feed: Feed) -> None:
-        """The translator sends no such thing."""
+        """Not used: the translator sends no KILL."""
 
     # --- as a publisher ---
 
@@ -239,12 +239,12 @@ class SchedulerHost(Process):
     # --- steps ---
 
     def reported(self, report: object) -> None:
-        """The worker of the coordinate frame reports something."""
+        """Process a report of the coordinate frame's worker."""
         self._step(FrameReported(report))
 
     @property
     def _has_ended(self) -> bool:
-        """The experiment has, and only supervisors are still heard."""
+        # after the end only supervisors' messages are processed
         return self.core.leave_at_s < math.inf
 
     def _step(self, event: Input, *, late: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Everything that holds of a scheduler holds of the drift compensated one, whatever becomes of its worker."""
+"""All invariants of a scheduler hold for the drift compensated one, also when its worker fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Real components, the real `Scope`, the real translator: in simulation, killed anywhere, every scan is there once."""
+"""Real components, `Scope` and translator in simulation: every scan is taken once, wherever they are killed."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Survey(Component):
 
 
 class Worrier(Component):
-    """Flags the tip every so often."""
+    """Flags the tip from time to time."""
 
     period_s = 100.0
 
@@ -125,10 +125,10 @@ def night(
 
 
 class _Observer:
-    """Control goes to solvers only while anything is flagged."""
+    """Checks that only solvers get control while a problem is flagged."""
 
     def carried_out(self, host: SchedulerHost, effect: object) -> None:
-        """Every effect is fine."""
+        """Accept every effect."""
 
     def stepped(self, host: SchedulerHost, event: object, effects: object) -> None:
         control = host.core.control
@@ -142,7 +142,7 @@ def run(night: Night, limit_s: float = 3000.0) -> None:
 
 
 def check(night: Night) -> None:
-    """Every scan asked for is there exactly once, with all its channels, and none was taken twice."""
+    """Check that every requested scan was taken and published exactly once, with all its channels."""
     files = night.files()
     assert set(files) == {f"tile-{tile}" for tile in range(TILES)}
     names = [file for of_tile in files.values() for file in of_tile]
@@ -167,7 +167,7 @@ def test_a_quiet_survey_is_complete(tmp_path: Path) -> None:
     check(quiet)
 
 
-def test_it_replays_exactly(tmp_path: Path) -> None:
+def test_schedule_of_faults_replays_exactly(tmp_path: Path) -> None:
     ends = []
     for attempt in ("a", "b"):
         made = night(5, tmp_path / attempt, dies_in_call=0.01)
@@ -177,21 +177,21 @@ def test_it_replays_exactly(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(16))
-def test_every_scan_is_there_once_though_control_is_lost_and_everything_is_killed(seed: int, tmp_path: Path) -> None:
+def test_every_scan_is_taken_once_although_control_is_lost_and_all_processes_killed(seed: int, tmp_path: Path) -> None:
     made = night(seed, tmp_path, dies_in_call=0.02, dies_in_step=0.01)
     run(made)
     check(made)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_every_scan_is_there_once_though_components_are_killed_anywhere(seed: int, tmp_path: Path) -> None:
+def test_every_scan_is_taken_once_although_components_are_killed_anywhere(seed: int, tmp_path: Path) -> None:
     made = night(seed, tmp_path, dies_in_call=0.02, worried=False)
     run(made)
     check(made)
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_every_scan_is_there_once_though_the_scheduler_is_killed_anywhere(seed: int, tmp_path: Path) -> None:
+def test_every_scan_is_taken_once_although_the_scheduler_is_killed_anywhere(seed: int, tmp_path: Path) -> None:
     made = night(seed, tmp_path, dies_in_step=0.02, worried=False)
     run(made)
     check(made)

@@ -1,4 +1,4 @@
-"""The invariants can fail: what is broken on purpose is found within a few nights."""
+"""The invariants can fail: decisions broken on purpose are found within a few nights."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _FEW = ("experiment", "classifier", "corrector", "feedback", "person")
 
 
 def _bad_night(seed: int) -> Plan:
-    """A night in which much goes wrong, in some with a greedy client."""
+    # many faults; in some nights also a greedy client
     away = [Fault("outage", "experiment", (seed % 10) / 10.0, 60.0)]
     drawn = plan(seed, hours=4.0)
     if seed % 4 == 3:  # few others and slow, so that control stays where it is
@@ -81,7 +81,7 @@ def two_in_control(patch: Patch) -> None:
     _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.OTHER_HOLDS))
 
 
-def anybody_while_flagged(patch: Patch) -> None:
+def any_component_while_flagged(patch: Patch) -> None:
     _rows(patch, ArbitrationEvent.REQUEST_CONTROL, _without(arbitration.SOLVES_NONE))
 
 
@@ -97,7 +97,7 @@ def solver_stays_when_solved(patch: Patch) -> None:
     _rows(patch, ArbitrationEvent.CLEAR, _not_doing(ControlChange.TAKE))
 
 
-def anybody_commands(patch: Patch) -> None:
+def any_component_commands(patch: Patch) -> None:
     rows = arbitration.TABLE[ArbitrationEvent.COMMAND]
     _rows(patch, ArbitrationEvent.COMMAND, lambda _: (replace(rows[0], when=arbitration.OTHERWISE),))
 
@@ -110,7 +110,7 @@ def no_lease(patch: Patch) -> None:
     patch.setattr(Lease, "deadline_ns", lambda self, is_free: None)
 
 
-def nobody_is_dead(patch: Patch) -> None:
+def no_holder_is_ever_dead(patch: Patch) -> None:
     patch.setattr(HolderTimeout, "dead_at_s", lambda self, *args: None)
 
 
@@ -152,7 +152,7 @@ def a_former_holder_commands_on(patch: Patch) -> None:
     patch.setattr(request_pipeline, "_not_allowed_now", lambda draft, job: None)
 
 
-def told_before_saved(patch: Patch) -> None:
+def published_before_saved(patch: Patch) -> None:
     real = StateDraft.finish
 
     def finish(self: StateDraft) -> tuple[SchedulerState, list[Effect]]:
@@ -188,7 +188,7 @@ def replay_envelope_by_envelope(patch: Patch) -> None:
     patch.setattr(PacketCache, "replay", replay)
 
 
-def answers_are_written_down_once_more(patch: Patch) -> None:
+def answers_are_logged_twice(patch: Patch) -> None:
     real, before = EventLog.take, list[JournalEntry]()
 
     def take(self: EventLog, *args: Any) -> tuple[EventLog, JournalEntries]:
@@ -200,7 +200,7 @@ def answers_are_written_down_once_more(patch: Patch) -> None:
     patch.setattr(EventLog, "take", take)
 
 
-def every_fiftieth_answer_is_not_written_down(patch: Patch) -> None:
+def every_fiftieth_answer_is_not_logged(patch: Patch) -> None:
     real, count = EventLog.add_request, itertools.count(1)
 
     def add_request(self: EventLog, *args: Any) -> EventLog:
@@ -209,7 +209,7 @@ def every_fiftieth_answer_is_not_written_down(patch: Patch) -> None:
     patch.setattr(EventLog, "add_request", add_request)
 
 
-def changes_of_control_are_not_written_down(patch: Patch) -> None:
+def changes_of_control_are_not_logged(patch: Patch) -> None:
     patch.setattr(control_change, "control_entries", lambda *args: [])
 
 
@@ -248,11 +248,11 @@ def the_tip_is_never_retracted(patch: Patch) -> None:
     patch.setattr(Watchdog, "_endangered", lambda self, microscope: self)
 
 
-def a_danger_that_can_not_be_helped_is_never_told(patch: Patch) -> None:
+def danger_without_a_retract_is_never_logged(patch: Patch) -> None:
     patch.setattr(MicroscopeStatus, "telling", lambda self: (self, None))
 
 
-def nobody_is_called_to_a_tip_that_was_retracted(patch: Patch) -> None:
+def no_person_is_called_after_a_retract(patch: Patch) -> None:
     patch.setattr(Watchdog, "left_to_people", False)
 
 
@@ -300,24 +300,24 @@ def forgotten_ids_are_new(patch: Patch) -> None:
     patch.setattr(Floors, "is_below", lambda self, client, request_id: False)
 
 
-def everybody_has_every_role(patch: Patch) -> None:
+def every_component_has_every_role(patch: Patch) -> None:
     patch.setattr(arbitration, "may", lambda role, who: True)
 
 
 MUTANTS = [
     the_tip_is_never_retracted,
-    a_danger_that_can_not_be_helped_is_never_told,
-    nobody_is_called_to_a_tip_that_was_retracted,
+    danger_without_a_retract_is_never_logged,
+    no_person_is_called_after_a_retract,
     other_problems_are_solved_with_a_tip_that_is_away,
     the_end_does_not_wait_for_the_tip,
     the_end_never_comes,
     limits_are_not_checked,
     limits_are_decided_at_arrival,
     forgotten_ids_are_new,
-    everybody_has_every_role,
-    answers_are_written_down_once_more,
-    every_fiftieth_answer_is_not_written_down,
-    changes_of_control_are_not_written_down,
+    every_component_has_every_role,
+    answers_are_logged_twice,
+    every_fiftieth_answer_is_not_logged,
+    changes_of_control_are_not_logged,
     entries_are_held_back,
     entries_are_published_at_once,
     entries_backwards,
@@ -325,20 +325,20 @@ MUTANTS = [
     starts_are_not_saved_before_they_are_sent,
     flag_leaves_control,
     two_in_control,
-    anybody_while_flagged,
+    any_component_while_flagged,
     manual_lets_in,
     manual_leaves_control,
     solver_stays_when_solved,
-    anybody_commands,
+    any_component_commands,
     the_dead_keep_control,
     no_lease,
-    nobody_is_dead,
+    no_holder_is_ever_dead,
     an_impostor_is_let_in,
     ids_are_forgotten,
     nothing_expires,
     any_answer_will_do,
     a_former_holder_commands_on,
-    told_before_saved,
+    published_before_saved,
     times_go_back,
     doubles_of_the_translator_pass,
     replay_by_one_newest_time,
@@ -352,7 +352,7 @@ def _nights() -> None:
 
 
 def _drift_nights() -> None:
-    """Nights of a client that does not wait, and little else: a move takes the microscope's time."""
+    # nights of a client that does not wait, and little else: a move takes the microscope's time
     for seed in range(2, 26, 4):
         night = replace(_bad_night(seed), cast=("person", "burster", "adjuster"), hours=2.0, ends=True, faults=())
         DriftNight(night).run()
@@ -377,7 +377,7 @@ def test_limits_decided_at_arrival_are_found_in_sample_coordinates(monkeypatch: 
 
 
 def test_actions_that_are_not_saved_are_found_in_sample_coordinates(monkeypatch: Patch) -> None:
-    """Where the sample moves, a repeated action is sent to another place: no translator knows that it is the same."""
+    """Where the sample moves, a repeated action is sent to another place: to a translator it is a new one."""
 
     def nights() -> None:
         for seed in range(12, 15):

@@ -1,4 +1,4 @@
-"""Whole experiments in simulation, with everything that can go wrong going wrong; the invariants hold at every step."""
+"""Whole experiments in simulation with all kinds of faults; the invariants hold at every step."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def test_the_nights_are_a_few_thousand_hours() -> None:
     assert sum(plan(seed).hours_to_the_end for seeds in ALL_SEEDS for seed in seeds) >= 2000.0
 
 
-def test_the_nights_reach_what_protects_the_tip() -> None:
-    """Else the invariants on it hold of nothing."""
+def test_nights_reach_the_protection_of_the_tip() -> None:
+    """Otherwise its invariants would check nothing."""
     cast = ("experiment", "classifier", "corrector", "feedback", "person", "careless", "stranger")
     nights = [Night(Plan(seed, cast=cast, retracts=seed < 3, ends=seed % 2 == 0)) for seed in range(4)]
     for night in nights:
@@ -54,14 +54,14 @@ def test_a_quiet_night_is_full_of_scans() -> None:
     assert outcome.given_up == []
 
 
-def test_what_happens_in_a_night_is_written_down_and_orders_are_carried_out() -> None:
+def test_events_of_a_night_are_logged_and_orders_carried_out() -> None:
     night = Night(Plan(seed=4, hours=8.0, cast=("experiment", "stranger", "listener")))
     night.run()
     assert night.invariants.written.entries > 300
     assert 0 < night.teller.ordered <= night.components["experiment"].life // 2
 
 
-def test_who_has_ended_for_good_loses_control_as_soon_as_its_supervisor_tells() -> None:
+def test_ended_component_loses_control_as_soon_as_its_supervisor_reports() -> None:
     night = Night(Plan(seed=5, cast=("crasher",)))
     crasher, over_s = night.components["crasher"], math.inf
     while night.timeline.monotonic_s() < night.plan.length_s:
@@ -73,13 +73,13 @@ def test_who_has_ended_for_good_loses_control_as_soon_as_its_supervisor_tells() 
     assert over_s < math.inf
 
 
-def test_the_long_run_tells_what_it_did(capsys: pytest.CaptureFixture[str]) -> None:
+def test_long_run_prints_its_outcome(capsys: pytest.CaptureFixture[str]) -> None:
     assert long_run.main(["--nights", "2", "--seed", "5"]) == 0
     assert "every invariant held" in capsys.readouterr().out
 
 
-def test_two_changes_of_control_at_the_end_of_an_outage_are_told_one_after_the_other() -> None:
-    """The scheduler comes back, says who is in control, and finds at the same moment that its lease has run out."""
+def test_two_changes_of_control_after_an_outage_are_published_one_by_one() -> None:
+    """The scheduler comes back, publishes the holder, and finds at the same moment that its lease has run out."""
     faults = (Fault("outage", "scheduler", 0.6640625, 5.0), Fault("freeze", "scheduler", 0.84375, 5.0))
     cast = tuple(CAST)
     night = Plan(0, hours=2.0, speed=200.0, cast=cast, impostor=False, lease_s=900.0)

@@ -1,4 +1,4 @@
-"""Simulated time: what happens when, and the clock that shows it."""
+"""Simulated time: the events in their order, and the clock that shows it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _STUCK = 10_000
 
 
 class GoesInCircles(Exception):
-    """Things happen, and time stands still."""
+    """Events follow each other without time passing."""
 
 
 class Timer:
-    """Something that will happen, unless it is cancelled."""
+    """A future event, unless it is cancelled."""
 
     __slots__ = ("args", "cancelled", "do")
 
@@ -34,10 +34,10 @@ class Timer:
 
 
 class Timeline:
-    """All that is going to happen, in order. It is a `Clock` as well.
+    """All future events in their order. It is a `Clock` as well.
 
     Args:
-        seed: of all chance.
+        seed: of all random choices.
         speed: experiment seconds in a real (simulated) second.
     """
 
@@ -59,7 +59,7 @@ class Timeline:
         return self.at_ns(self._time_s)
 
     def at_ns(self, time_s: float) -> int:
-        """Experiment time at a moment of real time."""
+        """Return the experiment time at a moment of real time."""
         return _START_NS + round(time_s * self.speed * 1e9)
 
     def now_s(self) -> float:
@@ -69,24 +69,24 @@ class Timeline:
         return experiment_s / self.speed
 
     def late(self) -> AbstractContextManager[None]:
-        """Nobody is late here."""
+        """Do nothing: no process is late in simulation."""
         return nullcontext()
 
     # --- what happens ---
 
     def after(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
-        """`do(*args)` in `delay_s` real seconds; of two at the same time the one first asked for comes first."""
+        """Call `do(*args)` in `delay_s` real seconds; calls at the same time happen in the order of registration."""
         return self.at(self._time_s + delay_s if delay_s > 0.0 else self._time_s, do, args)
 
     def at(self, time_s: float, do: Callable[..., None], args: tuple[Any, ...]) -> Timer:
-        """`do(*args)` at a time that has not passed."""
+        """Call `do(*args)` at a time that has not passed."""
         timer = Timer(do, args)
         self._order = order = self._order + 1
         heapq.heappush(self._coming, (time_s, order, timer))
         return timer
 
     def step(self) -> bool:
-        """Let the next thing happen; False if there is none."""
+        """Let the next event happen; False if there is none."""
         while self._coming:
             time_s, _, timer = heapq.heappop(self._coming)
             if timer.cancelled:
@@ -101,7 +101,7 @@ class Timeline:
         return False
 
     def run_until(self, time_s: float) -> None:
-        """Let happen whatever comes before `time_s`, and go on to then."""
+        """Let all events before `time_s` happen, and advance to this time."""
         while self._coming and self._coming[0][0] <= time_s:
             self.step()
         self._time_s = max(self._time_s, time_s)

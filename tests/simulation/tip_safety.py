@@ -1,4 +1,4 @@
-"""What must hold of the tip, of limits, of roles and of the end, whatever befalls a simulated night."""
+"""The invariants of the tip, of roles and of the end, in any simulated night."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _SLACK_S = 1.0
 
 
 class TipSafety:
-    """Watches the controller itself, and who may command it.
+    """Observes the controller itself, and the right to command it.
 
-    A tip is unattended from the moment that its holder loses control otherwise than by giving it back, until a person
-    takes over, a component gets control to solve the malfunction, or it is out of danger as the next gets control.
+    A tip is unattended from the moment that its holder loses control without releasing it, until a person takes over, a
+    component gets control to solve the malfunction, or the next holder gets control with the tip out of danger.
 
     Attributes:
         retractions: how often the scheduler withdrew the tip.
         dangers: how often a tip was unattended in danger.
 
     Args:
-        must: says that an invariant is violated, if it is.
+        must: raises a violation if a condition does not hold.
     """
 
     def __init__(
@@ -55,11 +55,11 @@ class TipSafety:
         self._life = 0
 
     def disturbed(self, for_s: float) -> None:
-        """The connection between scheduler and microscope, or either of them, does not work for so long."""
+        """Note that scheduler, microscope or the connection between them do not work for a time."""
         self._disturbed_until_s = max(self._disturbed_until_s, self._timeline.monotonic_s() + for_s)
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
-        """After each step of the scheduler."""
+        """Check the state after a step of the scheduler."""
         if host.life != self._life:  # it may have been killed before what it had decided was seen
             self._life, self._before = host.life, host.core.control
             self._unattended = self._unattended and self.memory_is_certain
@@ -77,7 +77,7 @@ class TipSafety:
         self._look(host)
 
     def _ends(self, host: SchedulerHost, *, tip_is_safe: bool) -> None:
-        """The experiment waits for the tip, and says so where it could not wait any longer."""
+        # the experiment waits for the tip, and logs an end with the tip in danger
         microscope, now_s = self._microscope, self._timeline.monotonic_s()
         if not (self._unattended and microscope.endangers_tip and microscope.habits.retracts):
             return
@@ -85,7 +85,7 @@ class TipSafety:
         self._must(has_waited or self._is_disturbed(host), "the experiment ended with the tip in danger")
 
     def _forget_told(self) -> None:
-        """What people were told holds for one danger; a command that was on its way may bring that about later."""
+        # a warning holds for one danger; a command on its way may cause another later
         now_s, settings = self._timeline.monotonic_s(), self._settings
         if self._microscope.endangers_tip:
             self._safe_since_s = now_s
@@ -113,7 +113,7 @@ class TipSafety:
             self._must(may, f"{who or 'nobody'} cleared the malfunction that only a person may")
 
     def _look(self, host: SchedulerHost) -> None:
-        """A tip left in danger is withdrawn soon, or people are told."""
+        # a tip left in danger is withdrawn soon, or people are warned
         now_s = self._timeline.monotonic_s()
         if not (self._unattended and self._microscope.endangers_tip):
             self._danger_since_s = None
@@ -140,7 +140,7 @@ class TipSafety:
         return not there or self._timeline.monotonic_s() < self._disturbed_until_s
 
     def executed(self, request: Request) -> None:
-        """Before the microscope carries out a command."""
+        """Check a command before the microscope executes it."""
         subject = request.subject
         if subject == names.RETRACT and not request.id:
             self.retractions += 1
@@ -164,7 +164,7 @@ class TipSafety:
 
 
 def _who(event: Input | None, effects: Sequence[Effect]) -> str:
-    """Return who asked for what a step did; a request that waited for the scheduler's start is answered on a tick."""
+    # a request that waited for the scheduler's start is answered on a tick
     if isinstance(event, RequestIn):
         return event.name
     return next((effect.name for effect in effects if isinstance(effect, Reply) and effect.asked in _OF_CONTROL), "")

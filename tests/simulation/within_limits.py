@@ -1,4 +1,4 @@
-"""What must hold of limits: held against what the simulated microscope really has in force."""
+"""The invariants of limits, checked against the values really in force at the simulated microscope."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _SLACK = 1e-6
 
 
 class WithinLimits:
-    """Watches the controller itself: where its scan and its probe are, how far and how fast its values change.
+    """Observes the controller itself: the places of its scan and its probe, and the size and speed of changes.
 
     Attributes:
-        memory_is_certain: the scheduler was not killed before it could write down what it knows.
+        memory_is_certain: the scheduler was not killed before it could save its state.
         placed, changed: how often the microscope was set.
 
     Args:
-        must: says that an invariant is violated, if it is.
+        must: raises a violation if a condition does not hold.
     """
 
     def __init__(
@@ -43,13 +43,13 @@ class WithinLimits:
         microscope.on_placed = self.on_placed
 
     def on_placed(self) -> None:
-        """The scan's region or the probe was set."""
+        """Check the scan's region and the probe after one was set."""
         self.placed += 1
         self._must(self._contains(self._microscope.region), f"the scan is at {self._microscope.region}")
         self._must(self._is_inside(self._microscope.probe_m), f"the probe is at {self._microscope.probe_m}")
 
     def on_changed(self, name: str, before: float, now: float) -> None:
-        """The value of a parameter was set."""
+        """Check a parameter that was set."""
         self.changed += 1
         limit, change = self._limits.parameters.get(name), abs(now - before)
         since_ns, self._changed_ns[name] = self._changed_ns.get(name, 0), self._timeline.now_ns()
@@ -62,12 +62,12 @@ class WithinLimits:
             self._must(change <= allowed * (1 + _SLACK), f"{name} changed by {change:g}, allowed was {allowed:g}")
 
     def executed(self, request: Request) -> None:
-        """Before the microscope carries out a command."""
+        """Check a command before the microscope executes it."""
         if request.kind == ControlRequest.ACTION and request.subject == names.START_SCAN:
             self._must(self._contains(self._microscope.region), f"a scan begins at {self._microscope.region}")
 
     def sent(self, request: Request) -> None:
-        """A command is sent to the microscope: a use of what may be used every so often only."""
+        """Count a command sent to the microscope as a use, if its interval is limited."""
         action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
         limit, now_ns = self._limits.actions.get(action), self._timeline.now_ns()
         if limit is None or limit.interval_s is None or not request.id:

@@ -1,4 +1,4 @@
-"""What the scheduler writes down of what happens, held against what was seen to happen."""
+"""The scheduler's event log, compared with the observed events."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Told = tuple[str, int, int]
 
 @dataclass
 class _Derived:
-    """What the entries say of control."""
+    """The state of control as derived from the entries."""
 
     holder: str | None = None
     mode: str = ControlMode.AUTOMATED.name
@@ -70,11 +70,11 @@ _ANSWERED_S = 15.0
 
 
 class Written:
-    """Every answer is written down once, soon, in order, and what was published of it outlives a kill.
+    """Every answer is logged once, soon and in order, and published entries outlive a kill.
 
     Args:
-        must: says that an invariant is violated, if it is.
-        name_taken: part of the refusal of who takes another's name: it is given anew each time.
+        must: raises a violation if a condition does not hold.
+        name_taken: part of the refusal of a second client of a name: it is sent each time.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class Written:
         self._starts: dict[str, set[int]] = {}
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
-        """Before each effect."""
+        """Check an effect before it is carried out."""
         if host.life != self._life:
             self._begin(host)
         if isinstance(effect, Reply):
@@ -110,13 +110,13 @@ class Written:
             self._publish(effect.packet, at_the_end=host.core.control.ended)
 
     def executed(self, request: Request) -> None:
-        """The microscope carries out a command."""
+        """Note a command that the microscope executes."""
         if request.id and request.kind == ControlRequest.ACTION and request.subject in _STARTS:
             begun = self._started.setdefault(request.id.partition("/")[0], {})
             begun.setdefault(request.id, self._timeline.monotonic_s())
 
     def has_all_starts(self) -> None:
-        """Each measurement that was begun has the entry of its start, also where a process was killed in between."""
+        """Check that each measurement that was begun has the entry of its start, also after a kill in between."""
         answered_s = self._timeline.monotonic_s() - _ANSWERED_S
         for who, times_s in self._started.items():
             begun = sum(begun_s <= answered_s for begun_s in times_s.values())
@@ -124,7 +124,7 @@ class Written:
             self._must(written >= begun or not self.is_certain, f"{who}: {begun} begun, {written} written")
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
-        """After each step."""
+        """Check the entries after a step."""
         if host.life != self._life:
             self._begin(host)
         if any(isinstance(effect, Publish) and effect.packet.envelope == JOURNAL.name for effect in effects):
@@ -136,7 +136,7 @@ class Written:
             self._must(now_s - since_s <= PERIOD_S + _LATE_S, f"not written down: {self._awaited[0]}")
 
     def _begin(self, host: SchedulerHost) -> None:
-        """What a killed scheduler had not published is lost with it, what it had is not."""
+        # a kill loses entries that were not published, and no others
         self._life = host.life
         self._answered.clear()
         self._awaited.clear()

@@ -1,7 +1,7 @@
-"""The coordinates in which components think, where they differ from those of the microscope's tip.
+"""The coordinates of components, where they differ from those of the microscope's tip.
 
 A coordinate frame is one more part of the scheduler's state: frozen, and replaced by its own methods. The scheduler
-knows this protocol, and no frame by name; without another it has `TipFrame`, which changes nothing.
+knows this protocol, and no frame by name; by default it has `TipFrame`, which changes nothing.
 
 | the scheduler | asks the frame |
 | --- | --- |
@@ -32,13 +32,13 @@ class MappedRequest:
 
     Attributes:
         request: is sent in place of the original, with the same id.
-        names: the parameters that the client means to set; the others change with them, by the mapping alone.
-        said: the place, in both coordinates, for the reason of a refusal.
+        names: the parameters that the client sets; the others change by the mapping alone.
+        places_text: the place in both coordinates, for the reason of a refusal.
     """
 
     request: Request
     names: Collection[str]
-    said: str
+    places_text: str
 
 
 # --- outputs of a frame's step, beside inputs that are passed on ------------------------------------------------------
@@ -46,14 +46,14 @@ class MappedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Reconsider:
-    """Take an input that was kept, as if it came now: through the frame first."""
+    """Step again with an input that was kept, through the frame first."""
 
     event: Input
 
 
 @dataclass(frozen=True, slots=True)
 class AskMicroscope:
-    """Send a request in the scheduler's own name; the answer comes as `FrameAnswered` with the same purpose."""
+    """Send a request in the scheduler's own name; `FrameAnswered` returns the answer with the same purpose."""
 
     request: Request
     purpose: object
@@ -66,21 +66,21 @@ class SaveNow:
 
 @dataclass(frozen=True, slots=True)
 class HoldControl:
-    """Publish the control state after a restart no earlier than `until_s` (real): old packets are still to come."""
+    """Delay the first control state after a restart until `until_s` (real): earlier packets are still missing."""
 
     until_s: float
 
 
 FrameOutput = Input | Reconsider | AskMicroscope | SaveNow | HoldControl | Delegate | Log
-"""An input among them is taken by the scheduler without the frame."""
+"""An input among them goes to the scheduler without passing the frame again."""
 
 
 class CoordinateFrame(Protocol):
     """Maps between the coordinates of components and those of the microscope. Immutable.
 
     Attributes:
-        is_moving: whether the microscope may have to be moved before an action. The action is then remembered as sent,
-            so that it is repeated after a restart without another move.
+        is_moving: whether the microscope may have to be moved before an action. The scheduler then remembers a sent
+            action, so that it is repeated after a restart without another move.
     """
 
     is_moving: ClassVar[bool]
@@ -94,7 +94,7 @@ class CoordinateFrame(Protocol):
             control: as it is before the input.
 
         Returns:
-            The frame after the input, and everything to be done in order; an input that passes is among it.
+            The frame after the input, and its outputs in order; an input that passes is among them.
         """
         ...
 
@@ -103,37 +103,33 @@ class CoordinateFrame(Protocol):
         ...
 
     def maps(self, now_ns: int) -> bool:
-        """Return whether components are given other coordinates than those of the microscope."""
+        """Return whether components have other coordinates than the microscope."""
         ...
 
     def in_force(self, place: Region | ProbePosition, now_ns: int) -> CoordinateFrame:
-        """Take a place that was read from the microscope; the next part of a place is put onto it."""
+        """Store a place that was read from the microscope: a change of one coordinate is applied to it."""
         ...
 
     def outgoing(
         self, who: str, request: Request, now_ns: int
     ) -> tuple[CoordinateFrame, MappedRequest | Response | None]:
-        """Map a request.
+        """Map a request to the coordinates of the microscope.
 
         Returns:
-            Also None if it is sent unchanged; a response if it can't be mapped.
+            The frame, and: the mapped request; None to send the request unchanged; or a refusal if it can't be mapped.
         """
         ...
 
     def move_before(self, action: str, now_ns: int) -> tuple[CoordinateFrame, MappedRequest | None]:
-        """Return the request that must come right before an action, so that the action happens at its place.
-
-        Returns:
-            Also None if no move has to come before it.
-        """
+        """Return the move that an action needs before it, to happen at its place; None: no move."""
         ...
 
     def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> CoordinateFrame:
-        """Take a success of the microscope, and the value of a parameter in its answer."""
+        """Store a success of the microscope, and the parameter value in its answer."""
         ...
 
     def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
-        """Return the value of a parameter for its client; None: the value of the microscope's answer."""
+        """Return the parameter value for the client; None: the value in the microscope's answer."""
         ...
 
     def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[CoordinateFrame, Packet]:
@@ -148,20 +144,20 @@ class CoordinateFrame(Protocol):
         """Return the frame after a restart.
 
         Args:
-            plain: `saved()` as it comes out of a snapshot: plain data.
+            plain: `saved()` as a snapshot returns it: plain data.
 
         Raises:
-            TypeError, ValueError, KeyError: it is of another frame, or damaged.
+            TypeError, ValueError, KeyError: it belongs to another frame, or is damaged.
         """
         ...
 
     def recalled(self, packets: Iterable[LoggedPacket]) -> CoordinateFrame:
-        """Take the packets that were published before a restart, oldest first."""
+        """Store the packets that were published before a restart, oldest first."""
         ...
 
 
 class TipFrame:
-    """The coordinates of the microscope itself: all inputs pass, and nothing is mapped."""
+    """The coordinates of the microscope itself: every input passes, and nothing is mapped."""
 
     is_moving: ClassVar[bool] = False
 

@@ -1,7 +1,7 @@
 """The inputs and effects of `SchedulerCore`.
 
-Times are given beside the input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for whatever
-means something in the experiment.
+Two times come with each input: `now_s`, real and monotonic, for timeouts; `now_ns`, the experiment's, for everything
+that has a meaning in the experiment.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Disconnected:
 
 @dataclass(frozen=True, slots=True)
 class Greeted:
-    """The peer of a connection said its name and nothing else (the empty first message of ZMQ_PROBE_ROUTER)."""
+    """A peer sent its name and nothing else (the empty first message of ZMQ_PROBE_ROUTER)."""
 
     connection: int
     name: str
@@ -42,11 +42,11 @@ class Greeted:
 
 @dataclass(frozen=True, slots=True)
 class RequestIn:
-    """A request came by `connection` from the peer that calls itself `name`.
+    """A request from the peer `name` arrived by `connection`.
 
     Attributes:
-        user: whose key it was, where connections are authenticated; None where they are not.
-        heard_s: when it came first, real; negative: in this step.
+        user: the owner of the peer's key; None where connections are not authenticated.
+        heard_s: time of the first arrival, real; negative: this step.
     """
 
     connection: int
@@ -58,7 +58,7 @@ class RequestIn:
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """A message from the peer `name` was no request, and was refused with `response`."""
+    """A message from the peer `name` could not be decoded as a request, and was refused with `response`."""
 
     name: str
     response: Response
@@ -74,10 +74,10 @@ class PacketIn:
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequested:
-    """A subscriber asks for what is cached under `prefixes` and newer than `since_ns`.
+    """A subscriber asks for the cached packets under `prefixes` that are newer than `since_ns`.
 
     Attributes:
-        subscriber: whatever the caller needs to find it again; comes back in `Replay`.
+        subscriber: the caller's own handle; returned in `Replay`.
     """
 
     subscriber: Hashable
@@ -87,17 +87,17 @@ class ReplayRequested:
 
 @dataclass(frozen=True, slots=True)
 class TranslatorUp:
-    """The translator can be asked."""
+    """The translator is connected: requests can be sent."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorDown:
-    """The connection to the translator is gone."""
+    """The connection to the translator is lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorCaughtUp:
-    """All that the translator published while we were not there has been taken in."""
+    """All packets that the translator published during the scheduler's absence have been received."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,10 +110,10 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ProblemSeen:
-    """The scheduler itself sees that a problem has come, or gone.
+    """The scheduler's process found that a problem has appeared, or disappeared.
 
     Attributes:
-        name: in whose name it is flagged.
+        name: the component in whose name it is flagged.
     """
 
     problem: int
@@ -123,10 +123,11 @@ class ProblemSeen:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """The scheduler itself has something to publish.
+    """The coordinate frame publishes a packet of its own.
 
     Attributes:
-        before_ns: the translator's time of a packet that it goes before; None: it is of now.
+        before_ns: the translator's time of a packet that must come after this one; None: published with the current
+            time.
     """
 
     envelope: str
@@ -136,17 +137,17 @@ class Announced:
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """The run is stopped though the experiment is not over: this is the last that the scheduler hears."""
+    """The run is stopped before the end of the experiment: the last input of this scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Nothing happened, but a deadline (`SchedulerCore.deadline_s`) has come."""
+    """A deadline (`SchedulerCore.deadline_s`) has passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameReported:
-    """The worker of the coordinate frame has a result, or has ended; only that frame knows what is in it."""
+    """The worker of the coordinate frame has a result, or has ended; only the frame reads its content."""
 
     report: object
 
@@ -161,7 +162,7 @@ class Started:
 
 @dataclass(frozen=True, slots=True)
 class FrameAnswered:
-    """A request that the coordinate frame made has its answer."""
+    """A request of the coordinate frame was answered."""
 
     purpose: object
     response: Response
@@ -203,10 +204,10 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """Answer the peer `name`, over `connection` (which is open, and the newest of that name).
+    """Answer the peer `name` over `connection`, which is open and the newest of that name.
 
     Attributes:
-        asked: the number of the request that is answered.
+        asked: the kind of the answered request.
     """
 
     connection: int
@@ -219,7 +220,8 @@ class Reply:
 class Forward:
     """Send a request to the translator, marked with `number`.
 
-    A client's `request.payload` is sent as it came. A request of the scheduler's own has none: its subject is encoded.
+    A client's `request.payload` is sent as it came. A request of the scheduler itself has no payload: its subject is
+    encoded.
     """
 
     number: int
@@ -228,11 +230,11 @@ class Forward:
 
 @dataclass(slots=True)
 class Publish:
-    """Publish a packet to whoever subscribes to its envelope.
+    """Publish a packet to the subscribers of its envelope.
 
     Attributes:
-        source_ns: the translator's own time of it; None for what comes from the scheduler.
-        history: how many of its envelope the cache keeps over a restart; 0: this one is not in it.
+        source_ns: the translator's own time of it; None for a packet of the scheduler.
+        history: how many packets of this envelope the cache keeps over a restart; 0: this one is not cached.
     """
 
     packet: Packet
@@ -242,7 +244,7 @@ class Publish:
 
 @dataclass(slots=True)
 class Replay:
-    """Send these packets to one subscriber, in this order, and then that it has caught up."""
+    """Send these packets to one subscriber, in this order, and then the message that it has caught up."""
 
     subscriber: Hashable
     packets: tuple[Packet, ...]
@@ -250,14 +252,14 @@ class Replay:
 
 @dataclass(slots=True)
 class SaveState:
-    """Keep `state` so that it survives a kill, before the effects that follow are carried out."""
+    """Save `state`, so that it survives a kill, before the effects that follow are carried out."""
 
     state: SavedState
 
 
 @dataclass(slots=True)
 class Log:
-    """Tell people. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
+    """Write to the log. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
 
     level: str
     text: str
@@ -268,7 +270,7 @@ class Kill:
     """The experiment ends: publish the signal KILL, and close.
 
     Attributes:
-        tip_is_safe: the translator may leave; if not, it sees to the tip when it is asked to.
+        tip_is_safe: the translator may leave; if False, it retracts the tip itself when it is stopped.
     """
 
     tip_is_safe: bool = True
@@ -276,7 +278,7 @@ class Kill:
 
 @dataclass(slots=True)
 class Delegate:
-    """Hand a job to the worker of the coordinate frame; what comes of it is an input, `FrameReported`."""
+    """Hand a job to the worker of the coordinate frame; its result is the input `FrameReported`."""
 
     job: object
 
@@ -285,13 +287,13 @@ Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill | Delegate
 
 
 class Codec(Protocol):
-    """Objects to and from bytes, as decisions need them; in simulated nights a table takes the place of the wire."""
+    """Objects to and from bytes, as decisions need them; simulated nights use a table in place of the wire format."""
 
     def encode(self, thing: object) -> bytes:
         """Return a model object as the payload of a packet or an answer."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
-        """Return the ParameterMsg of a response; None if it is not one."""
+        """Return the ParameterMsg of a response; None if it can't be decoded."""
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
         """Return the object of a small packet (ScopeStatus, Feedback, ProcessStates …); None if malformed."""

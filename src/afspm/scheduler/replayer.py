@@ -1,4 +1,4 @@
-"""Stands where a scheduler did, and publishes what that had published; it decides nothing, and nobody measures."""
+"""Replays a recorded run in place of a scheduler: it publishes the packets, and refuses every command."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from afspm.transport.publisher import Publisher
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, Router
 
-REASON = "this is a replay of a recorded run: nothing can be asked of it"
-FAREWELL_S = 0.5  # real: for those who are told that it is over
+REASON = "this is a replay of a recorded run: it takes no requests"
+FAREWELL_S = 0.5  # real: for the end to reach all subscribers
 MOST_AT_ONCE = 200
 
 
@@ -61,30 +61,30 @@ class Replayer:
             self._poller.register(socket, self._answer)
         self._ended = self._stopping = False
         self.count = 0
-        """How many packets have been published."""
+        """The number of packets published."""
 
     def run(self, *, stay: bool = False) -> None:
-        """Until all is published, or `stop`; then everybody is told that the experiment has ended.
+        """Publish until the last packet or `stop`, then publish the end of the experiment.
 
         Args:
-            stay: also when all is published.
+            stay: wait for `stop` after the last packet, too.
         """
         while not self._stopping and (self._recorded.next_ns is not None or stay):
             self._serve(self._due_in_s())
             self._publish_due()
-        self._end()
+        self._publish_end()
 
     def stop(self) -> None:
-        """`run` is to return. From any thread, or a signal handler."""
+        """Make `run` return. May be called from any thread, or a signal handler."""
         self._stopping = True
         self._wake_up.post()
 
     def wakeup_fileno(self) -> int:
-        """Return a file descriptor: a write to it makes `run` look whether it is to stop."""
+        """Return a file descriptor; a write to it makes `run` check whether to stop."""
         return self._wake_up.writer_fileno()
 
-    def _end(self) -> None:
-        """Tell everybody that it is over, also those who come in this moment."""
+    def _publish_end(self) -> None:
+        # a subscriber that connects at this moment gets the end, too
         self._ended = True
         self._publisher.serve()
         self._publisher.kill()
@@ -93,7 +93,7 @@ class Replayer:
             self._serve(left_s)
 
     def close(self) -> None:
-        """Close all once what was sent has gone out. Safe to repeat."""
+        """Close all sockets once all messages are sent. Safe to repeat."""
         self._network.close()
         self._wake_up.close()
 
@@ -105,7 +105,7 @@ class Replayer:
 
     def _publish_due(self) -> None:
         for packet in islice(self._recorded.due(self._clock.now_ns()), MOST_AT_ONCE):
-            keep = not packet.envelope.startswith("ScanLines")  # as a scheduler does
+            keep = not packet.envelope.startswith("ScanLines")  # a scheduler does not cache them either
             stamped = self._published.stamp(packet.envelope, bytes(packet.payload), packet.time_ns, keep=keep)
             self._publisher.publish(stamped)
             self.count += 1
@@ -133,6 +133,6 @@ class Replayer:
         if request.kind == CLOCK_REQUEST:
             told = {**self._clock.as_dict(), "now_ns": self._clock.now_ns()}
             return Response(int(ControlResponse.SUCCESS), json.dumps(told).encode(), "", request.id)
-        if request.kind == RELAY_REQUEST:  # a supervisor of those who listen: it has nobody to tell
+        if request.kind == RELAY_REQUEST:  # a supervisor of the replay's components: nothing is published for it
             return Response(int(ControlResponse.SUCCESS), wire.encode_orders(()), "", request.id)
         return Response(int(ControlResponse.FAILURE), reason=REASON, id=request.id)

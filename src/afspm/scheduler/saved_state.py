@@ -14,7 +14,7 @@ from afspm.scheduler.safety.limit_state import LimitState
 from afspm.scheduler.safety.watchdog import RetractState
 
 KIND, VERSION = "scheduler", 2
-"""Of snapshots of `SavedState`."""
+"""Kind and version of snapshots of `SavedState`."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class SavedState:
     """The state that survives a restart.
 
     Attributes:
-        granted_to: the token of the life of the holder that was granted control.
-        lease_s: that the holder asked for.
-        sessions: the token of each session that was connected.
+        granted_to: the token of the process that was granted control.
+        lease_s: the lease that the holder requested, real.
+        sessions: the token of each connected session.
         forgotten: see `idempotency_cache.Floors`.
         last_ns: the time of the newest packet.
-        recent: (translator's time, the scheduler's) of the packets published last.
-        frame: `CoordinateFrame.saved()`; out of a file, the same as plain data.
+        recent: (translator's time, published time) of the last packets.
+        frame: `CoordinateFrame.saved()`; read from a file, the same as plain data.
     """
 
     control: ArbitrationState = field(default_factory=ArbitrationState)
@@ -56,5 +56,5 @@ class SavedState:
     frame: object = None
 
     def without_holder(self) -> SavedState:
-        """Return the state with no holder: an older state does not know the holder of now."""
+        """Return the state with no holder: an older state does not know the present one."""
         return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None, lease_s=None)

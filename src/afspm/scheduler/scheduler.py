@@ -1,4 +1,4 @@
-"""The scheduler as the host of processes runs it."""
+"""`Scheduler`: the process of the scheduler, with its settings, its files and its sockets."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Coordinates:
     """The coordinate frame of a scheduler.
 
     Attributes:
-        frame: as it is without a restart.
+        frame: its state at a first start.
         worker: takes the frame's jobs; None: it has none.
     """
 
@@ -45,10 +45,9 @@ class Coordinates:
 
 
 class Scheduler:
-    """Lets one component at a time command the microscope, and gives everybody what was published.
+    """Lets one component at a time command the microscope, and republishes all packets.
 
-    Killed and restarted it goes on where it was: mode, holder and problems, and everything that it publishes, are on
-    disk before anybody is told of them.
+    It continues after a kill and a restart. Mode, holder, problems and packets are on disk before they are published.
 
     Args:
         control: the section [control] of the experiment file: `ControlSettings` as plain data.
@@ -70,10 +69,10 @@ class Scheduler:
         self._cache = _section(CacheSettings, cache or {}, "cache")
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run until the experiment ends or we are told to stop; returns an exit code.
+        """Run until the experiment ends or the process is stopped; return an exit code.
 
         Raises:
-            AfspmError: an address, a setting or what was saved can't be used.
+            AfspmError: an address, a setting or the saved state can't be used.
         """
         launch, clock, log = context.launch, context.clock, context.log
         folder = Path(launch.state_dir) if launch.state_dir else None
@@ -120,7 +119,7 @@ class Scheduler:
         )
 
     def coordinates(self, context: ProcessContext) -> Coordinates:
-        """Return the coordinates of components: those of the tip, but for a subclass that knows others."""
+        """Return the coordinates of components: those of the tip, unless a subclass has others."""
         return Coordinates()
 
 
@@ -135,9 +134,9 @@ def _restore(core: SchedulerCore, state: StateFile, log: Path | None) -> None:
             core.restore(saved)
     except (KeyError, TypeError, ValueError) as error:
         raise FileError(
-            f"what was in force before the restart can't be understood: {error!r}",
+            f"the state saved before the restart can't be read: {error!r}",
             where=str(state.path),
-            hint="delete the file to begin with nobody in control",
+            hint="delete the file to start with control free and no problem flagged",
         ) from error
     if log is not None:
         core.restore_cache(cached_packets(log))

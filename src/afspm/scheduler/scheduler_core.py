@@ -1,4 +1,4 @@
-"""`SchedulerCore`: all that a scheduler decides, composed of the parts beside this module."""
+"""`SchedulerCore`: all decisions of a scheduler, composed of the parts beside this module."""
 
 from __future__ import annotations
 
@@ -73,28 +73,34 @@ _AT_ONCE_S = 0.0  # in real monotonic time: always past
 def step(
     state: SchedulerState, event: Input, env: Environment, now_s: float, now_ns: int
 ) -> tuple[SchedulerState, list[Effect]]:
-    """Return the state after an event, and what is to be done, in order."""
+    """Return the state after an event, and the effects in their order."""
     draft = StateDraft(state, env, now_s, now_ns)
-    _take(draft, event)
+    _dispatch(draft, event)
     while draft.raised:
-        _take(draft, draft.raised.pop(0))
+        _dispatch(draft, draft.raised.pop(0))
     request_pipeline.send_next(draft)
     if draft.control is not state.control:
-        _take(draft, ControlChanged(state.control, draft.control))
+        _dispatch(draft, ControlChanged(state.control, draft.control))
     _end_when_safe(draft)
     return draft.finish()
 
 
-def _take(draft: StateDraft, event: Input) -> None:
-    """Have the coordinate frame look at an input first: it may keep it, and add to it."""
+def _dispatch(draft: StateDraft, event: Input) -> None:
+    # the coordinate frame is first: it may keep an event back, or add others
     draft.frame, outputs = draft.frame.step(event, draft.control, draft.now_s, draft.now_ns)
     for output in outputs:
         _HANDLERS[type(output)](draft, output)
 
 
 def due_s(state: SchedulerState) -> float | None:
-    """Return when, in real monotonic time, a Tick is due at the latest."""
-    dues = (state.due_s(), _malfunction(state)[0], _entries_due_s(state), _dead_at_s(state), _unrenewed_at_s(state))
+    """Return when a Tick is due at the latest, in real monotonic time; None: no deadline."""
+    dues = (
+        state.due_s(),
+        _malfunction_due(state)[0],
+        _entries_due_s(state),
+        _holder_dead_at_s(state),
+        _lease_ends_at_s(state),
+    )
     return min((one_s for one_s in dues if one_s is not None), default=None)
 
 
@@ -106,14 +112,14 @@ class SchedulerCore:
         effects = core.start(now_s, now_ns)                  # then, for each input:
         effects = core.step(RequestIn(...), now_s, now_ns)
 
-    The host carries out the effects in their order, and steps with `Tick()` when `deadline_s` or `deadline_ns` has
-    come, however much else there is to do.
+    The host carries out the effects in their order. At `deadline_s` or `deadline_ns` it steps with `Tick()`, even while
+    other inputs wait.
 
     Args:
         frame: the coordinates of components, if they differ from those of the microscope.
 
     Attributes:
-        state: all that it decides by; replaced by every step.
+        state: all that decisions depend on, except the cache; replaced by every step.
     """
 
     def __init__(self, settings: SchedulerSettings, codec: Codec, frame: CoordinateFrame = TIP_FRAME) -> None:
@@ -122,7 +128,7 @@ class SchedulerCore:
         self._restored: SavedState | None = None
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Begin. The control state is published as soon as the translator's packets have been caught up with."""
+        """Begin. The control state is published once the translator's missed packets have come."""
         draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
         draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
         draft.watchdog = draft.watchdog.begun(now_s)
@@ -139,12 +145,12 @@ class SchedulerCore:
             draft.barrier = draft.barrier.begin(now_s, is_restart=is_restart)
             entry = start_entry(now_ns, draft.control, is_restart=is_restart)
             draft.event_log = draft.event_log.add(now_s, entry)
-        _take(draft, Started())
+        _dispatch(draft, Started())
         self.state, effects = draft.finish()
         return effects
 
     def step(self, event: Input, now_s: float, now_ns: int) -> list[Effect]:
-        """Take an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
+        """Process an event; `now_s` is real and monotonic, `now_ns` the experiment's time."""
         self.state, effects = step(self.state, event, self._env, now_s, now_ns)
         return effects
 
@@ -156,51 +162,51 @@ class SchedulerCore:
                 yield from found.entries if isinstance(found, JournalEntries) else ()
 
     def deadline_s(self) -> float | None:
-        """Return when, in real monotonic time, a Tick is due at the latest; None: no deadline."""
+        """Return when a Tick is due at the latest, in real monotonic time; None: no deadline."""
         return due_s(self.state)
 
     def deadline_ns(self) -> int | None:
-        """Return when, in experiment time, a Tick is due at the latest; None: no deadline (only a lease makes one)."""
+        """Return when a Tick is due at the latest, in experiment time; None: no deadline (only a lease makes one)."""
         return self.state.lease.deadline_ns(is_free=self.state.microscope.is_free)
 
     def snapshot(self) -> SavedState:
-        """Return what must survive a kill, but for the cache."""
+        """Return the state that must survive a kill, without the cache."""
         return saved_state(self.state, self._env)
 
     def restore(self, saved: SavedState) -> None:
-        """Take up what `snapshot` gave and a file of plain data returned, before `start`."""
+        """Restore the state of `snapshot`, read back from plain data, before `start`."""
         self._restored = saved
         self.state = restored_state(saved, self._env.settings, self.state.frame)
         self._env.cache.not_before(saved.last_ns)
 
     def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
-        """Take up packets that were published (with their `source_ns`), oldest first, before `start`."""
+        """Restore published packets (with their `source_ns`), oldest first, before `start`."""
         logged = list(packets)
         self._env.cache.restore(logged)
         self.state = replace(self.state, frame=self.state.frame.recalled(logged))
 
     def cached(self) -> Iterable[LoggedPacket]:
-        """Return what is cached now (with `source_ns`), oldest first."""
+        """Return the packets in the cache (with `source_ns`), oldest first."""
         return self._env.cache
 
     @property
     def newest_source_ns(self) -> int:
-        """The translator's newest packet that was taken in: where to subscribe from; -1 if there is none."""
+        """The time of the translator's newest packet in the cache, to subscribe from; -1 if there is none."""
         return self._env.cache.newest_source_ns
 
     @property
     def leave_at_s(self) -> float:
-        """When, in real monotonic time, the scheduler may leave after the end; inf: it has not ended."""
+        """When the scheduler leaves after the end, in real monotonic time; inf: the experiment has not ended."""
         return self.state.end.leave_at_s
 
     @property
     def control(self) -> ArbitrationState:
-        """The state of control: its holder, for which problem, and who flagged which."""
+        """The state of control: the holder, its problem, and the flagged problems with their authors."""
         return self.state.control
 
     @property
     def control_state(self) -> ControlState:
-        """The same as all peers are told it."""
+        """The state of control as it is published."""
         return self.control.published()
 
 
@@ -221,8 +227,8 @@ def _on_disconnected(draft: StateDraft, event: Disconnected) -> None:
     timeout = draft.peers.timeout
     if waiting is not None:
         request_pipeline.handle(draft, waiting)
-    elif name == draft.control.holder and draft.now_s >= timeout.told_again_s:
-        draft.peers = replace(draft.peers, timeout=timeout.told(draft.now_s))
+    elif name == draft.control.holder and draft.now_s >= timeout.next_loss_log_s:
+        draft.peers = replace(draft.peers, timeout=timeout.loss_logged(draft.now_s))
         draft.log(
             "WARNING", f"lost contact with {name}, which is in control; it has {timeout.grace_s:g} s to come back"
         )
@@ -239,7 +245,7 @@ def _on_unreadable(draft: StateDraft, event: Unreadable) -> None:
     draft.event_log = draft.event_log.add_request(draft.now_s, entry)
 
 
-def _on_subscriber(draft: StateDraft, event: ReplayRequested) -> None:
+def _on_replay_requested(draft: StateDraft, event: ReplayRequested) -> None:
     draft.effects.append(Replay(event.subscriber, draft.env.cache.replay(event.prefixes, event.since_ns)))
 
 
@@ -249,7 +255,7 @@ def _on_problem(draft: StateDraft, event: ProblemSeen) -> None:
 
 
 def _on_announced(draft: StateDraft, event: Announced) -> None:
-    # what goes before a packet must not put off its time: should that come again after a kill, it is to keep it
+    # a time just before the packet's own, so that the packet keeps its time when it comes again after a kill
     time_ns = None if event.before_ns is None else event.before_ns - TIME_STEP_NS
     publishing.publish(draft, event.envelope, event.payload, time_ns)
 
@@ -287,10 +293,10 @@ def _on_translator_caught_up(draft: StateDraft, event: TranslatorCaughtUp) -> No
 
 
 def _on_reconsidered(draft: StateDraft, output: Reconsider) -> None:
-    _take(draft, output.event)
+    _dispatch(draft, output.event)
 
 
-def _on_frame_asks(draft: StateDraft, output: AskMicroscope) -> None:
+def _on_ask_microscope(draft: StateDraft, output: AskMicroscope) -> None:
     draft.forwarder, _ = draft.forwarder.ask_own(output.request, draft.now_s, AskForFrame(output.purpose))
 
 
@@ -307,14 +313,15 @@ def _add_effect(draft: StateDraft, output: Log | Delegate) -> None:
 
 
 def _on_frame_input(draft: StateDraft, event: Input) -> None:
-    """Inputs that only a coordinate frame acts upon."""
+    # only a coordinate frame acts on these, in its `step`
+    ...
 
 
 # --- the end, and time ----------------------------------------------------------------------------------------------
 
 
 def _on_stopped(draft: StateDraft, event: Stopped) -> None:
-    """See to it that whoever resumes the run finds the tip retracted, or worse. A person in control knows."""
+    # the run may be resumed: a tip in danger is then retracted, or a person is called; a person in control knows of it
     if draft.control.mode is ControlMode.MANUAL:
         return
     danger = draft.microscope.danger
@@ -325,7 +332,6 @@ def _on_stopped(draft: StateDraft, event: Stopped) -> None:
 
 
 def _end_when_safe(draft: StateDraft) -> None:
-    """End the experiment that is over, once the tip is out of danger or that takes too long."""
     owes_retract, kept = draft.watchdog.owes_retract, draft.end.kept
     if not draft.end.is_due(draft.now_s, owes_retract=owes_retract):
         return
@@ -334,7 +340,8 @@ def _end_when_safe(draft: StateDraft) -> None:
         draft.log("CRITICAL", "the experiment ended with the tip in danger: the microscope did not retract it")
     for event, code, why, detail in kept:
         newest = draft.peers.sessions.connection_of(event.name)
-        if event.request.id and newest is not None:  # a client that lost its connection asks again by another
+        # a client that lost its connection repeats its request over a new one
+        if event.request.id and newest is not None:
             event = replace(event, connection=newest)
         answers.answer(draft, event, code, why, detail=detail)
     draft.send_forwards()
@@ -343,24 +350,24 @@ def _end_when_safe(draft: StateDraft) -> None:
 
 
 def _on_tick(draft: StateDraft, event: Tick) -> None:
-    _see_to_deadlines(draft)
+    _handle_deadlines(draft)
     entries_due_s = _entries_due_s(draft)
     if entries_due_s is not None and draft.now_s >= entries_due_s:
         publishing.publish_entries(draft)
 
 
-def _see_to_deadlines(draft: StateDraft) -> None:
-    # one change of control in a step: it is saved and told before the next is decided
-    for see_to in (_open_barrier, _flag_malfunction, _have_watchdog_look):
+def _handle_deadlines(draft: StateDraft) -> None:
+    # at most one change of control in a step: it is saved and published before the next is decided
+    for see_to in (_open_barrier, _flag_malfunction, _run_watchdog):
         if see_to(draft):
             return
-    if (holder := draft.control.holder) is not None and _has_come(_dead_at_s(draft), draft.now_s):
+    if (holder := draft.control.holder) is not None and _is_due(_holder_dead_at_s(draft), draft.now_s):
         control_change.decide(draft, ControlInput(ArbitrationEvent.DEAD, holder))
     lease_ns = draft.lease.deadline_ns(is_free=draft.microscope.is_free)
-    is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _has_come(_unrenewed_at_s(draft), draft.now_s)
+    is_idle = (lease_ns is not None and draft.now_ns >= lease_ns) or _is_due(_lease_ends_at_s(draft), draft.now_s)
     if (holder := draft.control.holder) is not None and is_idle:
         control_change.decide(draft, ControlInput(ArbitrationEvent.IDLE, holder))
-    for name in draft.pending.still_unclear(draft.now_s):  # both connections go on: they are two
+    for name in draft.pending.still_unclear(draft.now_s):  # both connections stay open: they belong to two processes
         draft.pending, waiting = draft.pending.clear_up(name)
         if waiting is not None:
             request_pipeline.refuse_second(draft, waiting)
@@ -370,7 +377,7 @@ def _see_to_deadlines(draft: StateDraft) -> None:
 
 
 def _open_barrier(draft: StateDraft) -> bool:
-    if _has_come(draft.barrier.until_s, draft.now_s):
+    if _is_due(draft.barrier.until_s, draft.now_s):
         publishing.publish_control(draft)
         return True
     draft.barrier, kept = draft.barrier.let_in()
@@ -380,8 +387,8 @@ def _open_barrier(draft: StateDraft) -> bool:
 
 
 def _flag_malfunction(draft: StateDraft) -> bool:
-    at_s, told_by = _malfunction(draft)
-    if not _has_come(at_s, draft.now_s):
+    at_s, told_by = _malfunction_due(draft)
+    if not _is_due(at_s, draft.now_s):
         return False
     if told_by == SCHEDULER:
         draft.watchdog = draft.watchdog.people_called()
@@ -390,8 +397,8 @@ def _flag_malfunction(draft: StateDraft) -> bool:
     return True
 
 
-def _have_watchdog_look(draft: StateDraft) -> bool:
-    if not _has_come(draft.watchdog.due_s, draft.now_s):
+def _run_watchdog(draft: StateDraft) -> bool:
+    if not _is_due(draft.watchdog.due_s, draft.now_s):
         return False
     is_seen_to = draft.control.sees_to_tip
     draft.watchdog, told = draft.watchdog.look_again(draft.microscope, draft.now_s, is_seen_to=is_seen_to)
@@ -401,17 +408,17 @@ def _have_watchdog_look(draft: StateDraft) -> bool:
     return True
 
 
-def _has_come(due_s: float | None, now_s: float) -> bool:
+def _is_due(due_s: float | None, now_s: float) -> bool:
     return due_s is not None and now_s >= due_s
 
 
 def _entries_due_s(state: SchedulerState | StateDraft) -> float | None:
-    """Return when the event log is to be published; not while what was before a restart may still come again."""
+    # not before the startup barrier opens: older entries may still be published by then
     return None if state.barrier.until_s is not None else state.event_log.due_s
 
 
-def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
-    """Return when control is taken from a holder that is gone, after what was before a restart is told."""
+def _holder_dead_at_s(state: SchedulerState | StateDraft) -> float | None:
+    # not before the startup barrier opens: the state of before the restart is published first
     holder, told_at_s = state.control.holder, state.barrier.until_s
     if holder is None:
         return None
@@ -419,15 +426,14 @@ def _dead_at_s(state: SchedulerState | StateDraft) -> float | None:
     return dead_at_s if dead_at_s is None or told_at_s is None else max(dead_at_s, told_at_s)
 
 
-def _unrenewed_at_s(state: SchedulerState | StateDraft) -> float | None:
-    """Return when control is taken from a holder that does not renew its lease, after what was before a restart."""
+def _lease_ends_at_s(state: SchedulerState | StateDraft) -> float | None:
+    # not before the startup barrier opens: the state of before the restart is published first
     until_s, told_at_s = state.lease.asked_until_s(), state.barrier.until_s
     return until_s if until_s is None or told_at_s is None else max(until_s, told_at_s)
 
 
-def _malfunction(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
-    """Return when a problem is made of it that the microscope can't be used, and in whose name; None: it can, or it is
-    flagged already."""
+def _malfunction_due(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
+    # (when device-malfunction is to be flagged, or None; in whose name)
     if _MALFUNCTION in state.control.problems or state.control.ended:
         return None, ""
     return (_AT_ONCE_S, SCHEDULER) if state.watchdog.left_to_people else (state.microscope.lost_at_s, TRANSLATOR)
@@ -441,7 +447,7 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     Connected: _on_connected,
     Disconnected: _on_disconnected,
     Greeted: _on_greeted,
-    ReplayRequested: _on_subscriber,
+    ReplayRequested: _on_replay_requested,
     TranslatorUp: _on_translator_up,
     TranslatorDown: _on_translator_down,
     TranslatorCaughtUp: _on_translator_caught_up,
@@ -450,7 +456,7 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     Stopped: _on_stopped,
     Tick: _on_tick,
     Reconsider: _on_reconsidered,
-    AskMicroscope: _on_frame_asks,
+    AskMicroscope: _on_ask_microscope,
     HoldControl: _on_hold_control,
     SaveNow: _on_save_now,
     Log: _add_effect,
@@ -460,4 +466,4 @@ _HANDLERS: dict[type, Callable[[StateDraft, Any], None]] = {
     FrameAnswered: _on_frame_input,
     ControlChanged: _on_frame_input,
 }
-"""By the type of an input or of a frame's output."""
+"""The handler for each type of input and of frame output."""

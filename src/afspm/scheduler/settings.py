@@ -76,18 +76,17 @@ class ControlSettings:
     __pydantic_config__: ClassVar[object] = SECTION
 
     def rules(self, problems: ProblemNames) -> Rules:
-        """Return the part that the table of arbitration needs.
+        """Return the part that the arbitration table needs.
 
         Raises:
             InvalidValue: an unknown problem in `end_on`.
         """
         roles, end = self.roles, self.roles.end_experiment
-        if end is not None:  # a supervisor ends the experiment when nothing that acts is left
+        if end is not None:  # a supervisor ends the experiment when no component that can act is left
             roles = replace(roles, end_experiment=(*end, SUPERVISOR))
         return Rules(roles, problems, frozenset(self.adjustable), frozenset(map(problems.number, self.end_on)))
 
     def watchdog(self) -> WatchdogSettings:
-        """Return when the watchdog acts."""
         default = WatchdogSettings()
         spared = set[Cause]()
         if not self.stop_scan_on_problem:
@@ -103,13 +102,13 @@ class ControlSettings:
 
 @dataclass(frozen=True)
 class Waits:
-    """How long the scheduler waits for what may still come, in real time.
+    """The scheduler's waits, in real time.
 
     Attributes:
-        restart_grace_s: how long a holder stays in control that was not connected since a restart of the scheduler.
-        answer_s: how much longer the line to the translator is kept for an answer that is overdue.
-        takeover_s: see `Sessions`.
-        catch_up_s: how long a scheduler waits at its start for packets that the translator published before.
+        restart_grace_s: how long a holder stays in control that has not connected since a restart of the scheduler.
+        answer_s: how much longer the line to the translator is kept for an overdue answer.
+        takeover_s: see `model.sessions.SessionTable`.
+        catch_up_s: how long a starting scheduler waits for packets that the translator published before.
         longest_queue: how many requests may wait for the translator.
     """
 
@@ -122,12 +121,12 @@ class Waits:
 
 @dataclass(frozen=True)
 class RunFacts:
-    """The facts of a run that the scheduler answers to `CLOCK_REQUEST`.
+    """The facts of a run in the scheduler's answer to `CLOCK_REQUEST`.
 
     Attributes:
         clock: `ExperimentClock.as_dict()`; empty: real time.
         name: the identity of the run; empty: it has none.
-        simulated: whether the microscope is.
+        simulated: whether the microscope is simulated.
         versions: of the programs on this computer.
     """
 
@@ -142,8 +141,9 @@ class SchedulerSettings:
     """The settings of a scheduler's decisions.
 
     Attributes:
-        rules, watchdog: as `control` says; see its methods.
-        cache_bytes: how much is cached at most.
+        rules: `control.rules(problems)`.
+        watchdog: `control.watchdog()`.
+        cache_bytes: the largest size of the cache.
     """
 
     control: ControlSettings = field(default_factory=ControlSettings)

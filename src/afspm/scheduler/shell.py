@@ -1,4 +1,4 @@
-"""Sockets and disk around the scheduler's decisions: what comes in becomes inputs, effects are carried out."""
+"""Sockets and disk around the scheduler's decisions: messages become inputs, and effects are carried out."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
 
 _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
-"""How late a deadline may be noticed while messages come: to ask for the next one after each takes as long as some of
-them do."""
+"""How late a deadline may be noticed while messages come: computing the next deadline after each message would cost as
+much as processing some of them."""
 _TOGETHER_BYTES = 1 << 20
-"""Packets are written down together up to this size: a first one must not wait long for the others."""
+"""Packets are written together up to this size: the first one must not wait long for the others."""
 _WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBLM]))
-"""Requests that are still written down after the end."""
+"""Requests that are still recorded after the end."""
 
 
 class FrameWorker(Protocol):
-    """The worker of a coordinate frame. It has threads or processes of its own: no call waits.
+    """The worker of a coordinate frame. It has threads or processes of its own, so no call waits.
 
     Attributes:
         wake: called from any thread when there is a report.
@@ -57,16 +57,16 @@ class FrameWorker(Protocol):
         ...
 
     def reports(self) -> Iterable[object]:
-        """Yield the reports since the last call, oldest first; the next one once the last was handled."""
+        """Yield the reports since the last call, oldest first; a report is handled before the next is taken."""
         ...
 
     def close(self) -> None:
-        """End it."""
+        """Stop the worker."""
         ...
 
 
 class SchedulerShell:
-    """One scheduler at work: `start`, then `handle` what `wait` returns until it is `over`."""
+    """A running scheduler: `start`, then `handle` the result of `wait` until it is `over`."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class SchedulerShell:
         self._warnings = warnings
         self._log = log
         self._replay: tuple[Packet, ...] = ()
-        self._look_at_s = 0.0  # at the deadlines, in real monotonic time
+        self._next_deadline_s = 0.0  # at the deadlines, in real monotonic time
         self.ended = False
         self._tip_is_safe = True
         self._worker = worker
@@ -97,79 +97,77 @@ class SchedulerShell:
         self._carry_out(self._core.start(self._clock.monotonic_s(), self._clock.now_ns()))
 
     def wait(self) -> list[Source]:
-        """Wait for whatever comes first, a message or a deadline."""
-        next_s = min(self._core.leave_at_s if self.ended else self._look_at_s, self._sockets.router.due_s)
+        """Wait for a message or a deadline, and return the sources that are ready."""
+        next_s = min(self._core.leave_at_s if self.ended else self._next_deadline_s, self._sockets.router.due_s)
         timeout_s = next_s - self._clock.monotonic_s()
         return self._sockets.wait(None if timeout_s == math.inf else milliseconds(timeout_s))
 
     @property
     def over(self) -> bool:
-        """The experiment has ended, and nobody is waited for any more."""
+        """The experiment has ended, and the grace period after it."""
         return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
     def handle(self, ready: list[Source]) -> None:
-        """See to what has come, and to the deadlines."""
+        """Process incoming messages, then expired deadlines."""
         if self.ended:
-            self._handle_late(ready)
+            self._handle_after_end(ready)
             return
         for report in () if self._worker is None else self._worker.reports():
-            self._take(events.FrameReported(report))
+            self._step_with(events.FrameReported(report))
         sockets = self._sockets
         for source in ready:
             if source in (sockets.router, sockets.router.monitor):
-                self._requests()
+                self._receive_requests()
             elif source is sockets.link:
                 heard = sockets.link.receive()
                 if heard is not None:
-                    self._take(events.TranslatorReply(heard.number, _response(heard)))
+                    self._step_with(events.TranslatorReply(heard.number, _response(heard)))
             elif source is sockets.subscriber:
-                self._packets()
+                self._receive_packets()
             elif source is sockets.publisher:
                 sockets.publisher.serve()
             elif source is sockets.subscriber.monitor:
                 sockets.subscriber.follow()
             else:
                 for change in sockets.link.follow():
-                    self._take(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
+                    self._step_with(events.TranslatorUp() if isinstance(change, LinkUp) else events.TranslatorDown())
         now_s = self._clock.monotonic_s()
         if now_s >= sockets.router.due_s:
-            self._requests()
-        if now_s >= self._look_at_s:
+            self._receive_requests()
+        if now_s >= self._next_deadline_s:
             self._deadlines(now_s)
-        elif now_s + _LATE_S < self._look_at_s:
-            self._look_at_s = now_s + _LATE_S  # what has come may have set an earlier one
+        elif now_s + _LATE_S < self._next_deadline_s:
+            self._next_deadline_s = now_s + _LATE_S  # the messages may have set an earlier deadline
 
-    def _handle_late(self, ready: list[Source]) -> None:
-        """After the end: nothing happens any more, but whoever comes is told so."""
+    def _handle_after_end(self, ready: list[Source]) -> None:
+        # after the end no request is decided: each is answered that the experiment has ended
         sockets = self._sockets
         for source in ready:
             if source is sockets.publisher:
                 if sockets.publisher.serve():
                     sockets.publisher.kill()
             elif source in (sockets.router, sockets.router.monitor):
-                self._requests()
+                self._receive_requests()
             elif source is sockets.link:
                 sockets.link.receive()
             elif source is sockets.link.monitor:
                 if any(isinstance(change, LinkUp) for change in sockets.link.follow()):
-                    self._let_translator_go()
+                    self._close_translator()
             elif source is sockets.subscriber:
                 sockets.subscriber.receive()
             else:
                 sockets.subscriber.follow()
         if self._clock.monotonic_s() >= sockets.router.due_s:
-            self._requests()
+            self._receive_requests()
 
-    def _let_translator_go(self) -> None:
-        """End the translator, which subscribes to nothing.
-
-        One whose tip is in danger is left to find that the scheduler is gone: then it sees to the tip by itself.
-        """
+    def _close_translator(self) -> None:
+        # a translator subscribes to nothing, so CLOSE is sent to it. With a tip in danger it gets none: it retracts the
+        # tip by itself when it is stopped or its parent has gone
         if self._tip_is_safe:
             self._sockets.link.send(0, [wire.CLOSE])
 
-    def _asked_late(self, asked: RouterEvent) -> None:
-        """Take the last words of a supervisor, and problems that were seen too late; answer that it is over."""
+    def _request_after_end(self, asked: RouterEvent) -> None:
+        # final process states, and problems seen after the end, still belong in the record
         if not isinstance(asked, PeerAsked) or not asked.frames:
             return
         if asked.frames[0] in _WRITTEN_DOWN_LATE:
@@ -179,39 +177,39 @@ class SchedulerShell:
         self._answer(asked, Response(ControlResponse.FAILURE, b"", HAS_ENDED, wire.id_of(asked.frames), ended))
 
     def stop(self) -> None:
-        """See to what must be known to whoever resumes the run, unless the experiment is over."""
+        """Save the duty towards a tip in danger for a resumed run, unless the experiment has ended."""
         if not self.ended:
-            self._take(events.Stopped())
+            self._step_with(events.Stopped())
 
     def close(self) -> None:
-        """End the frame's worker, and make sure of what was written."""
+        """Stop the frame's worker, and flush the files."""
         if self._worker is not None:
             self._worker.close()
         self._write_ahead.close()
 
     # --- what comes in ---
 
-    def _take(self, event: events.Input) -> None:
+    def _step_with(self, event: events.Input) -> None:
         self._carry_out(self._decide(event))
 
     def _decide(self, event: events.Input) -> list[events.Effect]:
         return self._core.step(event, self._clock.monotonic_s(), self._clock.now_ns())
 
-    def _requests(self) -> None:
+    def _receive_requests(self) -> None:
         for event in self._sockets.router.receive():
             if self.ended:
-                self._asked_late(event)
+                self._request_after_end(event)
             elif isinstance(event, PeerAsked):
                 self._request(event)
             elif isinstance(event, PeerConnected):
-                self._take(events.Connected(event.connection))
+                self._step_with(events.Connected(event.connection))
             else:
-                self._take(events.Disconnected(event.connection))
+                self._step_with(events.Disconnected(event.connection))
 
     def _request(self, asked: PeerAsked) -> None:
         name = asked.name
         if not asked.frames:
-            self._take(events.Greeted(asked.connection, name, asked.user))
+            self._step_with(events.Greeted(asked.connection, name, asked.user))
             return
         try:
             request = wire.decode_request(asked.frames)
@@ -219,7 +217,7 @@ class SchedulerShell:
             self._warnings.warning(f"refused a request of {name or 'a nameless peer'}: {error}")
             response = Response(error.response, reason=str(error), id=wire.id_of(asked.frames))
             self._answer(asked, response)
-            self._take(events.Unreadable(name, response))
+            self._step_with(events.Unreadable(name, response))
             return
         now_s = self._clock.monotonic_s()
         event = events.RequestIn(asked.connection, name, request, asked.user, now_s)
@@ -228,11 +226,9 @@ class SchedulerShell:
     def _answer(self, asked: PeerAsked, response: Response) -> None:
         self._reply(events.Reply(asked.connection, asked.name, response))
 
-    def _packets(self) -> None:
-        """Take in the translator's packets; several small ones are written down together, then published.
-
-        To hand one to the disk's thread and wait takes as long as to receive and publish it.
-        """
+    def _receive_packets(self) -> None:
+        # small packets go to the disk's thread together: handing one over and waiting takes as long as receiving and
+        # publishing it
         effects, size = list[events.Effect](), 0
         for incoming in self._sockets.subscriber.receive():
             if isinstance(incoming, CaughtUp):
@@ -254,13 +250,13 @@ class SchedulerShell:
 
     def _history(self, subscriber: Hashable, prefixes: tuple[str, ...], since_ns: int) -> Iterable[Packet]:
         self._replay = ()
-        self._take(events.ReplayRequested(subscriber, prefixes, since_ns))
+        self._step_with(events.ReplayRequested(subscriber, prefixes, since_ns))
         return self._replay
 
     def _deadlines(self, now_s: float) -> None:
         if self._core_due_s() <= now_s:
-            self._take(events.Tick())
-        self._look_at_s = self._core_due_s()
+            self._step_with(events.Tick())
+        self._next_deadline_s = self._core_due_s()
 
     def _core_due_s(self) -> float:
         due_s = self._core.deadline_s()
@@ -274,7 +270,8 @@ class SchedulerShell:
     def _carry_out(self, effects: Iterable[events.Effect]) -> None:
         sockets = self._sockets
         effects = [*effects]
-        self._write_down(effects)
+        # first: a kill between two effects must leave nothing published that a restart does not know
+        self._persist(effects)
         for effect in effects:
             match effect:
                 case events.Reply():
@@ -291,17 +288,16 @@ class SchedulerShell:
                     assert self._worker is not None, "a frame with jobs has a worker"
                     self._worker.take(effect.job)
                 case events.Kill():
-                    sockets.publisher.serve()  # whoever subscribes at this moment is to hear it too
+                    sockets.publisher.serve()  # a subscriber that connects at this moment gets the end, too
                     sockets.publisher.kill()
                     self._tip_is_safe = effect.tip_is_safe
-                    self._let_translator_go()
+                    self._close_translator()
                     self.ended = True
 
     def _reply(self, reply: events.Reply) -> None:
         self._sockets.router.reply(reply.connection, wire.encode_response(reply.response))
 
-    def _write_down(self, effects: list[events.Effect]) -> None:
-        """Write what must outlive a crash before anybody is told."""
+    def _persist(self, effects: list[events.Effect]) -> None:
         entries: list[LoggedPacket] = []
         state: SavedState | None = None
         over = self.ended
@@ -309,7 +305,7 @@ class SchedulerShell:
             if isinstance(effect, events.SaveState):
                 state = effect.state
             elif isinstance(effect, events.Publish):
-                # last words are recorded; a scheduler that is started again must not find the end in its cache
+                # packets after the end are recorded, but not cached: a resumed run must not replay its end
                 entries.append(LoggedPacket(effect.packet, effect.source_ns, 0 if over else effect.history))
             elif isinstance(effect, events.Kill):
                 over = True

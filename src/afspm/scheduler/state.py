@@ -1,4 +1,4 @@
-"""The state of a scheduler: a tree of frozen parts, the draft of its next state, and its way over a restart."""
+"""The state of a scheduler: a tree of frozen parts, the draft of its next state, and its snapshot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from afspm.model.idempotency_cache import IdempotencyCache
 from afspm.model.microscope_status import MicroscopeStatus
 from afspm.model.sessions import SessionTable
 from afspm.scheduler.control.arbitration import ArbitrationState
-from afspm.scheduler.control.hand_settings import HandSettings
+from afspm.scheduler.control.descriptions import HandSettings
 from afspm.scheduler.control.holder_timeout import HolderTimeout, Lease
 from afspm.scheduler.control.lifecycle import ExperimentEnd, StartupBarrier
 from afspm.scheduler.control.supervisor_registry import SupervisorRegistry
@@ -28,7 +28,7 @@ from afspm.scheduler.settings import SchedulerSettings
 
 @dataclass(frozen=True)
 class Peers:
-    """The processes of the experiment, as far as they are there.
+    """The processes of the experiment, as far as known.
 
     Attributes:
         timeout: the grace period of a holder without a connection.
@@ -47,7 +47,7 @@ class Peers:
 
 @dataclass(frozen=True)
 class SchedulerState:
-    """All that a scheduler decides by, but for the packets in its cache.
+    """All that a scheduler's decisions depend on, except the packets in its cache.
 
     Attributes:
         logged: texts that are logged only once.
@@ -92,12 +92,12 @@ class SchedulerState:
         )
 
     def saved_parts(self) -> tuple[object, ...]:
-        """The parts of which every change is saved before it is told."""
+        """The parts whose changes are saved before they are published."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
         return *saved, self.limits.state.usage, self.idempotency.sent_actions, self.event_log.starts
 
     def due_s(self) -> float | None:
-        """Return when, in real monotonic time, a part has something to do that depends on no other."""
+        """Return the earliest deadline, in real monotonic time, of the parts that do not depend on others."""
         dues = (
             self.forwarder.deadline_s(),
             self.barrier.due_s(),
@@ -114,8 +114,7 @@ class Environment:
     """Everything that a step needs beside the state.
 
     Attributes:
-        cache: the packets published lately; the one part that is changed in place, since it holds up to all memory that
-            it may.
+        cache: the packets published last; the one part that changes in place, since it may hold hundreds of megabytes.
     """
 
     settings: SchedulerSettings
@@ -124,7 +123,7 @@ class Environment:
 
 
 class StateParts:
-    """The parts of a state while a step replaces them, one after the other."""
+    """The parts of a state, replaced one after the other during a step."""
 
     control: ArbitrationState
     lease: Lease
@@ -151,8 +150,8 @@ class StateDraft(StateParts):
 
     Attributes:
         now_s: real and monotonic, for timeouts.
-        now_ns: of the experiment, for whatever means something in it.
-        raised: inputs that this step has raised itself; the frame takes them within it.
+        now_ns: of the experiment, for everything that has a meaning in it.
+        raised: inputs raised by this step; the frame processes them within it.
     """
 
     def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
@@ -166,7 +165,7 @@ class StateDraft(StateParts):
         self._is_to_be_saved = False
 
     def save(self) -> None:
-        """Have the state saved, though no part changed of which every change is."""
+        """Save the state after this step even if none of its `saved_parts` changed."""
         self._is_to_be_saved = True
 
     def log(self, level: str, text: str) -> None:
@@ -178,7 +177,7 @@ class StateDraft(StateParts):
             self.forwarder = replace(self.forwarder, outbox=())
 
     def finish(self) -> tuple[SchedulerState, list[Effect]]:
-        """Return the new state and the effects: first of all it is saved, and requests are sent last."""
+        """Return the new state and the effects: saving comes first, requests to the translator come last."""
         self.send_forwards()
         parts = self.__dict__
         state = replace(self._before, **{name: parts[name] for name in _PARTS})
@@ -210,10 +209,10 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
 def restored_state(
     saved: SavedState, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME
 ) -> SchedulerState:
-    """Return the state in which a scheduler goes on after a restart.
+    """Return the state of a scheduler after a restart.
 
     Args:
-        frame: as it is without a restart.
+        frame: its state at a first start.
     """
     state = SchedulerState.initial(settings, frame.restored(saved.frame))
     sessions, supervisors = (

@@ -1,4 +1,4 @@
-"""The state that survives a kill: a small file of JSON lines, of which the last holds."""
+"""The state that survives a kill: a small file of JSON lines; the last line is valid."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 
 
 class StateFile:
-    """Holds mode, holder, problems …; what it holds was written before anybody was told.
+    """Stores mode, holder, problems …, each time before they are published.
 
     Args:
-        path: of the file; None: nothing is kept.
+        path: of the file; None: nothing is stored.
     """
 
     def __init__(self, path: Path | None, log: logging.Logger) -> None:
         self.path = path
         self._generations = None if path is None else CheckpointFile(path)
         self._log = log
-        self._told = OutageLog("a restart would not know what is in force now", log)
+        self._outage = OutageLog("a restart would not know the present state", log)
 
     def load(self) -> SavedState | None:
-        """Return what was saved last; None if nothing was.
+        """Return the state saved last; None if none was.
 
-        If that is damaged, as a power cut may leave it, the generation before is taken up: the mode, and the problems
-        that stand, but nobody in control. Who was then may not be now, and asks again.
+        If a power cut has damaged it, the generation before is used, with its mode and problems, but without a holder:
+        the holder may have changed since, and requests control again.
 
         Raises:
-            FileError: neither can be read. To begin without a problem that is flagged could cost a tip.
+            FileError: neither can be read. Starting without a flagged problem could cost a tip.
         """
         if self.path is None:
             return None
@@ -45,17 +45,17 @@ class StateFile:
         return state.without_holder()
 
     def save(self, state: SavedState) -> None:
-        """Write it down; when this returns it outlives a kill.
+        """Write the state, so that it outlives a kill.
 
-        A disk that is full must not end the experiment: it is said, and the experiment goes on.
+        A full disk must not end the experiment: the outage is logged, and the experiment goes on.
         """
         if self._generations is None:
             return
-        with self._told.trying():
+        with self._outage.trying():
             self._generations.save(json.dumps(snapshot(state, KIND, VERSION), ensure_ascii=False).encode())
 
     def close(self) -> None:
-        """Make sure that what was saved last is on the disk."""
+        """Flush the last state to the disk."""
         if self._generations is not None:
             self._generations.close()
 

@@ -1,4 +1,4 @@
-"""The wire, as far as the scheduler's decisions need it."""
+"""The wire format, as far as the scheduler's decisions need it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from afspm.model import Parameter
 
 
 class WireCodec:
-    """The wire as `scheduler.events.Codec` asks for it."""
+    """The codec of the wire format for `scheduler.events.Codec`."""
 
     def decode_parameter(self, payload: bytes) -> Parameter | None:
         try:
@@ -20,6 +20,7 @@ class WireCodec:
         return wire.encode(thing)[1]
 
     def decode_packet(self, message: str, payload: bytes | memoryview) -> object:
+        # a malformed payload is published all the same: only decisions ignore it
         try:
             return wire.decode(message, payload)
         except AfspmError:

@@ -1,4 +1,4 @@
-"""The state and the packets that the scheduler writes before it publishes them."""
+"""The write-ahead log: state and packets are on disk before the scheduler publishes them."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from afspm.storage.atomic import OutageLog
 from afspm.storage.disk import DEADLINE_S, SYNCER, DiskBacklogFull, DiskThread
 from afspm.storage.packet_log import PacketLog
 
-_CLOSED_WITHIN_S = 5.0
+_CLOSED_WITHIN_S = 5.0  # real; a hanging disk must not keep the process from ending
 
 
 class WriteAhead:
-    """Writes in a thread, and waits for the disk a moment at most: control must not wait for it.
+    """Writes in a thread, and waits only for a moment: a slow disk must not delay control.
 
-    A disk that is full or hangs is logged, and the experiment goes on. What could not be written then is written once
-    there is room, as far as it is still cached.
+    A full or hanging disk is logged, and the experiment goes on. Entries that could not be written are written later,
+    as far as they are still cached.
 
     Args:
-        log: None: no packets are kept.
-        cached: returns what is in the scheduler's cache.
+        log: None: no packets are stored.
+        cached: returns the packets in the scheduler's cache.
     """
 
     def __init__(
@@ -38,13 +38,13 @@ class WriteAhead:
         self._log = log
         self._cached = cached
         self._disk = DiskThread()
-        self._outage = OutageLog("what is told now would be lost in a crash", logger)
+        self._outage = OutageLog("what is published now would be lost in a crash", logger)
         self._given_up = OutageLog("packets are given up that are not recorded yet", logger)
         self._missed_ns: int | None = None
         self._problems: frozenset[int] = frozenset()
 
     def write(self, state: SavedState | None, entries: Sequence[LoggedPacket]) -> None:
-        """Save the state and append the packets; problems that are new are on the disk then, too."""
+        """Save the state and append the packets; new problems are flushed to the disk."""
         if state is None and not entries:
             return
         entries = [*self._missed(entries), *entries]
@@ -60,12 +60,13 @@ class WriteAhead:
             except DiskBacklogFull:
                 self._note_missed(entries)
                 raise
+            # a power cut must not lose a flagged problem: resumed without it, the run could cost a tip
             if state is not None and self._has_new_problems(state):
                 SYNCER.now(DEADLINE_S)
             self._clean()
 
     def close(self) -> None:
-        """Make sure of what was written, if that does not take too long."""
+        """Flush and close the files, if that does not take too long."""
         with contextlib.suppress(OSError):
             if self._log is not None:
                 self._disk.run(self._log.close)
@@ -73,7 +74,7 @@ class WriteAhead:
         self._disk.close(_CLOSED_WITHIN_S)
 
     def _append(self, entries: Sequence[LoggedPacket]) -> None:
-        """In the disk's thread."""
+        # runs in the disk's thread
         if self._log is None:
             return
         for number, entry in enumerate(entries):
@@ -88,11 +89,11 @@ class WriteAhead:
         self._missed_ns = min(times if self._missed_ns is None else [self._missed_ns, *times], default=None)
 
     def _missed(self, entries: Sequence[LoggedPacket]) -> list[LoggedPacket]:
-        """Return what is to be appended again before `entries`, since it could not be."""
         missed_ns, self._missed_ns = self._missed_ns, None
         if missed_ns is None:
             return []
         new = {entry.packet.time_ns for entry in entries}
+        # the cache bounds how much a hanging disk may hold back
         since = [entry for entry in self._cached() if (entry.packet.time_ns or 0) >= missed_ns]
         return [entry for entry in since if entry.packet.time_ns not in new]
 

@@ -1,19 +1,18 @@
-"""`Activity`: the measurement that runs at a maker's program, from its begin to its file.
+"""`Activity`: the measurement that runs at a maker's program, from its start to its file.
 
-Theory of operation. A program is looked at again and again (`status`), and most do not report that anything began or
-ended. The life of a measurement is the same with all of them:
+Theory of operation. A program is polled (`status`), and most programs do not report that a measurement began or ended.
+The life of a measurement is the same with all of them:
 
 | step | by |
 | --- | --- |
 | it begins: on request, or at the panel, where only the next look shows it | `begin`, `follow` |
-| it settles: a request is answered once the measurement is seen running, or its file is there | `settle` |
-| it ends: nothing is seen running any more, and its file is awaited from then on | `follow`, `end` |
-| it is stopped on request: a rest that still runs is not taken for another measurement, and has no result | `stopped` |
-| what was broken off or has failed is reported once as INTERRUPTED | `at_rest` |
+| it settles: a request is answered once the measurement is seen running, or its file exists | `settle` |
+| it ends: no measurement is seen running any more, and its file is awaited | `follow`, `end` |
+| it is stopped on request: a measurement that still runs for a moment is not a new one, and has no result | `stopped` |
+| an interruption or a failure is reported once as INTERRUPTED | `at_rest` |
 
-A curve may have to wait until the tip is where the curve is to be taken (`curve_awaited`), and a command may last as
-long as the measurement itself (`call`). A maker's driver says how its program shows what runs, and how a measurement is
-noted with its files.
+A curve may have to wait for the tip to arrive at its place (`curve_awaited`), and a command may last as long as the
+measurement itself (`call`). A maker's driver decides how to see a running measurement, and records it with the files.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ from afspm.translator.result_files import SCAN, ResultFiles
 
 
 class Activity(ABC):
-    """The measurement that runs, begun by a request or at the program's panel.
+    """The running measurement, begun by a request or at the program's panel.
 
     Args:
-        files: the results that are awaited.
+        files: the awaited results.
 
     Attributes:
-        call: the command that lasts as long as what it began; None: there is none.
-        curve_awaited: the kind of the curve that is taken once the tip is there; empty: none.
+        call: the command that lasts as long as its measurement; None: there is none.
+        curve_awaited: the kind of the curve that starts once the tip has arrived; empty: none.
     """
 
     program: ClassVar[str]
     """The name of the program, for messages."""
     settles_s: ClassVar[float] = 0.0
-    """Real time that a measurement may take to be seen running."""
+    """Real time until a started measurement must be seen running."""
     call_failures: ClassVar[tuple[type[AfspmError], ...]] = ()
     """The errors by which a `call` reports that it failed."""
 
@@ -61,20 +60,20 @@ class Activity(ABC):
 
     @abstractmethod
     def begin(self, what: str) -> None:
-        """Note with the files that a measurement begins, with the values in force: `SCAN`, or the kind of a curve."""
+        """Record the start of a measurement, with the values in force. `what` is `SCAN`, or the kind of a curve."""
 
     @abstractmethod
     def end(self) -> None:
-        """Note with the files that the measurement has ended: its result is awaited from now on."""
+        """Record the end of the measurement, and wait for its result."""
 
     @abstractmethod
     def status(self) -> ScopeStatus:
-        """Look at the program, and return what it is doing now. Raises ControllerLost."""
+        """Return the present state of the program. Raises ControllerLost."""
 
     # --- the life of a measurement ---
 
     def follow(self, what: str) -> None:
-        """Take in what was seen running: end what does not run any more, and begin what was begun at the panel.
+        """Compare with the program: end a measurement that stopped running, and begin one started at the panel.
 
         Args:
             what: `SCAN`, the kind of a curve, or empty.
@@ -87,11 +86,12 @@ class Activity(ABC):
             self.begin(what)
 
     def settle(self, what: str, is_seen: Callable[[], bool]) -> None:
-        """Wait until what was begun is seen running, or has ended already: its file is there.
+        """Wait until the started measurement is seen running, or has ended already: its file exists.
 
         Raises:
-            Refused: ACTION_ERROR: the program does not do it, and reported no error.
+            Refused: ACTION_ERROR: the program did not start it, and reported no error.
         """
+        # without a pause: each look takes as long as the program's answer
         until_s = self._clock.monotonic_s() + self.settles_s
         while self._clock.monotonic_s() < until_s:
             if is_seen():
@@ -102,7 +102,11 @@ class Activity(ABC):
         raise Refused(ControlResponse.ACTION_ERROR, reason)
 
     def started(self, what: str, do: Callable[[], object], is_seen: Callable[[], bool]) -> None:
-        """Begin a measurement on request. Raises what `do` raises, and Refused: nothing comes of it then."""
+        """Begin a measurement on request.
+
+        Raises:
+            Refused: the measurement was not started. Also the errors of `do`.
+        """
         self._stopping = False
         self.begin(what)
         try:
@@ -113,28 +117,27 @@ class Activity(ABC):
         self.settle(what, is_seen)
 
     def stopped(self) -> None:
-        """Note that a request has stopped the measurement, which has no result."""
+        """Record that a request has stopped the measurement, which has no result."""
         self._stopping, self.curve_awaited = True, ""
         self._results.forget()
 
     def forget(self) -> None:
-        """Expect no result of what was begun."""
         self._results.forget()
 
     def at_rest(self, state: ScopeState = ScopeState.FREE) -> ScopeStatus:
-        """Return the state while nothing is measured: INTERRUPTED once after a failure or a broken off scan."""
+        """Return the state while nothing is measured: INTERRUPTED once after a failure or an interrupted scan."""
         failed, self._failed = self._failed, False
         return ScopeStatus(ScopeState.INTERRUPTED if failed or self._results.broken_off else state)
 
     def fail(self, reason: str, *values: object) -> ScopeStatus:
-        """Log why nothing comes of what was asked for, and return the state that reports it."""
+        """Log why a request came to nothing, and return the state INTERRUPTED."""
         self._log.error(reason, *values)
         return ScopeStatus(ScopeState.INTERRUPTED)
 
     # --- commands that take as long as what they do ---
 
     def watched_call(self) -> LongCall | None:
-        """Return the call as long as it goes on; one that has failed is logged. Raises ControllerLost."""
+        """Return the call while it goes on; log a call that has failed. Raises ControllerLost."""
         call = self.call
         if call is None:
             return None
@@ -150,22 +153,21 @@ class Activity(ABC):
         return None
 
     def watch(self, call: LongCall) -> None:
-        """Watch a call instead of the one before."""
         self.close()
         self.call = call
 
     def close(self) -> None:
-        """Wait no longer for what takes long."""
+        """Stop waiting for the call."""
         if self.call is not None:
             self.call.close()
             self.call = None
 
 
 class TipWay:
-    """The time that the tip needs to where it was sent, for programs that do not report its arrival.
+    """The time that the tip needs to its target, for programs that do not report its arrival.
 
     Args:
-        kept: JSON-able, and lasts: the tip goes on when the connection is lost.
+        kept: a JSON dict on disk: the tip moves on after the connection is lost.
     """
 
     def __init__(self, kept: Plain, clock: Clock) -> None:
@@ -177,20 +179,20 @@ class TipWay:
         return float(self._kept.get("arrives_s", 0.0))
 
     def sets_out(self, lasts_s: float, *, after_last_way: bool = False) -> None:
-        """Note that the tip was sent somewhere: now, or after the way that it is on."""
+        """Record that the tip was sent somewhere: now, or after its present way."""
         now_s = self._clock.now_s()
         self._kept["arrives_s"] = (max(now_s, self.arrives_s) if after_last_way else now_s) + lasts_s
 
     def give_up(self) -> None:
-        """Note that the tip does not go on."""
+        """Record that the tip does not move on."""
         self._kept["arrives_s"] = 0.0
 
     @property
     def is_on(self) -> bool:
-        """True while the tip may be on its way."""
+        """True while the tip may be moving."""
         return self._clock.now_s() < self.arrives_s
 
     @property
     def next_s(self) -> float | None:
-        """The time of the arrival while the tip may be on its way."""
+        """The time of the arrival while the tip may be moving."""
         return self.arrives_s if self.is_on else None

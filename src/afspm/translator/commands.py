@@ -1,4 +1,4 @@
-"""Does what a request asks for: checks everything first, then has the driver do it."""
+"""Executes requests: checks everything first, then has the driver do it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _SETTERS = (*_ANNOUNCED, ControlRequest.PARAM)
 
 @dataclass
 class CommandOutcome:
-    """The response to a request, with what follows from it.
+    """The response to a request, with its consequences.
 
     Attributes:
         steps: to publish after the response.
@@ -41,11 +41,11 @@ class CommandOutcome:
 
 
 class Commands:
-    """Carries out requests at one microscope.
+    """Executes requests at one microscope.
 
     Args:
-        sequence: says whether the microscope is free, and in which order peers hear of it.
-        about_to_act: called right before anything is done that can't be taken back.
+        sequence: knows whether the microscope is free, and in which order states are published.
+        about_to_act: called right before the first step that can't be undone.
     """
 
     def __init__(
@@ -62,10 +62,10 @@ class Commands:
         self._about_to_act = about_to_act
         self._log = log
         driver.for_a_while = temporary.begin
-        self.actions = driver.own_actions() | self._added_actions(driver.added_actions)
+        self.actions = driver.own_actions() | self._added_actions(driver.common.actions)
 
     def do(self, request: Request) -> CommandOutcome:
-        """Carry out a request, whatever is wrong with it or with the controller. Raises only what says it is lost."""
+        """Execute a request; errors of the controller or its driver become the response. Raises only `LOST`."""
         try:
             return self._dispatch(request)
         except Refused as refused:
@@ -73,7 +73,7 @@ class Commands:
         except LOST:
             raise
         except Exception as error:
-            # an error of the controller, or of its driver, must not end the process: it is the reason
+            # broad: a driver may raise anything, and must not end the process; its error is the reason of the refusal
             self._log.exception("%s failed", request_name(request.kind))
             is_action = request.kind == ControlRequest.ACTION
             code = ControlResponse.ACTION_ERROR if is_action else ControlResponse.PARAM_ERROR
@@ -92,11 +92,11 @@ class Commands:
         return self._success(request) if values is None else self._set(request, values)
 
     def _success(self, request: Request) -> CommandOutcome:
-        """Return the success of a request; of one for a parameter with its value, in the unit that the peer used."""
+        # a parameter is returned in the unit that the peer used
         asked, payload = request.subject, b""
         if isinstance(asked, Parameter):
             spec = self._driver.table.find(asked.name)
-            text, unit = spec.told(self._driver.in_force([spec.name])[spec.name], asked.unit)
+            text, unit = spec.for_peer(self._driver.in_force([spec.name])[spec.name], asked.unit)
             payload = encode(Parameter(spec.name, text, unit or None))[1]
         return CommandOutcome(Response(ControlResponse.SUCCESS, payload, id=request.id))
 
@@ -117,7 +117,7 @@ class Commands:
 
     def _act(self, request: Request) -> CommandOutcome:
         action = self._find_action(request.subject)
-        state = self._sequence.said.state
+        state = self._sequence.published.state
         done = self._success(request)
         if action.only_stops and state not in action.interrupts:
             return done
@@ -132,6 +132,7 @@ class Commands:
 
     def _find_action(self, name: str) -> Action:
         if name not in self.actions:
+            # the name comes from a peer, and may be of any length
             near = difflib.get_close_matches(name[:100], self.actions, n=1)
             hint = f", perhaps {near[0]!r}" if near else ""
             raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"this microscope has no action {name[:100]!r}{hint}")
@@ -140,7 +141,7 @@ class Commands:
         return self.actions[name]
 
     def _refuse_if_busy(self, allowed: bool) -> None:
-        state = self._sequence.said.state
+        state = self._sequence.published.state
         if state is not ScopeState.FREE and not allowed:
             raise Refused(ControlResponse.NOT_FREE, f"the microscope is not free: SS_{state.name}")
 
@@ -157,11 +158,10 @@ class Commands:
             for_s = _duration_s(what["for"], f"{where}.for") if "for" in what else None
             moves = ScopeState.MOVING if MOVES & values.keys() else None
             state = moves if for_s is None else state_for(values)
-            added[name] = Action(name, partial(self._do, values, command, for_s), state)
+            added[name] = Action(name, partial(self._run_added_action, values, command, for_s), state)
         return added
 
-    def _do(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
-        """Do an action of the experiment file; the request behind it was written down before it began."""
+    def _run_added_action(self, values: Mapping[str, Value], command: str | None, for_s: float | None) -> None:
         if for_s is not None:
             self._temporary.begin(values, for_s)
         elif values:

@@ -1,4 +1,4 @@
-"""The connection to the controller: made, lost, and tried again."""
+"""The connection to the controller: made, lost, and retried."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from afspm.basics.errors import AfspmError, ConfigError
 from afspm.translator.driver_base import LOST, ControllerLost, DriverBase
 from afspm.translator.emulated_controller import EmulatedController
 
-RETRY_S = 1.0
+RETRY_S = 1.0  # real; decision 0016
 _STARTUP_S = 2.0
-"""Real time in which a controller that is started together with its translator (an emulated one) may be missing: until
-then it is looked for every `_STARTUP_RETRY_S`, and nothing is logged."""
+"""Real time in which a controller that starts together with its translator (an emulated one) may be missing: until then
+connecting is retried every `_STARTUP_RETRY_S`, and nothing is logged."""
 _STARTUP_RETRY_S = 0.1
 
 
 class Connection:
-    """Connects a driver to its controller, and decides what says that the controller is lost.
+    """Connects a driver to its controller, and decides which errors mean that the controller is lost.
 
     Args:
         controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver
-            knows where its controller is.
-        on_lost: called when the loss is to be published.
+            knows the address of its controller.
+        on_lost: called to publish the loss.
 
     Attributes:
         is_reached: True while the driver is connected.
-        stands: True while it is, and its state is looked at.
+        stands: True while it is connected, and its state is observed.
         why_lost: the reason of the last loss.
     """
 
@@ -51,7 +51,7 @@ class Connection:
         self._began_s = clock.monotonic_s()
 
     def establish(self) -> bool:
-        """Connect if it is time to try. Return True if the connection stands anew."""
+        """Connect if the next attempt is due. Return True if the connection was made."""
         if self._clock.monotonic_s() < self._retry_at_s:
             return False
         self.reach()
@@ -62,7 +62,7 @@ class Connection:
         return True
 
     def reach(self) -> None:
-        """Connect at once, unless connected. Raises what says that the controller is lost."""
+        """Connect at once, unless connected. Raises the errors of `LOST`."""
         if self.is_reached:
             return
         if self._controller is None:
@@ -81,10 +81,10 @@ class Connection:
         return max(0.0, self._retry_at_s - self._clock.monotonic_s())
 
     def guarded(self, do: Callable[[], None]) -> bool:
-        """Return True if that could be done; if not, the controller is lost, or says what can't be.
+        """Call `do`. Return False if it failed: the controller is then lost.
 
         Raises:
-            ConfigError: the controller can never be connected to with these settings.
+            ConfigError: the first connection can't succeed with these settings.
         """
         try:
             do()
@@ -95,13 +95,13 @@ class Connection:
             self.lose(error)
         except (*LOST, AfspmError) as error:
             self.lose(error)
-        except Exception as error:  # whatever a controller says, its translator lives on
+        except Exception as error:  # a driver may raise anything, and its translator must live on to retract the tip
             self._log.debug("reading the controller's state failed", exc_info=True)
             self.lose(error)
         return False
 
     def lose(self, error: Exception) -> None:
-        """Note the loss, and publish and log it once."""
+        """Record the loss, and publish and log it once."""
         now_s = self._clock.monotonic_s()
         starts = isinstance(error, LOST) and not self._ever_stood and now_s - self._began_s < _STARTUP_S
         self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)

@@ -1,4 +1,4 @@
-"""One run at a time commands a controller: its translator holds a lock, which the system takes back from the dead."""
+"""One run at a time commands a controller: its translator holds a lock, which ends with its process."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import BinaryIO, cast
 from afspm.basics.errors import AfspmError
 from afspm.basics.file_lock import lock
 
-_LOCKED_BYTES = 1  # where a lock covers what is read (Windows), who holds it is told behind it
+_LOCKED_BYTES = 1  # Windows lets no other process read locked bytes: the holder's name stands behind them
 
 
 class ControllerTaken(AfspmError):
@@ -27,21 +27,21 @@ class ControllerTaken(AfspmError):
 
 @contextlib.contextmanager
 def commanding(address: str, run: str) -> Iterator[None]:
-    """This process alone, of all on this computer, whoever's, commands the controller while in the block.
+    """Give this process the only right, on this computer and among all users, to command the controller.
 
     Args:
-        address: where the controller is; empty: nobody else can command it (a simulated one).
-        run: in which run, for whoever is refused.
+        address: of the controller; empty: no other process can command it (a simulated one).
+        run: the name of this run, for the refusal of others.
 
     Raises:
-        ControllerTaken: another process does.
+        ControllerTaken: another process commands it.
     """
     if not address:
         yield
         return
-    path = _file(address)
-    with _locked(path, address) as file:
-        # a full disk, or the file is another user's: who holds it can't be told, and it is held all the same
+    path = _lock_file(address)
+    with _open_and_lock(path, address) as file:
+        # a full disk, or a file of another user: the holder's name is missing, but the lock is held all the same
         with contextlib.suppress(OSError):
             file.truncate(0)
             file.write(b" " * _LOCKED_BYTES + f"{run or 'another run'}, process {os.getpid()}".encode())
@@ -49,17 +49,16 @@ def commanding(address: str, run: str) -> Iterator[None]:
         try:
             yield
         finally:
-            with contextlib.suppress(OSError):  # Windows keeps it while it is open, a folder for all that of others
+            with contextlib.suppress(OSError):  # Windows keeps an open file; a sticky folder keeps another user's
                 path.unlink()
 
 
-def _locked(path: Path, address: str) -> BinaryIO:
-    """The file, open, and locked by us. Raises ControllerTaken."""
+def _open_and_lock(path: Path, address: str) -> BinaryIO:
     while True:
         try:
-            file = _opened(path)
+            file = _open_lock_file(path)
         except FileNotFoundError:
-            continue  # whoever had it has just taken it away
+            continue  # its former holder has just deleted it
         except OSError as error:
             told = f"the lock file of this controller can't be opened: {error.strerror or error}"
             raise ControllerTaken(
@@ -67,6 +66,7 @@ def _locked(path: Path, address: str) -> BinaryIO:
             ) from error
         try:
             lock(file)
+            # between open and lock its former holder may have deleted it: then the lock is on no file of this name
             if os.path.samestat(os.fstat(file.fileno()), path.stat()):
                 return file
         except FileNotFoundError:
@@ -80,8 +80,9 @@ def _locked(path: Path, address: str) -> BinaryIO:
         file.close()
 
 
-def _opened(path: Path) -> BinaryIO:
-    """The file, of whichever user; a link is not followed. What is another user's can be locked, and not written."""
+def _open_lock_file(path: Path) -> BinaryIO:
+    # a link is not followed; a file of another user can be locked, but not written
+    # O_NONBLOCK: a FIFO in its place must not block the open
     flags = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
     try:
         descriptor, mode = os.open(path, os.O_RDWR | os.O_CREAT | flags, 0o644), "r+b"
@@ -93,19 +94,19 @@ def _opened(path: Path) -> BinaryIO:
     return cast("BinaryIO", os.fdopen(descriptor, mode))
 
 
-def _file(address: str) -> Path:
-    """The same for all processes of this computer, however they write its name."""
+def _lock_file(address: str) -> Path:
+    # one file for all spellings of an address
     plain = address.lower().replace("localhost", "127.0.0.1")
-    return _folder() / hashlib.sha256(plain.encode()).hexdigest()[:16]
+    return _lock_folder() / hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
-def _folder() -> Path:
-    """A folder of ours that all users have in common: each may put files there, and take away only the own ones.
-
-    Raises:
-        ControllerTaken: it can't be had, or is a link, which leads where somebody else wants.
-    """
-    in_common = {"win32": os.environ.get("PROGRAMDATA"), "darwin": "/tmp"}  # where the usual one is each user's own
+def _lock_folder() -> Path:
+    # common to all users: each may add files, and delete only their own (sticky bit). A link in its place is refused:
+    # it may lead into a folder chosen by another user
+    in_common = {
+        "win32": os.environ.get("PROGRAMDATA"),
+        "darwin": "/tmp",
+    }  # where the temporary folder is each user's own
     folder = Path(in_common.get(sys.platform) or tempfile.gettempdir()) / "afspm-controllers"
     try:
         with contextlib.suppress(FileExistsError):
@@ -120,7 +121,7 @@ def _folder() -> Path:
 
 
 def _holder(path: Path) -> str:
-    with contextlib.suppress(OSError), _opened(path) as file:
+    with contextlib.suppress(OSError), _open_lock_file(path) as file:
         file.seek(_LOCKED_BYTES)
         return file.read().decode(errors="replace") or "another run"
     return "another run"

@@ -1,4 +1,4 @@
-"""`Driver`: what one writes for a new controller. Everything else is done by the `Translator`, once for all."""
+"""`Driver`: the class to write for a new controller. The `Translator` does everything else, once for all makers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Driver(DriverBase):
     __doc__ = DriverBase.__doc__
 
     def run_process(self, context: ProcessContext) -> int:
-        """Be the translator of an experiment (what the host calls)."""
+        """Run the translator of an experiment (called by the host of processes)."""
         from afspm.translator.translator import run_translator
 
         return run_translator(self, context)

@@ -1,4 +1,4 @@
-"""`DriverBase`: what the translator asks of a driver. `Driver` adds the process around it."""
+"""`DriverBase`: the interface between the translator and a maker's driver. `Driver` adds the process around it."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
 
 class ControllerLost(AfspmError):
-    """The controller can't be reached: the translator says so to who asks, and connects again."""
+    """The controller can't be reached: the translator refuses requests with this reason, and reconnects."""
 
     code = "controller-lost"
 
 
 def connected(link: T | None, program: str, address: str = "") -> T:
-    """Return what stands for the connection to a maker's program. Raises ControllerLost: there is none (None)."""
+    """Return the connection to a maker's program. Raises ControllerLost: there is none (None)."""
     if link is None:
         raise ControllerLost(f"{program} is not connected", where=address)
     return link
 
 
 LOST = (ControllerLost, ConnectionError, TimeoutError)
-"""What says that the controller is gone, and not that it refuses."""
+"""The errors of a lost controller, as opposed to those of a refusal."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class Action:
 
     Attributes:
         name: the generic name, e.g. "start-scan".
-        do: begins it and returns at once; what it leads to is seen by `Driver.status`.
-        state: what the microscope is in from the moment that it is accepted, until `status` says otherwise.
-        while_busy: it may be asked for while the microscope is not free.
-        interrupts: the states that it breaks off.
+        do: starts the action and returns at once; `Driver.status` shows its effect.
+        state: the state of the microscope once the action is accepted, until `status` reports another.
+        while_busy: it is accepted while the microscope is not free.
+        interrupts: the states that it interrupts.
     """
 
     name: str
@@ -62,27 +62,28 @@ class Action:
 
     @property
     def only_stops(self) -> bool:
-        """It is nothing to do unless what it interrupts is running."""
+        """True if the action does nothing unless its measurement is running."""
         return self.name in (names.STOP_SCAN, names.STOP_SPEC)
 
 
-def _nothing() -> None:
+def _not_implemented() -> None:
     raise NotImplementedError
 
 
-def _nothing_to_prove() -> None:
-    """A real controller is the one at its address."""
+def _prove_nothing() -> None:
+    # a real controller is the one at its address
+    ...
 
 
 _KNOWN = {
     action.name: action
     for action in (
-        Action(names.START_SCAN, _nothing, ScopeState.SCANNING),
-        Action(names.START_SPEC, _nothing, ScopeState.SPEC),
-        Action(names.STOP_SCAN, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SCANNING})),
-        Action(names.STOP_SPEC, _nothing, None, while_busy=True, interrupts=frozenset({ScopeState.SPEC})),
-        # the way out must always be open
-        Action(names.RETRACT, _nothing, None, while_busy=True, interrupts=MEASURING),
+        Action(names.START_SCAN, _not_implemented, ScopeState.SCANNING),
+        Action(names.START_SPEC, _not_implemented, ScopeState.SPEC),
+        Action(names.STOP_SCAN, _not_implemented, None, while_busy=True, interrupts=frozenset({ScopeState.SCANNING})),
+        Action(names.STOP_SPEC, _not_implemented, None, while_busy=True, interrupts=frozenset({ScopeState.SPEC})),
+        # a retract must be possible at any time
+        Action(names.RETRACT, _not_implemented, None, while_busy=True, interrupts=MEASURING),
     )
 }
 
@@ -90,13 +91,13 @@ Method = TypeVar("Method", bound=Callable[[Any], None])
 
 
 def action(name: str, *, state: ScopeState | None = None, while_busy: bool | None = None) -> Callable[[Method], Method]:
-    """Marks a method of a `Driver` as the generic action `name`.
+    """Mark a method of a `Driver` as the generic action `name`.
 
     Args:
-        state: what the microscope is in from the moment that it is accepted; known for the base actions.
-        while_busy: it may be asked for while the microscope is not free; known for the base actions.
+        state: the state of the microscope once the action is accepted; known for the base actions.
+        while_busy: it is accepted while the microscope is not free; known for the base actions.
     """
-    known = _KNOWN.get(name, Action(name, _nothing))
+    known = _KNOWN.get(name, Action(name, _not_implemented))
     mark = replace(
         known,
         state=known.state if state is None else state,
@@ -111,7 +112,7 @@ def action(name: str, *, state: ScopeState | None = None, while_busy: bool | Non
 
 
 class Introduction(Protocol):
-    """The first lines of a connection, which a trace does not hold since they prove a secret.
+    """The first lines of a connection, which are not in a trace, since they prove a secret.
 
     Attributes:
         is_over: True once both sides have proven that they know the secret.
@@ -121,6 +122,17 @@ class Introduction(Protocol):
 
     def reply_to(self, line: bytes) -> str:
         """Return the controller's answer to a line; empty: hang up."""
+
+
+@dataclass(frozen=True)
+class CommonSettings:
+    """The settings that every driver takes: see `DriverBase`."""
+
+    actions: PlainMapping
+    poll_period_s: float
+    result_timeout_s: float
+    live_lines_s: float | None
+    trace: bool
 
 
 class DriverBase(ABC):
@@ -139,37 +151,38 @@ class DriverBase(ABC):
             def start_scan(self): self.link.send("scan")
 
     and beside it `parameters.toml`, the table of parameters by their generic names. All methods are called from one
-    thread and return soon: whatever takes long is begun and then seen by `status`. What they raise becomes the
-    response, its text the reason.
+    thread and must return soon: a method starts a long activity, and `status` shows its end. An exception becomes the
+    response to the request, with its text as the reason.
 
     Args:
         parameters: rows added to the table or changed in it by the experiment file.
         actions: generic actions added by the experiment file: `{name = {set = {<parameter> = <value>}}}` sets
-            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`), both does both; with
-            `for = "50 ms"` the microscope is busy so long, and what was set is put back then.
-        poll_period_s: the controller is looked at this often, in real seconds, when nothing is about to happen; its
-            state more often when a measurement is about to end, as learned from those before.
+            parameters, `{name = {command = "<text>"}}` sends a text to the controller (`command`), both does both. With
+            `for = "50 ms"` the microscope is busy for this time, and then the former values are restored.
+        poll_period_s: time between two looks at the controller while nothing is due, in real seconds; its state is read
+            more often when a measurement is about to end, as learned from earlier ones.
         result_timeout_s: how long after a scan or spectrum its file may take to appear, in experiment seconds (see
             `patience_s`).
-        live_lines_s: how often the lines of a running scan are published, in experiment seconds; 0: not at all; None:
-            as often as `live_real_s` says.
-        trace: keep all that is said to and by the controller, in `controller.trace.jsonl` of the run's folder.
+        live_lines_s: time between two publications of a running scan's lines, in experiment seconds; 0: never; None: by
+            `live_real_s`.
+        trace: record all exchanges with the controller in `controller.trace.jsonl` of the run's folder.
 
     Attributes:
-        clock, log: of the experiment; given before `connect`.
+        clock, log: of the experiment; set before `connect`.
         run_dir: the folder of this run.
-        wake: call it, from any thread, to have the controller looked at now rather than at the next poll.
-        for_a_while: sets parameters by their generic names, in SI, and has them put back after so many experiment
-            seconds: for actions that are made of settings. The microscope is busy meanwhile.
-        adjustable: parameters that may be set during a scan, whatever their row says: [control] adjustable.
-        controller_at: where the controller is: to be set by the constructor, and read by `connect`, since an experiment
-            with an emulator puts the emulator's address there. One run at a time commands it. Empty: there is none that
-            others can reach.
-        prove: to be called by `connect` once a connection stands, before anything is asked: it raises ControllerLost if
-            an emulated controller is not that of this run.
-        groups: the parameters that the controller has in another form than the table can say.
-        lacking: actions that this controller turned out not to have, and why; set it when connecting.
-        memory: a dict of JSON values, kept on disk: saved with every request and result, there after a restart.
+        wake: call it, from any thread, to have the controller polled now.
+        for_a_while: sets parameters by their generic names, in SI, and restores them after a time in experiment
+            seconds: for actions that consist of settings. The microscope is busy meanwhile.
+        adjustable: parameters that may be set during a scan, even where a row forbids it: [control] adjustable.
+        controller_at: the address of the controller. The constructor sets it and `connect` reads it, since an
+            experiment with an emulator puts the emulator's address there. Only one run at a time commands it. Empty:
+            other processes can't reach the controller.
+        prove: call it in `connect` once the connection is made, before the first question: it raises ControllerLost if
+            an emulated controller does not belong to this run.
+        groups: the parameters that the controller has in a form that a table can't describe.
+        lacking: actions that this controller turned out not to have, with the reason; set it when connecting.
+        memory: a dict of JSON values, saved with every request and result, and restored after a restart.
+        common: the settings above, as given.
     """
 
     parameters_file: ClassVar[Path]
@@ -185,13 +198,13 @@ class DriverBase(ABC):
     software: ClassVar[str] = ""
     """The controller's program, for the files of a run."""
     simulated: ClassVar[bool] = False
-    """No tip can break: the experiment's clock may go at another speed than the real one."""
+    """No tip can break: the experiment's clock may run at another speed than real time."""
     memory_is_all: ClassVar[bool] = False
-    """The microscope has no state outside of `memory` (a simulated one): nothing was done that is not in there."""
+    """The microscope (a simulated one) has no state outside `memory`: an action that is not in there was not done."""
 
     program_s: ClassVar[float] = 0.0
-    """Real seconds that the controller's program may need for whatever it does beside measuring, such as to save a
-    file, however fast the experiment's time passes."""
+    """Real seconds that the controller's program may need for work beside measuring, such as saving a file: independent
+    of the speed of the experiment's clock."""
 
     clock: Clock
     log: logging.Logger
@@ -216,19 +229,15 @@ class DriverBase(ABC):
         if live_lines_s is not None and type(self).lines is DriverBase.lines:
             raise ConfigError(f"{type(self).__name__} does not publish lines of a running scan", where="live_lines_s")
         self.table = self.parameter_table(parameters or {})
-        self.added_actions = dict(actions or {})
-        self.poll_period_s = poll_period_s
-        self.result_timeout_s = result_timeout_s
-        self.live_lines_s = live_lines_s
-        self.trace = trace
+        self.common = CommonSettings(dict(actions or {}), poll_period_s, result_timeout_s, live_lines_s, trace)
         self.adjustable: frozenset[str] = frozenset()
-        self.prove: Callable[[], None] = _nothing_to_prove
-        self._told: dict[str, Value] = {}
+        self.prove: Callable[[], None] = _prove_nothing
+        self._last_written: dict[str, Value] = {}
 
     def patience_s(self, of_s: float) -> float:
-        """Return how long to wait, in experiment seconds, for what takes the controller `of_s` at most.
+        """Return how long to wait, in experiment seconds, for a step that takes the controller `of_s` at most.
 
-        It is longer where so much passes while a program runs at all (an emulated controller at sixty times the speed).
+        It is at least `program_s` of real time: a fast clock leaves the program of an emulated controller little of it.
         """
         return max(of_s, self.program_s / self.clock.real_s(1.0))
 
@@ -239,17 +248,17 @@ class DriverBase(ABC):
 
     @classmethod
     def parameter_table(cls, changed: Mapping[str, Mapping[str, object]]) -> ParameterTable:
-        """The parameters of this kind of microscope, with the rows that the experiment file adds or changes.
+        """Return the parameters of this kind of microscope, with the rows that the experiment file adds or changes.
 
         Raises:
-            ConfigError: a row says what it can't.
+            ConfigError: a row has an impossible value.
         """
         table = ParameterTable.from_toml(cls.parameters_file)
         return table.extended(changed, where="the experiment file", translated=cls.translated)
 
     @classmethod
     def introductions(cls) -> Callable[[str], Introduction] | None:
-        """Return what makes the introduction of a connection to an address, for the replay of a trace; None: no secret.
+        """Return a factory of introductions by address, for the replay of a trace; None: there is no secret.
 
         Raises:
             OSError, ValueError: the secret can't be read.
@@ -258,42 +267,42 @@ class DriverBase(ABC):
 
     @classmethod
     def technique(cls, settings: Mapping[str, object]) -> str:
-        """Return STM or AFM, where the microscope is always the same with these settings; else an empty text."""
+        """Return STM or AFM, if these settings always give the same; else an empty text."""
         return ""
 
     @classmethod
     def excused(cls, controller: str) -> Mapping[str, str]:
-        """Return the checks of the translators' suite that a controller can't pass through no fault of ours, and why.
+        """Return the checks of the conformance suite that a controller itself makes impossible, with the reason.
 
         Args:
-            controller: its name and version, as `x-controller` tells.
+            controller: its name and version, as in `x-controller`.
         """
         return {}
 
     @abstractmethod
     def connect(self) -> None:
-        """Reach the controller. Called at the start, and again after a `ControllerLost`."""
+        """Connect to the controller. Called at the start, and again after a `ControllerLost`."""
 
     def close(self) -> None:  # noqa: B027 (many have nothing to close)
-        """Let go of the controller. The tip stays as it is."""
+        """Close the connection to the controller. The tip stays as it is."""
 
     @abstractmethod
     def status(self) -> ScopeStatus:
-        """Return the state of the controller now."""
+        """Return the present state of the controller."""
 
     @abstractmethod
     def get(self, vendor: str) -> Value:
-        """The value of a parameter, by the vendor's name, in the vendor's unit."""
+        """Return the value of a parameter, by the vendor's name, in the vendor's unit."""
 
     @abstractmethod
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set parameters together, by the vendor's names, in the vendor's units. All or none, if it can be."""
+        """Set parameters together, by the vendor's names, in the vendor's units. All or none, if possible."""
 
     @abstractmethod
     def results(self) -> Sequence[str]:
-        """The finished scans and spectra that there are, oldest first: as a rule the names of the controller's files.
+        """Return the finished scans and spectra, oldest first: as a rule the names of the controller's files.
 
-        The translator remembers which it has published, also over a restart.
+        The translator remembers, also over a restart, which ones it has published.
         """
 
     @abstractmethod
@@ -301,23 +310,23 @@ class DriverBase(ABC):
         """Read one of `results`: every channel of a scan, or a spectrum, with the parameters it was taken with.
 
         Raises:
-            FileError: it is not (yet) whole; asked for again until `result_timeout_s` is over.
+            FileError: it is incomplete; `load` is called again until `result_timeout_s` is over.
         """
 
     def followed(self) -> bool | None:
-        """Return whether a measurement was whole whose end `status` never reported, since another one followed at once.
+        """Return the outcome of a measurement whose end `status` never reported, since another followed at once.
 
-        To be written where a panel can repeat scans. Called after `results`, which have to list it by then.
+        To be written where a panel can repeat scans. Called after `results`, which must list the measurement by then.
 
         Returns:
-            once for each of them: True if it was whole, False if it was broken off; None: there was none.
+            once for each such measurement: True if it was complete, False if it was interrupted; None: there was none.
         """
         return None
 
     def lines(self, start: int) -> Sequence[ScanLines]:
-        """Return the complete lines of a running scan beyond the first `start`, in the order in which they are scanned.
+        """Return the complete lines of a running scan beyond the first `start`, in the order of scanning.
 
-        To be written where the controller can tell (`live_lines_s`).
+        To be written where the controller has them during the scan (`live_lines_s`).
 
         Returns:
             for each channel the same lines, rows and columns ascending; nothing while there are no new ones.
@@ -325,17 +334,17 @@ class DriverBase(ABC):
         return ()
 
     def command(self, text: str) -> None:
-        """Send a command that the experiment file added to the controller as it is."""
+        """Send a text command of the experiment file to the controller, unchanged."""
         raise Refused(ControlResponse.ACTION_NOT_SUPPORTED, f"{type(self).__name__} does not take commands as text")
 
     def next_change_s(self) -> float | None:
-        """The experiment time at which something is known to change by itself; None if nothing is known."""
+        """Return the experiment time of the next known change; None: nothing is known."""
         return None
 
     def read(self, wanted: Collection[str]) -> dict[str, Value]:
         """Return the values of parameters by their generic names, in SI; others may be among them.
 
-        To be written only where neither the table nor `groups` can say how the controller has it.
+        To be overridden only where neither the table nor `groups` can describe the controller's form.
         """
         found: dict[str, Value] = {}
         for group in self.groups:
@@ -344,7 +353,7 @@ class DriverBase(ABC):
         return found | self.read_rows([name for name in wanted if name not in found])
 
     def read_rows(self, wanted: Sequence[str]) -> dict[str, Value]:
-        """Return the values of parameters that the table alone says how to get."""
+        """Read parameters that the table alone describes."""
         return {name: self.table[name].from_vendor(self.get(self.table[name].vendor)) for name in wanted}
 
     def write(self, values: Mapping[str, Value]) -> None:
@@ -358,13 +367,13 @@ class DriverBase(ABC):
             self.write_rows(left)
 
     def write_rows(self, values: Mapping[str, Value]) -> None:
-        """Set parameters that the table alone says how to set."""
+        """Set parameters that the table alone describes."""
         self.set({self.table[name].vendor: self.table[name].to_vendor(value) for name, value in values.items()})
 
     def wait_for(self, condition: Callable[[], bool], at_most_s: float) -> bool:
-        """Ask the controller until something holds, which it does with a delay. Return False after so long, real time.
+        """Poll the controller until a condition holds. Return False if it does not within `at_most_s`, real time.
 
-        Each question takes as long as the controller takes to answer it.
+        There is no pause between two polls: each takes as long as the controller's answer.
         """
         until_s = self.clock.monotonic_s() + at_most_s
         while not (holds := condition()) and self.clock.monotonic_s() < until_s:
@@ -372,14 +381,14 @@ class DriverBase(ABC):
         return holds
 
     def pulse_bias(self) -> None:
-        """Do a bias pulse of `x-pulse-voltage` for `x-pulse-duration` by setting the bias, which is put back."""
+        """Apply a bias pulse of `x-pulse-voltage` for `x-pulse-duration` by setting the bias and restoring it."""
         wanted = self.in_force([names.PULSE_VOLTAGE, names.PULSE_DURATION])
         self.for_a_while({names.TIP_BIAS_VOLTAGE: wanted[names.PULSE_VOLTAGE]}, float(wanted[names.PULSE_DURATION]))
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        """Return True if two values of a parameter are one to the controller's precision.
+        """Return True if two values of a parameter are equal to the controller's precision.
 
-        To be written only where a `resolution` in the table can't say it.
+        To be overridden only where a `resolution` in the table can't describe the precision.
 
         Args:
             among: the values that `a` was read with.
@@ -387,25 +396,25 @@ class DriverBase(ABC):
         return self.table[name].same(a, b)
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
-        """Return what `read` gives; what was set is told as it was set, as long as the controller has the same.
+        """Return the values of `read`; where they equal the value set last, to the controller's precision, the latter.
 
         Raises:
-            InvalidValue: the controller says what is no number: it can be told to nobody.
+            InvalidValue: the controller returned a number that is not finite, which can't be published.
         """
-        found, told = self.read(wanted), self._told
+        found, told = self.read(wanted), self._last_written
         for name in wanted:
             value = found[name]
             if isinstance(value, float) and not math.isfinite(value):
-                raise InvalidValue(f"the controller says that {name} is {value}")
+                raise InvalidValue(f"the controller returned {value} for {name}")
         return {
             name: told[name] if name in told and self.same(name, found[name], told[name], found) else found[name]
             for name in wanted
         }
 
     def put_in_force(self, values: Mapping[str, Value]) -> None:
-        """`write` these, and remember them.
+        """Write values, and remember them.
 
-        Feedback is switched on after all else is written, and off before: it is not to act on what was there before.
+        Feedback is switched on after everything else is written, and off before: it must not act on the former values.
         """
         rest = {name: value for name, value in values.items() if name != names.FEEDBACK_ON}
         parts = [rest] if rest else []
@@ -414,10 +423,10 @@ class DriverBase(ABC):
             parts.insert(len(parts) if on else 0, {names.FEEDBACK_ON: on})
         for part in parts:
             self.write(part)
-        self._told.update(values)
+        self._last_written.update(values)
 
     def own_actions(self) -> dict[str, Action]:
-        """The methods marked with `@action`, by name."""
+        """Return the methods marked with `@action`, by name."""
         found = {}
         for attribute in dir(type(self)):
             mark = getattr(getattr(type(self), attribute), "_afspm_action", None)

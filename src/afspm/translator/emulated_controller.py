@@ -1,8 +1,8 @@
-"""The emulated controller of a run: its process tells its address in a file under a lock that dies with it.
+"""The emulated controller of a run, whose process writes its address to a file that it keeps locked.
 
-The file lies in the folder of the run's state. While the lock is held, the process that wrote the address lives, and it
-listens there: nobody else can. So a translator that reads the address talks to the emulator of its own run, and never
-to a real controller at the vendor's usual port.
+The file lies in the folder of the run's state. While the lock is held, the process that wrote the address is alive and
+listens there, so no other process can. So a translator that reads the address connects to the emulator of its own run,
+and never to a real controller at the vendor's usual port.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.translator.driver_base import DriverBase
 
 _LOCKED_BYTES = 1
-"""Windows lets nobody read what is locked: the text begins behind it."""
+"""Windows lets no other process read locked bytes: the text begins behind them."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Listening:
 
     Attributes:
         run: the identity of the run that started it.
-        life: differs between two lives of the process, and between two times that it began to listen.
+        life: a new random text each time that an emulator begins to listen.
     """
 
     address: str
@@ -40,7 +40,7 @@ class Listening:
 
 
 class AddressNotice:
-    """Tells, as long as this process lives, where its emulated controller listens. Made by the emulator.
+    """Publishes the address of an emulated controller, as long as the emulator's process lives.
 
     Args:
         file: see `notice_file`.
@@ -50,23 +50,22 @@ class AddressNotice:
     def __init__(self, file: Path, run: str) -> None:
         self._run = run
         self._file = file.open("a+b")
-        lock(self._file, wait=True)  # a reader has it for a moment
+        lock(self._file, wait=True)  # a reader holds the lock for a moment
         self.tell("")
 
     def tell(self, address: str) -> None:
-        """The controller listens at this address; empty: nowhere, for now."""
+        """Write the address of the controller; empty: it does not listen now."""
         text = json.dumps({"address": address, "run": self._run, "life": os.urandom(8).hex()})
         self._file.truncate(0)
         self._file.write(b" " * _LOCKED_BYTES + text.encode())
         self._file.flush()
 
     def close(self) -> None:
-        """The controller is gone."""
         self._file.close()
 
 
 class EmulatedController:
-    """The emulator that a translator is wired to, as its notice tells it.
+    """The emulator that a translator is connected to, found by its notice.
 
     Args:
         name: of the emulator's process.
@@ -79,22 +78,22 @@ class EmulatedController:
         self._reached: Listening | None = None
 
     def reach(self, microscope: DriverBase) -> None:
-        """Connect to this run's emulator, or to nobody.
+        """Connect to this run's emulator only.
 
         Raises:
-            ControllerLost: the emulator does not listen. And whatever `Driver.connect` raises.
+            ControllerLost: the emulator does not listen. Also the errors of `Driver.connect`.
         """
         found = self._reached = self._find()
         microscope.controller_at, microscope.prove = found.address, self.prove
         try:
             microscope.connect()
             self.prove()
-        except BaseException:
+        except BaseException:  # raised again: a connection to another controller must not stay open
             microscope.close()
             raise
 
     def prove(self) -> None:
-        """Return if the emulator that was reached still listens where it was reached.
+        """Check that the connected emulator still listens at the same address.
 
         Raises:
             ControllerLost: it does not.
@@ -125,16 +124,15 @@ class EmulatedController:
 
 
 def notice_file(state_dir: str, name: str) -> Path:
-    """Where the emulator called `name` tells its address."""
+    """Return the file with the address of the emulator `name`."""
     return Path(state_dir) / f"{name}.controller"
 
 
 def wired_to(launch: Launch, microscope: DriverBase) -> EmulatedController | None:
-    """The emulator that a translator may talk to; None: the controller in its settings, or none at all.
+    """Return the emulator that a translator may connect to; None: the controller in its settings, or none at all.
 
     Raises:
-        ConfigError: the experiment is called simulated, and the translator would command a controller that is not
-            proved to be an emulator.
+        ConfigError: the experiment is simulated, and the controller in the settings is not proved to be an emulator.
     """
     if not launch.controller and not (launch.simulated and microscope.controller_at):
         return None
@@ -151,7 +149,7 @@ def wired_to(launch: Launch, microscope: DriverBase) -> EmulatedController | Non
 
 
 def _is_unlocked(file: IO[bytes]) -> bool:
-    """True while no process holds the lock. What this takes is given back when the file is closed."""
+    # closing the file releases a lock taken here
     try:
         lock(file, shared=True)
     except OSError:

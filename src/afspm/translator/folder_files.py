@@ -22,10 +22,10 @@ from afspm.translator.result_files import (
 
 
 class FolderFiles(ResultFiles):
-    """The measurement that is running or has just ended, and the results.
+    """The running measurement, or the one just ended, and the results.
 
     Attributes:
-        pattern: of the names of its files, as of `Path.glob`.
+        pattern: of the names of its files, as in `Path.glob`.
         precision: of its files.
     """
 
@@ -33,20 +33,20 @@ class FolderFiles(ResultFiles):
     precision: FilePrecision
 
     def begin(self, what: str, folder: Path, taken: PlainMapping) -> None:
-        """A measurement begins.
+        """Record the start of a measurement.
 
         Args:
             taken: "frame" of a scan, "position" of a spectrum.
         """
+        # only files newer than those of now can be its result
         self._begins(what, {"folder": str(folder), "newest_ns": newest(self._files(folder))[0], **taken})
 
     def end(self, now_ns: int) -> None:
-        """It has ended."""
         if self._kept["running"] is not None:
             self._ends({"end_ns": now_ns})
 
     def has_file(self) -> bool:
-        """Return True if a file of what is running has appeared."""
+        """Return True if the running measurement has a file."""
         running = self._kept["running"]
         return running is not None and self._file(running) is not None
 
@@ -67,35 +67,35 @@ class FolderFiles(ResultFiles):
                 raise FileError("was overwritten or deleted", where=str(path))
         return self._content_of([path for path, _ in files], entry)
 
-    # -- what a controller may have otherwise
+    # --- to be overridden for a controller with other files ---
 
     def result_name(self, path: Path) -> str:
-        """Return the name of the result in a file."""
         return str(path)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return the files of what was measured, and when they were written; none: not all are there."""
+        """Return the files of a measurement with their times of writing, ns; empty: some are missing."""
         path = self._file(measured)
         return [] if path is None else [(str(path), modified_ns(path))]
 
     def check(self, path: Path, one: Scan | Spectrum, measured: Entry) -> None:
-        """Look at the first of a file that is taken."""
+        """Check the first scan or spectrum of a new file."""
 
     def _goes_on(self, running: Entry) -> None:
-        """The controller goes on with the next image."""
+        # the controller repeats scans: only a newer file belongs to the next image
         running["newest_ns"] = newest(self._files(Path(running["folder"])))[0]
 
     def _take(self, measured: Entry) -> bool:
-        """Return True if all is known of what was measured: its files are a result, or no whole scan."""
+        # True also for an incomplete scan: there is nothing more to wait for
         files = self.files_of(measured)
         paths = [Path(name) for name, _ in files]
         try:
             content = self._content_of(paths, measured) if paths else ()
         except (AfspmError, OSError):
-            return False  # not yet whole
+            return False  # still being written
+        # a file that changed while it was read is still being written
         if not content or [modified_ns(path) for path in paths] != [written_ns for _, written_ns in files]:
             return False
-        if lines_missing(content):  # it was saved when the scan was broken off
+        if lines_missing(content):  # the controller saved an interrupted scan
             self.broken_off = True
             return True
         self.check(paths[0], content[0], measured)

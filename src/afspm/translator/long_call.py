@@ -7,24 +7,24 @@ from typing import Any, Protocol
 
 
 class LongLink(Protocol):
-    """A connection on which a command was begun."""
+    """A connection on which a command is running."""
 
     def reply(self, what: str) -> tuple[bool, Any]:
-        """Return whether the reply has come, and what is in it. Raises the controller's error, or ControllerLost."""
+        """Return whether the reply has come, and its content. Raises the controller's error, or ControllerLost."""
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the connection."""
 
 
 class LongCall:
-    """A command that was begun.
+    """A running command.
 
     Args:
-        what: it does.
-        is_unfinished: tells from what is in the reply whether the instrument goes on all the same.
+        what: the command, in words.
+        is_unfinished: decides from the content of the reply whether the instrument still goes on.
 
     Attributes:
-        value: what is in the reply, once it has come.
+        value: the content of the reply, once it has come.
     """
 
     def __init__(self, what: str, link: LongLink, is_unfinished: Callable[[Any], bool] = lambda value: False) -> None:
@@ -34,11 +34,11 @@ class LongCall:
         self._came = False
 
     def running(self) -> bool:
-        """Return whether it goes on. Raises the controller's error: it failed. ControllerLost."""
+        """Return whether the command goes on. Raises the controller's error if it failed, or ControllerLost."""
         if not self._came:
             self._came, self.value = self._link.reply(self.what)
         return not self._came or self._is_unfinished(self.value)
 
     def close(self) -> None:
-        """Wait for it no longer."""
+        """Stop waiting for the reply."""
         self._link.close()

@@ -1,4 +1,4 @@
-"""Watches the controller and publishes what changes at it, whoever changed it."""
+"""Observes the controller and publishes every change, made by a request or at the panel."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from afspm.translator.driver_base import LOST, MEASURING, DriverBase
 from afspm.translator.outbox import Outbox, Outgoing
 from afspm.translator.parameters import Value
 from afspm.translator.polling import AdaptivePolling
-from afspm.translator.safe_exit import FeedbackWatch
 from afspm.translator.sequence import DiscardResults, LogError, PublishResults, PublishStatus, SequenceStep
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
@@ -38,7 +37,6 @@ class Observer:
         port: ServerPort,
         state: TranslatorState,
         temporary: TemporarySettings,
-        feedback: FeedbackWatch,
         log: logging.Logger,
     ) -> None:
         self._driver = driver
@@ -46,10 +44,9 @@ class Observer:
         self._clock = port.clock
         self._state = state
         self._temporary = temporary
-        self._feedback = feedback
         self._log = log
         self._outbox = Outbox(driver, state.kept["outbox"], state.stamp, log)
-        self._polling = AdaptivePolling(driver.poll_period_s, driver.eager_poll_s)
+        self._polling = AdaptivePolling(driver.common.poll_period_s, driver.eager_poll_s)
         self._live = LiveLines(driver)
         self.values: dict[str, Value] = {}
         self._polled_for = ScopeState.UNDEFINED
@@ -57,55 +54,56 @@ class Observer:
         self._replayed = False
 
     def begin(self) -> None:
-        """Publish everything in force, once connected; after a restart the last results before."""
+        """Publish everything in force after connecting; after a restart, the last results first."""
         if not self._replayed:
             self._replayed = True
             for packet in self._outbox.start():
                 self._port.publish(*packet)
             self._state.save()
-        self._temporary.end()  # before a kill, or while the controller was lost, nobody could
+        self._temporary.end()  # impossible before a kill, or while the controller was lost
         self._take_in(self._read())
         self.publish_all()
 
     def look(self) -> None:
-        """See what has changed at the controller and publish it."""
-        said = self._state.sequence.said
+        """Publish the changes at the controller since the last look."""
+        published = self._state.sequence.published
         self._temporary.end_if_due()
         if self._clock.monotonic_s() >= self._all_at_s:
             self.observe()
-        elif (status := self._status()) != said:
-            # what ends a measurement changes nothing of what is in force; what else happens, may
-            self.observe(values=said.state not in MEASURING, status=status)
+        elif (status := self._status()) != published:
+            # the end of a measurement changes no setting; any other change of state may
+            self.observe(values=published.state not in MEASURING, status=status)
         for name, payload in self._live.look(self._clock.now_s()):
             self._port.publish(name, payload, self._state.stamp()[0], keep=False)
 
     def wait_s(self) -> float:
-        """Return the real seconds until the controller should be looked at again."""
+        """Return the real seconds until the next look is due."""
         real_now_s, now_s = self._clock.monotonic_s(), self._clock.now_s()
         wait_s = min(self._polling.wait_s(real_now_s), self._all_at_s - real_now_s)
         sequence_s = self._state.sequence.deadline_s()
         for at_s in (self._driver.next_change_s(), sequence_s, self._live.due_s, self._temporary.until_s):
             if at_s is not None:
-                # a change that should have been and was not seen yet is looked for eagerly, and not without a break
+                # an overdue change is polled for eagerly, but with a pause: the controller has other work
                 until_s = self._clock.real_s(at_s - now_s)
                 wait_s = min(wait_s, until_s if until_s > 0.0 else self._driver.eager_poll_s)
         return max(0.0, wait_s)
 
     def observe(self, announce: Sequence[str] = (), *, values: bool = True, status: ScopeStatus | None = None) -> None:
-        """Publish what is new.
+        """Publish all changes.
 
         Args:
             announce: messages to publish even if nothing in them changed.
-            values: False leaves out what is in force, which takes a question for each parameter.
-            status: as it was just seen, since a driver reports only once that something was interrupted; None: ask.
+            values: False leaves out the settings, which take one question for each parameter.
+            status: the status just read, since a driver reports an interruption only once; None: read it.
         """
         if values:
             self._observe_values(announce)
-        # the state first: a result that comes in between then waits for the next look, and is not lost
+        # the state first: a result that appears in between waits for the next look, and is not lost
         status = self._status() if status is None else status
-        is_over = self._state.sequence.said.state in MEASURING and status.state not in MEASURING
+        is_over = self._state.sequence.published.state in MEASURING and status.state not in MEASURING
         if is_over:
             self._polling.over(self._clock.monotonic_s())
+        # a fast simulated clock waits here: otherwise much experiment time would pass before the results are published
         with self._clock.late() if is_over else nullcontext():
             results = self._outbox.look()
             is_whole = self._driver.followed()
@@ -114,11 +112,11 @@ class Observer:
             self.play(steps)
 
     def play(self, steps: Sequence[SequenceStep]) -> None:
-        """Do the steps of a status sequence: save all that they change at once, then publish.
+        """Carry out the steps of a status sequence: save all their changes at once, then publish.
 
         A process killed in between publishes the results again, at the same times, before the state that follows them.
-        Were that state saved first, a restarted process would publish it without the results, and the component that
-        waits for the scan would take it a second time.
+        If that state were saved first, a restarted process would publish it without the results, and a component that
+        waits for the scan would start it a second time.
         """
         if not steps:
             return
@@ -138,28 +136,29 @@ class Observer:
             self._port.publish(*packet)
         for step in steps:
             if isinstance(step, PublishStatus):
-                self._poll_for(step.status.state)
+                self._adapt_polling(step.status.state)
 
     def publish_all(self) -> None:
         """Publish everything in force, for a scheduler that has just connected."""
         for thing in setting_groups.messages(self.values).values():
             self.publish(thing)
-        said = self._state.sequence.said
-        if said.state is not ScopeState.UNDEFINED:
-            self.publish(said)
-        if said.state in MEASURING and self._polled_for not in MEASURING:  # since when is not known: it may end soon
-            self._polled_for = said.state
+        published = self._state.sequence.published
+        if published.state is not ScopeState.UNDEFINED:
+            self.publish(published)
+        if (
+            published.state in MEASURING and self._polled_for not in MEASURING
+        ):  # its start is not known: it may end soon
+            self._polled_for = published.state
             self._polling.began(object(), self._clock.monotonic_s())
 
     def publish(self, thing: setting_groups.Published | ScopeStatus) -> None:
-        """Publish a message."""
         self._port.publish(*self._packet(thing))
 
     def _packet(self, thing: setting_groups.Published | ScopeStatus) -> Outgoing:
         return Outgoing(*wire.encode(thing), self._state.stamp()[0])
 
     def _status(self) -> ScopeStatus:
-        """Return the state of the microscope, which is not asked while something is in force for a while."""
+        # while temporary settings are in force the microscope counts as busy, even if the controller reports FREE
         return self._temporary.status or self._driver.status()
 
     def _observe_values(self, announce: Sequence[str]) -> None:
@@ -169,13 +168,13 @@ class Observer:
         for name, thing in setting_groups.messages(values).items():
             if name in announce or before.get(name) != thing:
                 self.publish(thing)
-        wait_s, next_s = self._driver.poll_period_s, self._driver.next_change_s()
+        wait_s, next_s = self._driver.common.poll_period_s, self._driver.next_change_s()
         if next_s is not None:
             wait_s = min(wait_s, max(0.0, self._clock.real_s(next_s - self._clock.now_s())))
         self._all_at_s = self._clock.monotonic_s() + wait_s
 
     def _read(self) -> dict[str, Value]:
-        """Return what is in force; differences below the controller's precision are none."""
+        # a difference below the controller's resolution is no change
         table, old = self._driver.table, self.values
         values = self._driver.in_force(setting_groups.watched(table))
         return {
@@ -185,26 +184,25 @@ class Observer:
 
     def _take_in(self, values: dict[str, Value]) -> None:
         self.values = values
-        if self._feedback.saw(setting_groups.feedback(values).on):
+        if self._state.feedback.saw(setting_groups.feedback(values).on):
             self._state.save()
 
-    def _poll_for(self, state: ScopeState) -> None:
-        """Poll as often as the state asks for."""
+    def _adapt_polling(self, state: ScopeState) -> None:
         before, self._polled_for, now_s = self._polled_for, state, self._clock.monotonic_s()
         if state is ScopeState.SCANNING:
             self._live.begin(self._clock.now_ns())
         else:
             self._live.end()
         if state in MEASURING:
-            lasts_s, extent = self._scan_s() if state is ScopeState.SCANNING else (None, ())
+            lasts_s, extent = self._expected_scan() if state is ScopeState.SCANNING else (None, ())
             self._polling.began((state, *extent), now_s, lasts_s)
         elif state in (ScopeState.FREE, ScopeState.UNDEFINED):
             self._polling.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
         else:
             self._polling.moved(now_s)
 
-    def _scan_s(self) -> tuple[float | None, tuple[Value, ...]]:
-        """Return the real seconds of the scan, if no time is lost at its edges, and the values they depend on."""
+    def _expected_scan(self) -> tuple[float | None, tuple[Value, ...]]:
+        # a lower bound: the time lost at the edges of a scan is not known
         extent = tuple(self.values.get(name, 0.0) for name in setting_groups.EXTENT)
         with contextlib.suppress(*LOST, AfspmError, ArithmeticError):
             if all(extent) and names.SCAN_SPEED in self._driver.table:
@@ -215,18 +213,18 @@ class Observer:
 
 
 def _live_lines_s(microscope: DriverBase) -> float | None:
-    """Return how often, in experiment seconds, lines of a running scan are published; None: never."""
-    if microscope.live_lines_s is not None:
-        return microscope.live_lines_s or None
+    # experiment seconds; None: never
+    if microscope.common.live_lines_s is not None:
+        return microscope.common.live_lines_s or None
     real_s = microscope.live_real_s
     return None if real_s is None else real_s / microscope.clock.real_s(1.0)
 
 
 class LiveLines:
-    """Knows which lines of the running scan have been published. Times are of the experiment.
+    """Reads the new lines of the running scan. Times are of the experiment.
 
     Args:
-        microscope: its `live_lines_s` says how often it is asked for lines.
+        microscope: its `live_lines_s` decides how often its lines are read.
     """
 
     def __init__(self, microscope: DriverBase) -> None:
@@ -238,17 +236,17 @@ class LiveLines:
         """When to `look` next; None: not before another scan begins."""
 
     def begin(self, now_ns: int) -> None:
-        """A scan began."""
+        """Start with a new scan."""
         if self._every_s is not None:
             self._began_ns, self._lines = now_ns, 0
             self.due_s = now_ns / NS_PER_S + self._every_s
 
     def end(self) -> None:
-        """It is over: the whole of it comes, or nothing more."""
+        """Stop: the scan is over, and only its file comes."""
         self.due_s = None
 
     def look(self, now_s: float) -> list[tuple[str, bytes]]:
-        """If it is time: the messages with the lines that are new."""
+        """Return the messages with the new lines, if they are due."""
         if self._every_s is None or self.due_s is None or now_s < self.due_s:
             return []
         self.due_s = now_s + self._every_s

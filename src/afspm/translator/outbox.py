@@ -1,7 +1,7 @@
 """Finished scans and spectra on their way out: each is published once, also over a kill of the process.
 
-A packet's time is what tells a subscriber that it has had it. So the times are written down before anything is
-published; a process that was killed in between publishes the same results again at the same times.
+A subscriber recognises a duplicate by its time. So the times are saved before anything is published; after a kill in
+between the same results are published again at the same times.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from afspm.translator.driver_base import DriverBase
 from afspm.wire import encode
 
 KEPT_FOR_REPLAY = 8
-"""So many last results are published again after a restart, for a scheduler that had not got them."""
+"""The number of last results published again after a restart, for a scheduler that had not received them."""
 
 
 class Outgoing(NamedTuple):
@@ -29,12 +29,12 @@ class Outgoing(NamedTuple):
 
 
 class Outbox:
-    """Finds out which results are new, reads them and makes packets of them.
+    """Finds new results, reads them and makes packets of them.
 
     Args:
-        microscope: that has the results.
-        kept: the part of the translator's memory that this is written to; whoever owns it saves it.
-        stamp: gives `count` strictly increasing times, ns, for as many packets.
+        microscope: has the results.
+        kept: the outbox's part of the translator's memory; the memory's owner saves it.
+        stamp: returns `count` strictly increasing times, ns.
     """
 
     def __init__(
@@ -52,11 +52,12 @@ class Outbox:
         self._complained: set[str] = set()
 
     def start(self) -> list[Outgoing]:
-        """After connecting. What was there before the experiment is none of its results.
+        """Return the packets to publish again after connecting. Results of before the experiment are ignored.
 
         Returns:
-            the packets of the last results, published by an earlier process or meant to be.
+            the packets of the last results, which an earlier process has published or was going to.
         """
+        # at the first start of the experiment, all results listed are older
         if "known" not in self._kept:
             self._kept["known"] = list(self._microscope.results())
             self._kept["sent"] = []
@@ -75,7 +76,7 @@ class Outbox:
         listed = list(self._microscope.results())
         known = set(self._kept["known"])
         new = [result for result in listed if result not in known]
-        if len(known) > len(listed):  # what the microscope no longer lists need not be remembered
+        if len(known) > len(listed):  # a result that the microscope lists no longer need not be remembered
             self._kept["known"] = [result for result in self._kept["known"] if result in set(listed)]
         for result in new:
             if result not in self._read and (messages := self._load(result)) is not None:
@@ -83,9 +84,10 @@ class Outbox:
         return bool(self._read)
 
     def take(self) -> list[Outgoing]:
-        """The packets of the new results. To be published after the memory was saved."""
+        """Return the packets of the new results, to be published after the memory was saved."""
         packets = []
         for result, messages in self._read.items():
+            # one time each: subscribers recognise a duplicate by its time
             times = self._stamp(len(messages))
             packets += _packets(messages, times)
             self._kept["known"].append(result)
@@ -94,7 +96,7 @@ class Outbox:
         return packets
 
     def discard(self) -> None:
-        """All that is new is of something broken off, and is not published."""
+        """Drop all new results: they belong to an interrupted measurement."""
         self._read.clear()
         known = set(self._kept["known"])
         self._kept["known"] += [result for result in self._microscope.results() if result not in known]
@@ -105,7 +107,7 @@ class Outbox:
             if blank := [one.channel for one in found if isinstance(one, Scan) and one.is_blank]:
                 self._log.warning("%s has no value in %s: NaN alone", result, ", ".join(blank))
             return [encode(one) for one in found]
-        except Exception as error:  # whatever is wrong with a file, the microscope is to be commanded
+        except Exception as error:  # a reader may raise anything; a bad file must not end the process
             if result not in self._complained:
                 why = error if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"
                 self._log.warning("%s can't be read yet: %s; retrying", result, why)

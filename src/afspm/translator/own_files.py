@@ -1,6 +1,7 @@
 """Files that afspm writes where a controller saves none: one per scan with all its channels, one per spectrum.
 
-The simulated microscope saves them, and drivers save what they fetched. `afspm.storage.formats.simulator` reads them.
+The simulated microscope saves them, and drivers save the data that they fetched. `afspm.storage.formats.simulator`
+reads them.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from afspm.storage.formats.netcdf import Attributes, Variable
 
 @dataclass(frozen=True)
 class FileFacts:
-    """The facts of a file besides its values.
+    """The metadata of a file.
 
     Attributes:
-        time_ns: when it was finished.
-        attributes: everything that was in force, for a reader of the file.
+        time_ns: when the measurement was finished.
+        attributes: all settings in force, for a reader of the file.
     """
 
     time_ns: int
@@ -30,7 +31,7 @@ class FileFacts:
 
 
 def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], facts: FileFacts) -> bytes:
-    """Return a scan file: a variable over (y, x) per channel; x and y are those of the frame before it was turned."""
+    """Return a scan file: a variable over (y, x) per channel; x and y are those of the unrotated frame."""
     rows, columns = next(iter(channels.values()))[1].shape
     (left, low), (width, height) = region.top_left_m, region.size_m
     variables = {
@@ -51,7 +52,7 @@ def encode_scan(region: Region, channels: Mapping[str, tuple[str, np.ndarray]], 
 
 
 def encode_spectrum(spectrum: Spectrum, facts: FileFacts) -> bytes:
-    """Return a spectrum file: a variable over (point) per measured one, in their order."""
+    """Return a spectrum file: a variable over (point) per measured quantity, in their order."""
     variables = {}
     for number, (name, unit) in enumerate(zip(spectrum.names, spectrum.units, strict=True)):
         attributes: Attributes = {"long_name": name, "units": unit}
@@ -69,5 +70,5 @@ def _header(content: str, facts: FileFacts) -> dict[str, str | float]:
 
 
 def _identifier(name: str) -> str:
-    """Return a name that every reader of the format takes; the real one is the attribute `long_name`."""
+    # not every reader of NetCDF takes spaces or non-ASCII characters; the attribute `long_name` has the real name
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()

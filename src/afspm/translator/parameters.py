@@ -1,7 +1,7 @@
-"""The parameters of a microscope as a table: what a parameter is called generically and by the vendor, and its bounds.
+"""The parameters of a microscope as a table: generic name, vendor's name, unit and bounds of each.
 
-Inside the translator every number is in the SI unit of its parameter (angles in rad); this is where vendor's units,
-a peer's units and text are converted, and where what can't be is refused. Nothing is ever clamped.
+Inside the translator every number is in the SI unit of its parameter (angles in rad). This module converts the units
+and texts of vendors and peers, and refuses impossible values. Nothing is ever clamped.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _LONGEST_TEXT = 200
 
 
 def refuse_value(name: str, reason: str) -> Refused:
-    """The refusal of a parameter's value: REP_PARAM_ERROR, nothing changed."""
+    """Return the refusal of a parameter's value: REP_PARAM_ERROR, nothing changed."""
     return Refused(ControlResponse.PARAM_ERROR, f"{name}: {reason}")
 
 
@@ -39,17 +39,16 @@ class ParameterSpec:
 
     Attributes:
         name: the generic name, e.g. "scan-speed".
-        vendor: what the controller calls it; the generic name if left out.
+        vendor: the controller's name for it; by default the generic name.
         unit: the controller's unit.
         type: "float", "int", "bool" or "text".
-        range: the smallest and largest value that is accepted, in SI.
-        choices: for a text, what it may be; empty: anything.
-        read_only: it can be asked for, not set.
+        range: the smallest and largest value accepted, in SI.
+        choices: the texts accepted; empty: any.
+        read_only: it can be read, not set.
         while_busy: it may be set during a scan or a move.
         sign: -1 where the controller counts the other way round (an axis pointing down, angles clockwise).
-        resolution: differences below it are not differences (what the controller rounds away, noise of a read-back),
-            in SI.
-        where: the file that the row is from.
+        resolution: smaller differences are none (rounding by the controller, noise of a read-back), in SI.
+        where: the file of the row.
     """
 
     name: str
@@ -66,17 +65,17 @@ class ParameterSpec:
 
     @property
     def si_unit(self) -> str:
-        """The SI unit of the value inside. Of the setpoint, whose kind the operating mode decides, the row has it."""
+        """The SI unit of the value. The setpoint's depends on the operating mode: its row has the unit."""
         si = names.BASE_PARAMETERS.get(self.name)
         return units.si_unit(self.unit) if si is None else si
 
     @property
     def wire_unit(self) -> str:
-        """The unit that is meant when a peer gives none, and in which it is told: lengths in m, angles in deg."""
+        """The unit of a value without one, from or to a peer: lengths in m, angles in deg."""
         return "deg" if self.si_unit == "rad" else self.si_unit
 
     def parse(self, text: str, unit: str | None = None) -> Value:
-        """Return the value that a peer asks for, converted and checked.
+        """Return a peer's value, converted and checked.
 
         Raises:
             Refused: PARAM_ERROR, with the value, the bound that it breaks and where that was set.
@@ -94,10 +93,10 @@ class ParameterSpec:
         return self.checked(self.from_unit(number, unit))
 
     def from_unit(self, number: float, unit: str | None) -> float:
-        """A number of a peer's unit in SI; none given means that of the wire.
+        """Return a number in a peer's unit in SI; None: the unit of the wire.
 
         Raises:
-            Refused: PARAM_ERROR: the unit is unknown or of another kind.
+            Refused: PARAM_ERROR: the unit is unknown or of another dimension.
         """
         try:
             return units.convert(float(number), unit or self.wire_unit, self.si_unit)
@@ -105,7 +104,7 @@ class ParameterSpec:
             raise refuse_value(self.name, str(error)) from error
 
     def checked(self, value: Value) -> Value:
-        """`value`, in SI, if it is of the right type and within the range; a whole number becomes an int.
+        """Return a value in SI, checked for type and range; a whole number becomes an int.
 
         Raises:
             Refused: PARAM_ERROR.
@@ -128,24 +127,24 @@ class ParameterSpec:
         return float(value)
 
     def same(self, a: Value, b: Value) -> bool:
-        """Return True if two values are the same to the controller's precision."""
+        """Return True if two values are equal to the controller's precision."""
         if isinstance(a, str) or isinstance(b, str):
             return a == b
-        # what went through the vendor's unit and back may differ in the last bits
+        # a value converted to the vendor's unit and back may differ in the last bits
         return math.isclose(a, b, rel_tol=1e-12, abs_tol=self.resolution)
 
     def to_vendor(self, value: Value) -> Value:
-        """A value in SI as the controller wants it."""
+        """Return a value in SI in the controller's unit and sign."""
         if isinstance(value, bool | str):
             return value
         number = units.convert(float(value), self.si_unit, self.unit) * self.sign
         return round(number) if self.type == "int" else number
 
     def from_vendor(self, value: Value) -> Value:
-        """A value as the controller gives it in SI.
+        """Return a value of the controller in SI.
 
         Raises:
-            Refused: PARAM_ERROR: the controller gave something else than the table says.
+            Refused: PARAM_ERROR: the value is not of the type in the table.
         """
         if self.type == "text":
             return str(value)
@@ -154,17 +153,17 @@ class ParameterSpec:
         try:
             number = float(value) * self.sign
         except (ValueError, TypeError):
-            raise refuse_value(self.name, f"the controller says {value!r}, which is not a number") from None
+            raise refuse_value(self.name, f"the controller returned {value!r}, which is not a number") from None
         number = units.convert(self._finite(number), self.unit, self.si_unit)
         return round(number) if self.type == "int" else number
 
     def _finite(self, number: float) -> float:
         if not math.isfinite(number):
-            raise refuse_value(self.name, f"the controller says {number}, which is not a finite number")
+            raise refuse_value(self.name, f"the controller returned {number}, which is not a finite number")
         return number
 
-    def told(self, value: Value, unit: str | None = None) -> tuple[str, str]:
-        """A value in SI as (text, unit) for a peer, in the unit that it used or in that of the wire."""
+    def for_peer(self, value: Value, unit: str | None = None) -> tuple[str, str]:
+        """Return a value in SI as (text, unit), in the peer's unit or the wire's."""
         if isinstance(value, bool):
             return ("true" if value else "false"), ""
         if isinstance(value, str):
@@ -174,18 +173,18 @@ class ParameterSpec:
             wanted = self.wire_unit
         if isinstance(value, int):
             return str(value), wanted
-        # 15 digits: what was set as "0.1 nm" is told as 0.1, not as 0.09999999999999999
+        # 15 digits: a value set as "0.1 nm" is returned as 0.1, not as 0.09999999999999999
         return f"{units.convert(value, self.si_unit, wanted):.15g}", wanted
 
     def quantity(self, value: Value) -> str:
-        """A value in SI with its unit, for a person."""
+        """Return a value in SI with its unit, for a person."""
         if isinstance(value, bool | str):
             return str(value)
         number = units.convert(float(value), self.si_unit, self.unit)
         return f"{number:.6g} {unit_text(self.unit)}".rstrip()
 
     def range_text(self) -> str:
-        """The range for a person, and where it was set."""
+        """Return the range for a person, and where it was set."""
         text = f"{self.quantity(self.range[0])} to {self.quantity(self.range[1])}"
         return f"{text} (set in {self.where})" if self.where else text
 
@@ -211,7 +210,7 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         """Read a microscope's own table: `[parameters.<generic name>]` with the attributes of `ParameterSpec`.
 
         Raises:
-            ConfigError: the file can't be read or says something that it can't.
+            ConfigError: the file can't be read or has an impossible value.
         """
         try:
             with path.open("rb") as file:
@@ -223,13 +222,13 @@ class ParameterTable(Mapping[str, ParameterSpec]):
     def extended(
         self, rows: Mapping[str, Mapping[str, object]], *, where: str, translated: Collection[str] = ()
     ) -> ParameterTable:
-        """This table with rows added or changed, attribute by attribute, e.g. by the experiment file.
+        """Return the table with rows added or changed, attribute by attribute, e.g. by the experiment file.
 
         Args:
-            translated: the names of rows that code translates: how the controller has them is not a row's to say.
+            translated: the names of rows that code translates: a row can't change their vendor's name or sign.
 
         Raises:
-            ConfigError: an attribute is unknown or has a value that it can't have; those of all rows at once.
+            ConfigError: an attribute is unknown or has an impossible value; the errors of all rows at once.
         """
         table = dict(self._rows)
         errors = ErrorCollector()
@@ -241,16 +240,16 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         return ParameterTable(table)
 
     def without(self, names_: Collection[str]) -> ParameterTable:
-        """This table less some rows."""
         return ParameterTable({name: row for name, row in self._rows.items() if name not in names_})
 
     def find(self, name: str) -> ParameterSpec:
-        """A parameter by the name that a peer gave.
+        """Return a parameter by the name that a peer sent.
 
         Raises:
             Refused: PARAM_NOT_SUPPORTED, with the nearest name.
         """
         if name not in self._rows:
+            # the name comes from a peer, and may be of any length
             near = difflib.get_close_matches(name[:100], self._rows, n=1)
             hint = f", perhaps {near[0]!r}" if near else ""
             reason = f"this microscope has no parameter {name[:100]!r}{hint}"
@@ -258,10 +257,10 @@ class ParameterTable(Mapping[str, ParameterSpec]):
         return self._rows[name]
 
     def written(self, given: PlainMapping, *, where: str) -> dict[str, Value]:
-        """Values as the experiment file has them, in SI: "2 um/s", or plain numbers in the row's unit.
+        """Return values of the experiment file in SI: "2 um/s", or plain numbers in the row's unit.
 
         Raises:
-            ConfigError: a name or a value can't be; all of them at once.
+            ConfigError: a name or a value is impossible; all such errors at once.
         """
         values: dict[str, Value] = {}
         errors = ErrorCollector()
@@ -333,7 +332,7 @@ def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: b
 
 
 def _with_numbers(row: ParameterSpec, values: PlainMapping, where: str) -> ParameterSpec:
-    """The row with its numbers in SI: plain ones are in the row's unit, texts carry their own."""
+    # plain numbers are in the row's unit, texts carry their own
 
     def number(value: Any) -> float:
         given, unit = units.parse_quantity(value) if isinstance(value, str) else (float(value), "")
@@ -344,7 +343,7 @@ def _with_numbers(row: ParameterSpec, values: PlainMapping, where: str) -> Param
     if not isinstance(row.sign, int | float) or abs(row.sign) != 1:
         raise ValueError(f"sign must be 1 or -1, not {row.sign!r}")
     if row.type in ("float", "int"):
-        units.convert(1.0, row.unit, row.si_unit)  # the vendor's unit is of the right kind
+        units.convert(1.0, row.unit, row.si_unit)  # raises unless the vendor's unit has the right dimension
     if "range" in values:
         low, high = map(number, values["range"])
         if not low <= high:

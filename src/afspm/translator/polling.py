@@ -1,8 +1,8 @@
-"""The time between two looks at a controller: eagerly when something is about to end, seldom else. Pure.
+"""The time between two looks at a controller: short when a measurement is about to end, long otherwise. Pure.
 
-The end of a scan is to be noticed within 20 ms of the controller saying so, and a controller that serves one request
-after the other is not to be kept busy with ours meanwhile. So the time between two looks shrinks in proportion to
-what is left until the expected end, and grows again in proportion to how far that was missed.
+The end of a scan has to be noticed within 20 ms of the controller's report. A controller that serves one request after
+the other must not be kept busy by polling meanwhile. So the time between two looks shrinks in proportion to the time
+left until the expected end, and grows again in proportion to the time since.
 """
 
 from __future__ import annotations
@@ -12,16 +12,20 @@ from collections.abc import Hashable
 from dataclasses import dataclass
 
 EAGER_S = 0.01
-"""Between two looks when the end may come at any moment: what is left of 20 ms is for the look itself."""
-_PART = 0.1  # of what is left until the end: this much of it passes between two looks
-_GUESSED, _BY_OTHERS, _SAME = 0.35, 0.03, 0.005  # how wrong an expectation may be, as a part of the duration
+"""Between two looks when the end may come at any moment: the other half of the 20 ms is for the look itself."""
+_PART = 0.1  # of the time left until the expected end passes between two looks
+_GUESSED, _BY_OTHERS, _SAME = (
+    0.35,
+    0.03,
+    0.005,
+)  # uncertainty of the end, as a part of the duration: by settings, by other scans, by the same scan
 _LEAST_DOUBT_S = 0.05
 _REMEMBERED = 64
 
 
 @dataclass(frozen=True)
 class ExpectedEnd:
-    """When something that began at `began_s` should end, and how sure that is; None: nothing is known of it."""
+    """The expected end of a measurement that began at `began_s`, with its uncertainty; None: not known."""
 
     began_s: float
     end_s: float | None = None
@@ -29,11 +33,11 @@ class ExpectedEnd:
 
 
 class AdaptivePolling:
-    """Learns how long measurements take, and says when to look next. All times are real seconds.
+    """Learns how long measurements take, and returns the time until the next look. All times are real seconds.
 
     Args:
-        idle_s: between two looks when nothing is about to happen.
-        eager_s: when something is.
+        idle_s: between two looks when no change is expected.
+        eager_s: between two looks when a change is expected at once.
     """
 
     def __init__(self, idle_s: float, eager_s: float = EAGER_S) -> None:
@@ -46,7 +50,12 @@ class AdaptivePolling:
         self._over_s: float | None = None
 
     def began(self, what: Hashable, now_s: float, guess_s: float | None = None) -> None:
-        """A measurement began: `what` is the same for those that take as long; `guess_s` what its settings say."""
+        """Record the start of a measurement.
+
+        Args:
+            what: equal for measurements of equal duration.
+            guess_s: the duration by its settings; None: not known.
+        """
         self._measuring, self._over_s = (what, guess_s), None
         lasts_s, doubt = self._lasted_s.get(what), _SAME
         if lasts_s is None and guess_s is not None:
@@ -57,18 +66,18 @@ class AdaptivePolling:
             self._expected = ExpectedEnd(now_s, now_s + lasts_s, max(_LEAST_DOUBT_S, doubt * lasts_s))
 
     def moved(self, now_s: float) -> None:
-        """Something else began that should not take long."""
+        """Record the start of a short activity."""
         self._measuring = None
         self._expected = ExpectedEnd(now_s, now_s)
 
     def over(self, now_s: float) -> None:
-        """The controller has ended the measurement; what came of it may take a moment to be there."""
+        """Record the end of the measurement at the controller; its result may take a moment to appear."""
         if self._over_s is None and self._expected is not None:
             self._over_s = now_s
             self._expected = ExpectedEnd(self._expected.began_s, now_s)
 
     def ended(self, now_s: float, *, as_expected: bool) -> None:
-        """All is done; what was broken off is nothing to learn from."""
+        """Record that the result is there, and learn the duration, unless the measurement was interrupted."""
         if as_expected and self._measuring is not None and self._expected is not None:
             what, guess_s = self._measuring
             lasted_s = (now_s if self._over_s is None else self._over_s) - self._expected.began_s

@@ -1,4 +1,4 @@
-"""Answers requests: obeys one scheduler, carries out none twice, and says so when the controller is lost."""
+"""Answers requests: obeys one scheduler, executes no request twice, and reports a lost controller."""
 
 from __future__ import annotations
 
@@ -28,7 +28,6 @@ from afspm.translator.commands import Commands
 from afspm.translator.connection import Connection
 from afspm.translator.driver_base import LOST, DriverBase
 from afspm.translator.observer import Observer
-from afspm.translator.safe_exit import FeedbackWatch
 from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 from afspm.translator.trace import TRACE
@@ -43,7 +42,7 @@ class RequestHandler:
 
     Args:
         fence: decides which scheduler is obeyed.
-        is_connected: tells whether a connection that asked before still stands.
+        is_connected: returns whether an earlier connection still stands.
         reply: sends a response, and logs a refusal at a level.
     """
 
@@ -53,7 +52,6 @@ class RequestHandler:
         connection: Connection,
         observer: Observer,
         state: TranslatorState,
-        feedback: FeedbackWatch,
         temporary: TemporarySettings,
         log: logging.Logger,
         *,
@@ -65,35 +63,35 @@ class RequestHandler:
         self._connection = connection
         self._observer = observer
         self._state = state
-        self._feedback = feedback
         self._fence = fence
         self._is_connected = is_connected
         self._reply = reply
         self._outcomes = RequestOutcomes(state.kept, all_or_nothing=driver.memory_is_all)
-        self.commands = Commands(driver, state.sequence, temporary, self._about_to_act, log)
+        self.commands = Commands(driver, state.sequence, temporary, self._record_begin, log)
         self._acting: Request | None = None
         self._commander = b""
         self._last_refusal = ""
 
     def refuses(self, arrived: RequestReceived) -> bool:
-        """Answer a peer that is not obeyed, and return True; False: it is obeyed."""
+        """Refuse a request of a peer that is not obeyed, and return True; False: the peer is obeyed."""
         before, epoch = self._commander, Epoch.decode(arrived.epoch)
-        why = self._fence.refusal(epoch, _run_in(arrived.frames), lambda: self._is_connected(before))
+        why = self._fence.refusal(epoch, _run_of(arrived.frames), lambda: self._is_connected(before))
         if not why:
             self._commander = arrived.connection if epoch is not None else before
             return False
         last, self._last_refusal = self._last_refusal, why
+        # a peer that is not obeyed may repeat its request for hours: its refusal is logged once
         level = logging.DEBUG if last == why else logging.WARNING
         self._reply(Response(ControlResponse.FAILURE, reason=why, id=wire.id_of(arrived.frames)), level)
         return True
 
     def answer(self, frames: Sequence[bytes]) -> None:
-        """Carry a request out, unless that was done before, and answer it."""
+        """Execute a request, unless that was done before, and answer it."""
         try:
             request = wire.decode_request(frames)
         except WireError as error:
             refusal = Response(error.response, reason=str(error), id=wire.id_of(frames))
-            self._reply(refusal, logging.DEBUG)  # a stranger can send millions
+            self._reply(refusal, logging.DEBUG)  # at DEBUG: a stranger can send millions
             return
         known = self._outcomes.outcome(request)
         if known is not None:
@@ -110,18 +108,19 @@ class RequestHandler:
             self._finish(request, Response(ControlResponse.NO_RESPONSE, b"", reason, request.id, detail))
 
     def act(self, action: str) -> Response:
-        """Do an action that nobody has asked for."""
+        """Execute an action of the translator itself."""
         done = self.commands.do(Request(ControlRequest.ACTION, action))
         self._observer.play(done.steps)
         return done.response
 
     def _carry_out(self, request: Request) -> None:
         connection, observer = self._connection, self._observer
-        # whether it is free is decided by what it does now, not at the last look
-        if connection.stands and not _only_asks(request):
+        # the last look may be old: the microscope must be free now
+        if connection.stands and not _is_read_only(request):
             connection.guarded(partial(observer.observe, values=False))
         if request.subject == names.RETRACT:
-            connection.reach()  # the way out is always open: a controller that is there will do, whatever else it says
+            # a retract is always possible: a reachable controller suffices, even if its state can't be read
+            connection.reach()
         else:
             connection.require()
         try:
@@ -129,30 +128,31 @@ class RequestHandler:
         finally:
             TRACE.command("")
         if request.kind == ControlRequest.ACTION and done.response.ok and not done.steps:
-            connection.guarded(observer.observe)  # first, so that the answered peer knows what its action has set
+            connection.guarded(
+                observer.observe
+            )  # before the answer, so that the peer then knows the settings changed by its action
         self._finish(request, done.response)
         observer.play(done.steps)
         if done.response.ok and (done.steps or done.announce):
             connection.guarded(partial(observer.observe, done.announce))
 
-    def _about_to_act(self, request: Request) -> None:
-        """Write down that a request is going to be carried out."""
+    def _record_begin(self, request: Request) -> None:
         self._driver.prove()
         self._acting = request
         TRACE.command(f"{request_name(request.kind)} {request.subject}")
-        in_doubt = self._feedback.may_switch(request)
+        in_doubt = self._state.feedback.may_switch(request)
         self._outcomes.begin(request)
-        # what a kill leaves half set may be set again; an action may not be done again
+        # saved before: after a kill a setting may be written again, but an action must not be repeated
         once = bool(request.id) and request.kind == ControlRequest.ACTION
         if (in_doubt or once) and not self._driver.memory_is_all:
             self._state.save()
 
     def _finish(self, request: Request, response: Response) -> None:
-        """Write down what came of a request before anybody hears of it, and answer."""
+        # saved before the answer is sent: a retry after a kill gets the same answer
         if self._acting is request:
             self._acting = None
             if request.subject == names.RETRACT and response.ok:
-                self._feedback.retracted()
+                self._state.feedback.retracted()
             if response.code == ControlResponse.PARAM_ERROR:
                 self._outcomes.forget(request)  # nothing was changed
             else:
@@ -161,25 +161,25 @@ class RequestHandler:
         self._reply(response, logging.INFO)
 
 
-def _run_in(frames: Sequence[bytes]) -> str:
-    """Return the run of a component, from the id of its request; empty: it says none."""
+def _run_of(frames: Sequence[bytes]) -> str:
+    # before decoding, so that a stranger costs little: the id of a component's request names its run
     request_id = frames[2].decode("utf-8", "replace") if len(frames) > 2 else ""
     return run_of(request_id.partition("/")[0], request_id)
 
 
-def _only_asks(request: Request) -> bool:
+def _is_read_only(request: Request) -> bool:
     if request.kind == ControlRequest.PARAM:
         return isinstance(request.subject, Parameter) and request.subject.value is None
     return request.kind == ControlRequest.ACTION_SUPPORT
 
 
 class RequestOutcomes:
-    """The outcomes of the last requests that had an id. See `model.idempotency_cache` for older ids.
+    """The outcomes of the last requests with an id. See `model.idempotency_cache` for older ids.
 
     Args:
-        kept: the translator's memory; whoever owns it saves it, with every request. So an entry is a text, which is
-            quickly written: what was asked, and once it is known what came of it.
-        all_or_nothing: the microscope's own state is saved together with the ledger: what has no outcome here
+        kept: the translator's memory, which is saved with every request. So an entry is one text, which is quick to
+            write: the fingerprint of the request, then its outcome.
+        all_or_nothing: the microscope's own state is saved together with these outcomes: a request without an outcome
             was not done. Otherwise a request that was begun and has no outcome may have been done.
     """
 
@@ -187,13 +187,14 @@ class RequestOutcomes:
         self._shelves: tuple[dict[str, str], ...] = kept.setdefault("ledger", {}), kept.setdefault("unnumbered", {})
         self._kept = kept
         kept.setdefault("forgotten", {})
+        # begun and without an outcome: the microscope's state is in the same file, so nothing was done
         if all_or_nothing:
             for shelf in self._shelves:
                 for request_id in [key for key, entry in shelf.items() if " " not in entry]:
                     del shelf[request_id]
 
     def outcome(self, request: Request) -> Response | None:
-        """Return how the request was answered before; None if it is new."""
+        """Return the earlier answer to a request; None if the request is new."""
         entry = self._shelf(request.id).get(request.id) if request.id else None
         if entry is None:
             return self._forgotten(request)
@@ -208,7 +209,7 @@ class RequestOutcomes:
         return Response(int(code), base64.b64decode(payload), reason, request.id)
 
     def begin(self, request: Request) -> None:
-        """The request is going to be carried out."""
+        """Record that a request is about to be executed."""
         if not request.id:
             return
         shelf = self._shelf(request.id)
@@ -231,14 +232,14 @@ class RequestOutcomes:
         return self._shelves[number_of(request_id) is None]
 
     def finish(self, request: Request, response: Response) -> None:
-        """The request was carried out, with this outcome."""
+        """Record the outcome of a request."""
         if request.id:
             payload = base64.b64encode(response.payload).decode()
             entry = f"{_fingerprint(request)} {int(response.code)} {payload} {response.reason}"
             self._shelf(request.id)[request.id] = entry
 
     def forget(self, request: Request) -> None:
-        """Nothing of the request was done: it may be asked again."""
+        """Remove a request that was not executed: it may be repeated."""
         self._shelf(request.id).pop(request.id, None)
 
 

@@ -1,6 +1,6 @@
-"""Finds the files that a controller saves: which measurement is running, which has ended, and which results there are.
+"""Finds the files that a controller saves: the running measurement, the one just ended, and the results.
 
-What is known of them outlives a restart of the translator.
+All of this is kept over a restart of the translator.
 """
 
 from __future__ import annotations
@@ -22,26 +22,25 @@ from afspm.storage.formats import FileContent, read
 from afspm.translator.trace import TRACE
 
 SCAN: Final = "scan"
-"""The kind of a measurement that is no spectrum; that of a spectrum is its own."""
+"""The kind of a measurement that is no spectrum; a spectrum has the name of its own kind."""
 _LISTED: Final = 16
 _OF_A_RESULT: Final = ("what", "frame", "position", "end_ns")
 
 XY = tuple[float, float]
 Content = Sequence[Scan | Spectrum]
 Entry = Plain
-"""Of a measurement, in JSON: "what" it is, "frame" or "position" as they were set, "end_ns", and what a driver adds."""
+"""A measurement in JSON: "what" kind it is, "frame" or "position" as they were set, "end_ns", keys of the driver."""
 
 
 class ResultFiles(ABC):
     """The measurements of one controller.
 
     Args:
-        kept: JSON-able, and lasts. What is "running" or has "ended" is there as an `Entry`; "results" have a name, by
-            "result", and the same.
+        kept: a JSON dict on disk: "running" and "ended" are an `Entry` or None; "results" are entries with a name, by
+            "result".
 
     Attributes:
-        broken_off: True if it turned out that what has ended was broken off at the controller; until results are asked
-            for.
+        broken_off: True if the measurement that has ended was interrupted at the controller; until the next `results`.
     """
 
     def __init__(self, kept: Entry, log: logging.Logger) -> None:
@@ -54,29 +53,29 @@ class ResultFiles(ABC):
 
     @abstractmethod
     def read(self, entry: Entry) -> Content:
-        """Return the content of a result, with the parameters that it was taken with. Raises FileError."""
+        """Return the content of a result, with the parameters it was taken with. Raises FileError."""
 
     @property
     def what(self) -> str:
-        """The measurement that is running: `SCAN`, the kind of a spectrum, or empty."""
+        """The running measurement: `SCAN`, the kind of a spectrum, or empty."""
         running = self._kept["running"]
         return running["what"] if running else ""
 
     @property
     def frame(self) -> list[float] | None:
-        """The frame of the scan that is running (`as_list`); None: none is."""
+        """The frame of the running scan (`as_list`); None: none is running."""
         running = self._kept["running"]
         return None if running is None else running.get("frame")
 
     def forget(self) -> None:
-        """Forget what is running or has ended: it was broken off."""
+        """Forget the running or ended measurement: it was interrupted."""
         self._kept["running"] = self._kept["ended"] = None
 
     def load(self, result: str) -> Content:
         """Read one of the results.
 
         Raises:
-            FileError: it is no result any more, or its file has gone.
+            FileError: the result is not among the last ones, or its file is gone.
         """
         entry = next((one for one in self._kept["results"] if one["result"] == result), None)
         if entry is None:
@@ -92,23 +91,21 @@ class ResultFiles(ABC):
         self._kept["running"], self._kept["ended"] = None, {**self._kept["running"], **facts}
 
     def _add(self, result: str, measured: Entry, facts: Mapping[str, object], content: Content) -> None:
-        """It is a result, by this name."""
         taken = {key: measured[key] for key in _OF_A_RESULT if key in measured}
         self._kept["results"] = [*self._kept["results"], {"result": result, **taken, **facts}][-_LISTED:]
         self._content = {result: content}
 
     def _listed(self) -> list[str]:
-        """Return the last results, oldest first."""
         return [entry["result"] for entry in self._kept["results"]]
 
 
 @dataclass(frozen=True)
 class FilePrecision:
-    """The precision of a controller's files: what they leave out of the numbers that were set.
+    """The precision of a controller's files: how much the numbers in a file differ from the ones that were set.
 
     Attributes:
-        part: of the largest length, what is left out of each.
-        angle_rad: what is left out of the angle.
+        part: the rounding of a length, as a part of the largest length.
+        angle_rad: the rounding of the angle.
         positions: True if the file of a spectrum has its position as it was set.
     """
 
@@ -117,15 +114,17 @@ class FilePrecision:
     positions: bool = False
 
     def same(self, a: Region, b: Region) -> bool:
-        """Return True if two frames are one to the digits of a file."""
+        """Return True if two frames are equal to the digits of a file."""
         lengths_m = [*a.center_m, *a.size_m]
         scale_m = self.part * max(*map(abs, a.center_m), *a.size_m)
         close = np.allclose(lengths_m, [*b.center_m, *b.size_m], rtol=0.0, atol=scale_m)
         return bool(close) and abs(math.remainder(a.angle_rad - b.angle_rad, math.tau)) <= self.angle_rad
 
     def as_set(self, one: Scan | Spectrum, measured: Entry) -> Scan | Spectrum:
-        """Return a scan or spectrum of a file with the frame or position that was set, where the file has the same,
-        and our time."""
+        """Return a scan or spectrum of a file with the frame or position that was set, and with our time.
+
+        The file's own frame or position stays if it differs by more than its precision.
+        """
         time_ns = measured["end_ns"]
         if isinstance(one, Scan):
             wanted = as_region(measured["frame"])
@@ -145,30 +144,31 @@ class FilePrecision:
 
 
 def read_result(path: Path | str) -> FileContent:
-    """Read a file of the controller; a trace has it, too. Raises FileError."""
+    """Read a file of the controller, and add it to the trace. Raises FileError."""
     content = read(path)
     TRACE.file(Path(path))
     return content
 
 
 def as_list(region: Region) -> list[float]:
-    """Return a frame as it is kept."""
+    """Return a frame as a list, to be kept as JSON."""
     return [*region.center_m, *region.size_m, region.angle_rad]
 
 
 def as_region(kept: Sequence[float]) -> Region:
-    """Return the frame that was kept by `as_list`."""
+    """Return the frame that `as_list` gave."""
     x, y, width, height, angle_rad = kept
     return Region((x, y), (width, height), angle_rad)
 
 
 def lines_missing(content: Iterable[Scan | Spectrum]) -> int:
-    """Return how many lines of the scans have no value at all: they were broken off."""
+    """Return how many lines of the scans have no value at all: the scans were interrupted."""
     return max((one.lines_missing for one in content if isinstance(one, Scan)), default=0)
 
 
 def modified_ns(path: Path) -> int:
-    """Return when a file was written last; 0: it is not there."""
+    """Return the time of the last write of a file; 0: the file does not exist."""
+    # the controller may delete or rename a file at any time
     try:
         return path.stat().st_mtime_ns
     except OSError:
@@ -176,6 +176,6 @@ def modified_ns(path: Path) -> int:
 
 
 def newest(files: Iterable[Path], after_ns: int = 0) -> tuple[int, Path | None]:
-    """Return the file that was written last, after a time, and when; (0, None): there is none."""
+    """Return the file written last after a time, and when; (0, None): there is none."""
     times = [(modified_ns(file), file) for file in files]
     return max((one for one in times if one[0] > after_ns), default=(0, None))

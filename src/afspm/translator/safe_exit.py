@@ -1,4 +1,4 @@
-"""Sees to the tip when a run ends: nothing goes on measuring, and a tip without feedback is retracted."""
+"""Makes the end of a run safe: the measurement is stopped, and a tip without feedback is retracted."""
 
 from __future__ import annotations
 
@@ -7,74 +7,32 @@ import logging
 from collections.abc import Callable
 
 from afspm.basics.clock import Clock
-from afspm.model import ControlRequest, Request, Response, ScopeState, names
-from afspm.model.microscope_status import feedback_of
+from afspm.model import Response, ScopeState, names
 from afspm.translator.connection import RETRY_S, Connection
 from afspm.translator.driver_base import LOST
-from afspm.translator.state import Kept, TranslatorState
+from afspm.translator.state import TranslatorState
 from afspm.translator.temporary_settings import TemporarySettings
 
 _LOOK_S = 0.1
 _TIP_S = 8.0
-"""Real time in which the tip is tried to be retracted when the run is stopped: a controller may be lost just then, or
-refuse. A little less than `transport.process.parent` leaves."""
-
-
-class FeedbackWatch:
-    """Remembers whether a request, rather than a person at the panel, has switched the feedback off.
-
-    Args:
-        kept: JSON values that outlive a kill.
-    """
-
-    def __init__(self, kept: Kept) -> None:
-        self._kept = kept
-
-    @property
-    def is_off(self) -> bool:
-        """True while the feedback is known to be switched off by a request."""
-        return bool(self._kept.get("feedback_off"))
-
-    @property
-    def in_danger(self) -> bool:
-        """True while the feedback is, or may be, switched off by a request."""
-        return self.is_off or bool(self._kept.get("may_have_switched"))
-
-    def saw(self, on: bool | None) -> bool:
-        """Note the feedback as it is now. Return True if a request was just seen to have switched it off."""
-        kept = self._kept
-        switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
-        kept["feedback_off"] = on is False and (switched_off or self.is_off)
-        kept["feedback_was_on"], kept["may_have_switched"] = on, False
-        return switched_off
-
-    def may_switch(self, request: Request) -> bool:
-        """Note that a request is about to act. Return True if a kill must not make this be forgotten."""
-        affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
-        in_doubt = affects and not self._kept.get("may_have_switched")
-        self._kept["may_have_switched"] = True
-        return in_doubt
-
-    def retracted(self) -> None:
-        """Note that the tip is away, and needs no feedback."""
-        self._kept["may_have_switched"] = self._kept["feedback_off"] = False
+"""Real time for attempts to retract the tip when the run is stopped: the controller may be lost just then, or refuse. A
+little less than `transport.process.parent` allows."""
 
 
 class SafeExit:
-    """Stops what is measuring, and retracts the tip where that is owed.
+    """Stops the running measurement, and retracts the tip where that is owed.
 
     Args:
-        retracts: True if the tip is to be retracted when nobody is left to switch the feedback on again that a request
-            has switched off.
-        act: does an action that nobody has asked for.
-        observe: publishes what is new.
+        retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch
+            it on again.
+        act: executes an action of the translator itself.
+        observe: publishes all changes.
     """
 
     def __init__(
         self,
         connection: Connection,
         state: TranslatorState,
-        feedback: FeedbackWatch,
         temporary: TemporarySettings,
         clock: Clock,
         log: logging.Logger,
@@ -85,7 +43,6 @@ class SafeExit:
     ) -> None:
         self._connection = connection
         self._state = state
-        self._feedback = feedback
         self._temporary = temporary
         self._clock = clock
         self._log = log
@@ -95,31 +52,32 @@ class SafeExit:
 
     def is_owed(self) -> bool:
         """Return True if the tip has to be retracted before the process ends. May be called from another thread."""
-        return self._retracts and self._feedback.in_danger
+        return self._retracts and self._state.feedback.in_danger
 
     def end(self) -> None:
-        """End as the scheduler says, which has seen to the tip."""
-        with contextlib.suppress(*LOST):
+        """End on the scheduler's request; the scheduler has made the tip safe."""
+        with contextlib.suppress(*LOST):  # the process ends in any case
             self._stop_measuring()
             self._temporary.end()
 
     def leave(self, wait: Callable[[float], None]) -> None:
-        """End with nobody left. A feedback that is off at the panel is for the person at the panel.
+        """End without a scheduler. A feedback that was switched off at the panel is left to the person there.
 
         Args:
-            wait: lets so many real seconds pass, and looks at the controller then.
+            wait: lets a time in real seconds pass, and then looks at the controller.
         """
         self._connection.guarded(self._stop_measuring)
         if self._connection.stands:
             self._connection.guarded(self._temporary.end)
+        # the feedback is not switched on instead: where the tip would land by then is not known (decision 0007)
         until_s = self._clock.monotonic_s() + _TIP_S
         is_told = False
         while is_told or self.is_owed():
-            is_off = is_told or self._feedback.is_off
-            why_not = self._why_not_told() if is_off else f"the controller is lost: {self._connection.why_lost}"
+            is_off = is_told or self._state.feedback.is_off
+            why_not = self._retract_failure() if is_off else f"the controller is lost: {self._connection.why_lost}"
             if not why_not:
                 is_told = True
-                why_not = self._why_not_away(wait, until_s)
+                why_not = self._motion_failure(wait, until_s)
             if not why_not:
                 self._log.warning("the run is stopping with the feedback off: the tip was retracted")
                 return
@@ -130,25 +88,21 @@ class SafeExit:
                 return
             wait(RETRY_S)
 
-    def _why_not_away(self, wait: Callable[[float], None], until_s: float) -> str:
-        """Return why the tip that was told to retract may not be away; empty: it is seen to be.
-
-        A controller may not have heard yet what it was told, and would not any more without our connection.
-        """
+    def _motion_failure(self, wait: Callable[[float], None], until_s: float) -> str:
+        # a controller may not have read the command yet, and drops it when our connection closes
         sets_out = False
-        while (state := self._state.sequence.said.state) is not ScopeState.FREE:
+        while (state := self._state.sequence.published.state) is not ScopeState.FREE:
             sets_out = sets_out or state is ScopeState.COARSE_MOTOR
             if not self._connection.stands:
                 return f"the controller is lost: {self._connection.why_lost}"
             if sets_out and state is ScopeState.INTERRUPTED:
-                return "it was broken off"
+                return "the retract was interrupted"
             if self._clock.monotonic_s() >= until_s:
-                return f"it was told to, and is still {state.name}"
+                return f"a retract was sent, and the state is still {state.name}"
             wait(_LOOK_S)
         return ""
 
-    def _why_not_told(self) -> str:
-        """Return why the tip can't be told to retract; empty: it was."""
+    def _retract_failure(self) -> str:
         answered: list[Response] = []
         self._connection.guarded(lambda: answered.append(self._retract()))
         if not answered:
@@ -163,9 +117,8 @@ class SafeExit:
         return response
 
     def _stop_measuring(self) -> None:
-        """Stop a measurement: the tip does not go on scanning with nobody there."""
-        said = self._state.sequence.said.state
-        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(said)
+        published = self._state.sequence.published.state
+        stop = {ScopeState.SCANNING: names.STOP_SCAN, ScopeState.SPEC: names.STOP_SPEC}.get(published)
         if stop is not None and self._connection.stands:
             self._act(stop)
             self._observe()

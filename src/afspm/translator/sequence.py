@@ -1,8 +1,7 @@
-"""In which order peers see what a microscope does (wire format, "What a translator does"). Pure.
+"""The order in which peers see the states of a microscope (wire format, "What a translator does"). Pure.
 
-The controller is polled: it may be free again before it was ever seen scanning, its file may come later than its
-state. What is published is always the whole story: SS_SCANNING, the results, SS_FREE; or SS_SCANNING,
-SS_INTERRUPTED, SS_FREE.
+The controller is polled: it may be free again before it was ever seen scanning, and its file may come after its state.
+The published sequence is always complete: SS_SCANNING, the results, SS_FREE; or SS_SCANNING, SS_INTERRUPTED, SS_FREE.
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ class PublishStatus:
 
 @dataclass(frozen=True)
 class PublishResults:
-    """Publish the results that have come."""
+    """Publish the new results."""
 
 
 @dataclass(frozen=True)
 class DiscardResults:
-    """The results that have come, if any, are of something broken off: they are not published."""
+    """Drop new results, if any: they belong to an interrupted measurement."""
 
 
 @dataclass(frozen=True)
 class LogError:
-    """Something that should not be: into the log."""
+    """Write an error to the log."""
 
     text: str
 
@@ -43,85 +42,85 @@ _INTERRUPTED = ScopeStatus(ScopeState.INTERRUPTED)
 
 
 class StatusSequence:
-    """Turns what is seen at the controller into what is published.
+    """Turns observed states of the controller into published ones.
 
     Args:
-        said: what was published last (by an earlier process of this translator).
-        result_timeout_s: how long results may come after the end, and a stop may take.
+        published: the status published last (by an earlier process of this translator).
+        result_timeout_s: how long after the end results may come, and how long a stop may take.
     """
 
-    def __init__(self, said: ScopeStatus, result_timeout_s: float) -> None:
-        self.said = said
+    def __init__(self, published: ScopeStatus, result_timeout_s: float) -> None:
+        self.published = published
         self._timeout_s = result_timeout_s
         self._waiting_since_s: float | None = None
         self._broken_off = ScopeState.UNDEFINED
 
     def begin(self, state: ScopeState) -> list[SequenceStep]:
-        """A request was accepted that leads to `state`, seen at the controller already or not."""
-        return self._say(ScopeStatus(state))
+        """Publish `state`: a request was accepted that leads to it, whether or not it was observed already."""
+        return self._publish(ScopeStatus(state))
 
     def interrupt(self) -> list[SequenceStep]:
-        """Note that what is running was told to stop."""
-        return self._say(_INTERRUPTED)
+        """Publish an interruption: a request has stopped the running measurement."""
+        return self._publish(_INTERRUPTED)
 
     def follow(self, *, is_whole: bool) -> list[SequenceStep]:
-        """Publish the end of a measurement that was never seen to end, since another one followed at once.
+        """Publish the end of a measurement whose end was never observed, since another one followed at once.
 
         Args:
-            is_whole: False if it was broken off.
+            is_whole: False if it was interrupted.
         """
-        if self.said.state not in MEASURING:
+        if self.published.state not in MEASURING:
             return []
         free = ScopeStatus(ScopeState.FREE)
         if is_whole:
-            return [PublishResults(), *self._say(free)]
-        return [*self._say(_INTERRUPTED), DiscardResults(), *self._say(free)]
+            return [PublishResults(), *self._publish(free)]
+        return [*self._publish(_INTERRUPTED), DiscardResults(), *self._publish(free)]
 
     def observe(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
-        """The controller was looked at.
+        """Process the status that was just read from the controller.
 
         Args:
-            seen: what it is doing.
-            results: whether there are results that have not been published.
+            seen: the status.
+            results: whether there are unpublished results.
             now_s: experiment time.
         """
-        if self.said.state is ScopeState.INTERRUPTED:
+        if self.published.state is ScopeState.INTERRUPTED:
             return self._after_interruption(seen, now_s)
-        if seen == self.said:
+        if seen == self.published:
             self._waiting_since_s = None
-            return self._unseen(results) if seen.state is ScopeState.FREE else []
-        if self.said.state not in MEASURING or seen.state is self.said.state:
-            # results that are there already belong to what began and ended between two looks
-            return (self._unseen(results) if seen.state is ScopeState.FREE else []) + self._say(seen)
+            return self._unseen_scan(results) if seen.state is ScopeState.FREE else []
+        if self.published.state not in MEASURING or seen.state is self.published.state:
+            # results that are there already belong to a measurement that began and ended between two looks
+            return (self._unseen_scan(results) if seen.state is ScopeState.FREE else []) + self._publish(seen)
         return self._after_measuring(seen, results, now_s)
 
-    def _unseen(self, results: bool) -> list[SequenceStep]:
-        """Someone at the controller's panel took a scan between two looks at it."""
-        if not results or self.said.state is ScopeState.UNDEFINED:
+    def _unseen_scan(self, results: bool) -> list[SequenceStep]:
+        # a person at the panel took a scan that began and ended between two looks
+        if not results or self.published.state is ScopeState.UNDEFINED:
             return []
-        after = self.said
-        return [*self._say(ScopeStatus(ScopeState.SCANNING)), PublishResults(), *self._say(after)]
+        after = self.published
+        return [*self._publish(ScopeStatus(ScopeState.SCANNING)), PublishResults(), *self._publish(after)]
 
     def _after_measuring(self, seen: ScopeStatus, results: bool, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:
-            return self._say(seen)
+            return self._publish(seen)
         if results:
-            return [PublishResults(), *self._say(seen)]
+            return [PublishResults(), *self._publish(seen)]
         if not self._timed_out(now_s):
             return []
         text = "a scan or spectrum ended without a result: it was stopped at the controller, or its file is missing"
-        return [LogError(text), *self._say(_INTERRUPTED), DiscardResults(), *self._say(seen)]
+        return [LogError(text), *self._publish(_INTERRUPTED), DiscardResults(), *self._publish(seen)]
 
     def _after_interruption(self, seen: ScopeStatus, now_s: float) -> list[SequenceStep]:
         if seen.state is ScopeState.INTERRUPTED:
             return []
         if seen.state not in MEASURING:
-            return [DiscardResults(), *self._say(seen)]
+            return [DiscardResults(), *self._publish(seen)]
         if self._broken_off in MEASURING and seen.state is not self._broken_off:
-            return [DiscardResults(), *self._say(seen)]  # of the other kind: somebody began it
+            return [DiscardResults(), *self._publish(seen)]  # of the other kind: it was begun at the panel
         if not self._timed_out(now_s):
             return []
-        return [LogError("the controller keeps measuring after it was told to stop"), *self._say(seen)]
+        return [LogError("the controller keeps measuring after a stop"), *self._publish(seen)]
 
     def _timed_out(self, now_s: float) -> bool:
         if self._waiting_since_s is None:
@@ -129,14 +128,14 @@ class StatusSequence:
         return now_s - self._waiting_since_s >= self._timeout_s
 
     def deadline_s(self) -> float | None:
-        """When `observe` should be called again at the latest, experiment time."""
+        """Return when `observe` is due at the latest, experiment time; None: no deadline."""
         return None if self._waiting_since_s is None else self._waiting_since_s + self._timeout_s
 
-    def _say(self, status: ScopeStatus) -> list[SequenceStep]:
+    def _publish(self, status: ScopeStatus) -> list[SequenceStep]:
         self._waiting_since_s = None
-        if status == self.said:
+        if status == self.published:
             return []
         if status == _INTERRUPTED:
-            self._broken_off = self.said.state
-        self.said = status
+            self._broken_off = self.published.state
+        self.published = status
         return [PublishStatus(status)]

@@ -1,4 +1,4 @@
-"""Sets parameters: checks all that was asked for first, then sets it, then reads it back; or changes nothing."""
+"""Sets parameters: checks all of them first, then sets them, then reads them back; or changes nothing."""
 
 from __future__ import annotations
 
@@ -27,18 +27,19 @@ _UNBOUNDED: Final = (-math.inf, math.inf)
 
 
 def wanted_values(request: Request, driver: DriverBase) -> dict[str, Value] | None:
-    """Return the values in SI that a request sets, each checked by itself; None if it only asks.
+    """Return the values in SI that a request sets, each checked by itself; None if it only reads.
 
-    A value that can't be set, and is in force, is no change: peers send back a whole message in which they have changed
-    one field.
+    A value that can't be set, and is in force already, is no change: peers send back a whole message after changing one
+    field of it.
 
     Raises:
         Refused: PARAM_NOT_SUPPORTED or PARAM_ERROR.
     """
-    asked = _asked(request.subject)
+    asked = _values_in(request.subject)
     values: dict[str, Value] = {}
     for name, given in asked.items():
         spec = driver.table.find(name)
+        # first without bounds: a value out of bounds that is in force already is no change
         anything = replace(spec, range=_UNBOUNDED, choices=())
         value = (
             anything.parse(given.value or "", given.unit) if isinstance(given, Parameter) else anything.checked(given)
@@ -56,13 +57,13 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
     """Set the values, or change nothing.
 
     Args:
-        about_to_act: called once all is checked, right before anything is changed.
+        about_to_act: called after all checks, right before the first change.
 
     Raises:
-        Refused: PARAM_ERROR: they do not fit together, or the controller made something else of them.
+        Refused: PARAM_ERROR: the values do not fit together, or the controller set other ones.
     """
     table = driver.table
-    # all of a frame: setting a part of it, a controller may change the rest
+    # the whole frame: when a part of it is set, a controller may change the rest
     framed = FRAME if not values.keys().isdisjoint(FRAME) else ()
     whole = {*values, *(name for name in framed if name in table)}
     before = driver.in_force(whole)
@@ -75,8 +76,8 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
         after = driver.in_force(whole)
     except LOST:
         raise
-    except Exception:
-        with contextlib.suppress(Exception):  # the first error is the one to tell
+    except Exception:  # a driver may raise anything, and must not leave a frame half set
+        with contextlib.suppress(Exception):  # a driver may raise anything; the first error is reported
             driver.put_in_force(former)
         raise
     for name, value in wanted.items():
@@ -86,8 +87,8 @@ def apply(driver: DriverBase, values: Mapping[str, Value], about_to_act: Callabl
             raise refuse_value(name, f"the controller set {made} instead of {asked}; the former values were restored")
 
 
-def _asked(subject: object) -> dict[str, Parameter | Value]:
-    """Return what the subject of a request sets, by generic names: a parameter's text, else values in SI."""
+def _values_in(subject: object) -> dict[str, Parameter | Value]:
+    # a parameter keeps its text and unit; all other values are in SI
     if isinstance(subject, Parameter):
         return {} if subject.value is None else {subject.name: subject}
     if isinstance(subject, ScanParameters):
@@ -106,6 +107,8 @@ def _asked(subject: object) -> dict[str, Parameter | Value]:
 def _settable(spec: ParameterSpec, value: Value) -> Value:
     if spec.read_only:
         raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} is read-only")
-    if spec.name in FRAME and isinstance(value, float):  # the corner of a frame is reckoned from its centre
+    if spec.name in FRAME and isinstance(
+        value, float
+    ):  # the corner of a frame is computed from its centre, so it may miss the bound by its last bits
         value = next((end for end in spec.range if math.isclose(value, end, rel_tol=1e-12)), value)
     return spec.checked(value)

@@ -25,7 +25,7 @@ FRAME: Final = (
     names.SCAN_RESOLUTION_Y,
 )
 EXTENT: Final = (names.SCAN_SIZE_X, names.SCAN_RESOLUTION_Y, names.SCAN_RESOLUTION_X, names.SCAN_SIZE_Y)
-"""What, with the speed, a scan's duration depends on: the width, the rows, and perhaps the rest."""
+"""A scan's duration depends on these and the speed: certainly on width and rows, perhaps on the rest."""
 FEEDBACK: Final = (FEEDBACK_ON, names.ZCTRL_PGAIN, names.ZCTRL_IGAIN, names.ZCTRL_SETPOINT)
 POSITION: Final = (names.PROBE_POS_X, names.PROBE_POS_Y)
 _FRAME_MESSAGE, _FEEDBACK_MESSAGE, _POSITION_MESSAGE = SCAN_PARAMETERS.name, FEEDBACK_STATE.name, PROBE_POSITION.name
@@ -34,32 +34,32 @@ MOVES: Final = frozenset(FRAME + POSITION)
 
 
 class SettingsGroup(ABC):
-    """Parameters that belong together at a controller, which has them in another form than a table can say."""
+    """Parameters that belong together at a controller, in a form that a table can't describe."""
 
     names: Collection[str]
 
     @abstractmethod
     def read(self) -> dict[str, Value]:
-        """Return what is in force, by generic names, in SI."""
+        """Return the values in force, by generic names, in SI."""
 
     @abstractmethod
     def write(self, values: Mapping[str, Value]) -> None:
-        """Change some of them.
+        """Change some of the values.
 
         Raises:
-            Refused: PARAM_ERROR: the controller would make something else of it.
+            Refused: PARAM_ERROR: the controller would set other values.
         """
 
     def merged(self, values: Mapping[str, Value]) -> Plain:
-        """Return all of the group's values, with these changed."""
+        """Return all values of the group, with `values` changed."""
         return {**self.read(), **values}
 
 
 class KeptSettings(SettingsGroup):
-    """Settings that a controller is told with an action, and does not keep itself.
+    """Settings that are sent to a controller with an action, and that the controller itself does not keep.
 
     Args:
-        at_first: the values before anybody sets them.
+        at_first: the initial values.
     """
 
     def __init__(self, at_first: Mapping[str, Value]) -> None:
@@ -68,7 +68,7 @@ class KeptSettings(SettingsGroup):
         self._kept: dict[str, Value] = {}
 
     def kept_in(self, memory: Plain) -> None:
-        """Keep the values in a memory that lasts, from now on."""
+        """Keep the values in a memory on disk from now on."""
         self._kept = memory.setdefault("kept", {})
         for name, value in self._at_first.items():
             self._kept.setdefault(name, value)
@@ -77,7 +77,6 @@ class KeptSettings(SettingsGroup):
         return self._kept[name]
 
     def number(self, name: str) -> float:
-        """Return a value that is a number."""
         return float(self._kept[name])
 
     def read(self) -> dict[str, Value]:
@@ -88,12 +87,12 @@ class KeptSettings(SettingsGroup):
 
 
 def watched(table: ParameterTable) -> list[str]:
-    """The parameters whose changes are published, as far as the microscope has them."""
+    """Return the parameters whose changes are published, as far as the microscope has them."""
     return [name for name in (*FRAME, *FEEDBACK, names.ENGAGED, *POSITION) if name in table]
 
 
 def messages(values: Mapping[str, Value]) -> dict[str, Published]:
-    """Return the messages to publish of the values, by name: those that the microscope has all the parameters for."""
+    """Return the messages to publish, by name; a message is left out if the microscope lacks a parameter of it."""
     published: dict[str, Published] = {}
     if all(name in values for name in FRAME if name != names.SCAN_ANGLE):
         published[_FRAME_MESSAGE] = scan_parameters(values)
@@ -110,12 +109,11 @@ def of_message(message: str) -> tuple[str, ...]:
 
 
 def scan_parameters(values: Mapping[str, Value]) -> ScanParameters:
-    """The frame that values describe, as it is published."""
     return ScanParameters(*frame(values))
 
 
 def frame(values: Mapping[str, Value]) -> tuple[Region, tuple[int, int]]:
-    """The frame that values describe: its region and (rows, columns).
+    """Return the frame that values describe: its region and (rows, columns).
 
     Raises:
         InvalidValue: they describe none.
@@ -134,8 +132,10 @@ def frame_values(region: Region, shape: tuple[int, int]) -> dict[str, Value]:
 
 
 def feedback(values: Mapping[str, Value]) -> Feedback:
-    """The z feedback that values describe. Of a tip that is known to be withdrawn nobody is told that it is without
-    feedback, which would be a danger at the sample."""
+    """Return the z feedback that values describe.
+
+    For a withdrawn tip, a feedback that is off is not published: at the sample it would be a danger.
+    """
     on = values.get(FEEDBACK_ON)
     is_away = values.get(names.ENGAGED) is False
     return Feedback(
@@ -147,7 +147,7 @@ def feedback(values: Mapping[str, Value]) -> Feedback:
 
 
 def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixels: int) -> None:
-    """Check a frame as a whole: it is not empty, not too many pixels, all of it within reach of the probe.
+    """Check a frame as a whole: its size, its number of pixels, and the reach of the probe.
 
     Raises:
         Refused: PARAM_ERROR.
@@ -166,6 +166,7 @@ def check_together(values: Mapping[str, Value], table: ParameterTable, max_pixel
         if name in table:
             low, high = table[name].range
             reached = region.corners_m()[:, axis]
+            # the corners are computed, so their last bits may miss a bound that the frame touches
             slack = 1e-9 * max(abs(reached).max(), region.size_m[axis])
             if reached.min() < low - slack or reached.max() > high + slack:
                 extent = " to ".join(table[name].quantity(float(end)) for end in (reached.min(), reached.max()))

@@ -1,10 +1,11 @@
-"""The state that a translator keeps on disk, so that a restarted one tells the same story and does nothing twice."""
+"""The state that a translator keeps on disk, so that a restart repeats no action and no state."""
 
 from __future__ import annotations
 
 from afspm.basics.clock import Clock
 from afspm.basics.plain_data import Plain
-from afspm.model import ScopeState, ScopeStatus
+from afspm.model import ControlRequest, Request, ScopeState, ScopeStatus
+from afspm.model.microscope_status import feedback_of
 from afspm.storage.memory import Memory
 from afspm.translator.sequence import StatusSequence
 
@@ -12,30 +13,74 @@ Kept = Plain
 """JSON values by name, kept on disk."""
 
 
+class FeedbackWatch:
+    """Remembers whether a request, rather than a person at the panel, has switched the feedback off.
+
+    Args:
+        kept: JSON values that outlive a kill.
+    """
+
+    def __init__(self, kept: Kept) -> None:
+        self._kept = kept
+
+    @property
+    def is_off(self) -> bool:
+        """True while the feedback is known to be switched off by a request."""
+        return bool(self._kept.get("feedback_off"))
+
+    @property
+    def in_danger(self) -> bool:
+        """True while the feedback is, or may be, switched off by a request."""
+        return self.is_off or bool(self._kept.get("may_have_switched"))
+
+    def saw(self, on: bool | None) -> bool:
+        """Store the observed feedback. Return True if a request has just switched it off."""
+        kept = self._kept
+        # off without a request in between: switched off at the panel, where a person takes care of it (decision 0007)
+        switched_off = on is False and bool(kept.get("feedback_was_on") and kept.get("may_have_switched"))
+        kept["feedback_off"] = on is False and (switched_off or self.is_off)
+        kept["feedback_was_on"], kept["may_have_switched"] = on, False
+        return switched_off
+
+    def may_switch(self, request: Request) -> bool:
+        """Record that a request is about to be executed. Return True if this must be saved first."""
+        affects = request.kind == ControlRequest.ACTION or feedback_of(request) is not None
+        in_doubt = affects and not self._kept.get("may_have_switched")
+        self._kept["may_have_switched"] = True
+        return in_doubt
+
+    def retracted(self) -> None:
+        """Record that the tip is withdrawn, and needs no feedback."""
+        self._kept["may_have_switched"] = self._kept["feedback_off"] = False
+
+
 class TranslatorState:
-    """The kept values, with the times and the order of what is published.
+    """The values on disk, with the times and the order of published packets.
 
     Args:
         result_timeout_s: see `StatusSequence`.
 
     Attributes:
         kept: JSON values of the translator's parts; the part that changes them calls `save`.
+        feedback: whether a request has switched the feedback off.
     """
 
     def __init__(self, memory: Memory, clock: Clock, result_timeout_s: float) -> None:
         self._memory = memory
         self._clock = clock
         self.kept: Kept = memory.setdefault("translator", {"said": 0, "ledger": {}, "outbox": {}})
+        self.feedback = FeedbackWatch(self.kept)
         self.sequence = StatusSequence(ScopeStatus(ScopeState(self.kept["said"])), result_timeout_s)
 
     def save(self) -> None:
-        """Write everything to disk. On a full disk it is logged, and the tip is looked after all the same."""
-        self.kept["said"] = int(self.sequence.said.state)
-        self.kept["seen_ns"] = self._clock.now_ns()  # a run that is resumed goes on after it
+        """Write everything to disk. A full disk is logged, and the translator goes on protecting the tip."""
+        self.kept["said"] = int(self.sequence.published.state)
+        self.kept["seen_ns"] = self._clock.now_ns()  # a resumed run continues after this time
         self._memory.save()
 
     def stamp(self, count: int = 1) -> list[int]:
-        """Return strictly increasing times for so many packets, ns."""
+        """Return `count` strictly increasing times for packets, ns."""
+        # a clock that was set back must not give a time twice: subscribers would drop the packet as a duplicate
         first = max(self._clock.now_ns(), int(self.kept.get("last_ns", 0)) + 1)
         self.kept["last_ns"] = first + count - 1
         return list(range(first, first + count))

@@ -1,4 +1,4 @@
-"""A TCP connection to a controller that answers one question after the other, and never speaks unasked."""
+"""A TCP connection to a controller that answers one question after the other, and sends nothing unasked."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from afspm.translator.driver_base import ControllerLost
 from afspm.translator.trace import TCP, TRACE, TracedAnswer
 
 _AT_ONCE: Final = 1 << 20
-_SLOWEST_BYTES_PER_S: Final = 1e6
+_SLOWEST_BYTES_PER_S: Final = 1e6  # a whole scan may take longer than the timeout of a small answer
 
 T = TypeVar("T")
 
 
 class Receiver:
-    """The bytes that come in reply to one question, until its deadline."""
+    """The bytes of the answer to one question, until its deadline."""
 
     def __init__(
         self,
@@ -51,7 +51,7 @@ class Receiver:
         return part
 
     def exactly(self, size: int) -> bytearray:
-        """Return so many bytes; memory is taken for what has come, not for what was announced."""
+        """Return `size` bytes; memory is allocated for the bytes received, not for the size announced."""
         self._until_s += size / _SLOWEST_BYTES_PER_S
         received = bytearray()
         while len(received) < size:
@@ -62,18 +62,18 @@ class Receiver:
 class TcpConnection:
     """A connection, for one thread at a time but for `close`.
 
-    Whatever goes wrong on it, it is closed: a late answer must never be taken for that to the next question.
+    Any error closes it: a late answer must never be taken for the answer to the next question.
 
     Args:
         timeout_s: how long an answer may take, in real time.
         monotonic_s: real time.
-        hints: what to look at where nobody listens, and where no answer comes.
+        hints: what to check when the connection is refused, and when no answer comes.
 
     Attributes:
         where: "HOST:PORT", as it was given; peer: the same in numbers.
 
     Raises:
-        ControllerLost: nobody listens there.
+        ControllerLost: no program listens there.
     """
 
     def __init__(
@@ -87,6 +87,7 @@ class TcpConnection:
             self._socket = socket.create_connection(address, timeout_s)
         except OSError as error:
             raise ControllerLost(f"no connection: {error}", where=self.where, hint=hints[0]) from error
+        # a small question must not wait for more data to fill a segment
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.peer = "{}:{}".format(*self._socket.getpeername()[:2])
         self._trace = TRACE.connection(TCP)
@@ -100,16 +101,16 @@ class TcpConnection:
         longer_s: float = 0.0,
         is_secret: bool = False,
     ) -> T:
-        """Send a question, and return what `read` makes of the bytes of its answer. See `send` and `receive`."""
+        """Send a question, and return `read` of the bytes of its answer. See `send` and `receive`."""
         self.send(what, message, is_secret=is_secret)
         return self.receive(what, read, longer_s=longer_s)
 
     def send(self, what: str, message: bytes, *, is_secret: bool = False) -> None:
-        """Send a question, whose answer is to be received before the next is sent.
+        """Send a question; its answer must be received before the next is sent.
 
         Args:
-            what: is asked for, for messages.
-            is_secret: the question is not to be written into a trace.
+            what: the question in words, for messages.
+            is_secret: the question must not be written into a trace.
 
         Raises:
             ControllerLost: it could not be sent; the connection is closed.
@@ -124,13 +125,13 @@ class TcpConnection:
             self._guarded(what, self._timeout_s, send)
 
     def receive(self, what: str, read: Callable[[Receiver], T], *, longer_s: float = 0.0) -> T:
-        """Return what `read` makes of the bytes of the answer.
+        """Return `read` of the bytes of the answer.
 
         Args:
-            longer_s: so much longer than usual may the answer take.
+            longer_s: added to the usual timeout.
 
         Raises:
-            ControllerLost: no answer, or none to be trusted; the connection is closed.
+            ControllerLost: no answer, or a malformed one; the connection is closed.
         """
         timeout_s = self._timeout_s + longer_s
         with self._trace.answering() as traced:
@@ -140,7 +141,7 @@ class TcpConnection:
             return found
 
     def has_answer(self) -> bool:
-        """Return True if an answer has begun to come, or the connection is lost, as `receive` will say."""
+        """Return True if an answer has begun to arrive, or the connection is lost, as `receive` will report."""
         try:
             self._socket.settimeout(0.0)
             self._socket.recv(1, socket.MSG_PEEK)
@@ -167,7 +168,7 @@ class TcpConnection:
             raise
 
     def close(self) -> None:
-        """Let go of it, from any thread: a thread that waits for an answer hears that the connection is lost."""
+        """Close the connection, from any thread: a thread that waits for an answer gets ControllerLost."""
         with suppress(OSError):
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()

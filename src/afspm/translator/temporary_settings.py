@@ -1,7 +1,7 @@
-"""Values that are in force for a while, as those of a bias pulse: what was there before is put back.
+"""Values that are in force for a limited time, as in a bias pulse: the former values are restored afterwards.
 
-The translator holds the microscope busy meanwhile. It remembers what to put back, so that a translator that is started
-anew, or finds a lost controller again, does so first.
+The microscope counts as busy meanwhile. The former values are kept on disk: a translator that is restarted, or
+reconnects to a lost controller, restores them first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _KEY = "temporary"
 
 
 class TemporarySettings:
-    """The values that are in force for a while, if any are."""
+    """The values in force for a limited time, if any."""
 
     def __init__(self, driver: DriverBase, state: TranslatorState, log: logging.Logger) -> None:
         self._driver = driver
@@ -29,7 +29,7 @@ class TemporarySettings:
         self._log = log
 
     def begin(self, values: Mapping[str, Value], for_s: float) -> None:
-        """Set values, to be put back after `for_s`, experiment time.
+        """Set values, to be restored after `for_s`, experiment time.
 
         Raises:
             Refused: nothing was changed.
@@ -37,20 +37,21 @@ class TemporarySettings:
         values = {name: self._driver.table[name].checked(value) for name, value in values.items()}
         former = self._driver.in_force(values.keys())
         self._kept[_KEY] = {"former": former, "until_s": self._driver.clock.now_s() + for_s}
-        self._state.save()  # before anything is changed
+        self._state.save()  # before any change: a kill must not lose the former values
         try:
             if values:
                 apply(self._driver, values)
         except LOST:
-            raise  # whether it was set is not known: it is put back when the controller is found again
-        except Exception:
+            raise  # the outcome is unknown: the former values are restored when the controller is reconnected
+        except Exception:  # raised again: `apply` has restored the former values
             self._forget()
             raise
+        # counted again: setting the values has taken time
         self._kept[_KEY]["until_s"] = self._driver.clock.now_s() + for_s
 
     @property
     def until_s(self) -> float | None:
-        """Experiment time at which it is over; None: nothing is temporary."""
+        """Experiment time at which the former values are restored; None: nothing is temporary."""
         found = self._kept.get(_KEY)
         return None if found is None else float(found["until_s"])
 
@@ -61,12 +62,12 @@ class TemporarySettings:
         return None if found is None else ScopeStatus(state_for(found["former"]))
 
     def end_if_due(self) -> None:
-        """Put back what was there, once it is time. Raises what says that the controller is lost."""
+        """Restore the former values once their time has come. Raises the errors of `LOST`."""
         if self.until_s is not None and self._driver.clock.now_s() >= self.until_s:
             self.end()
 
     def end(self) -> None:
-        """Put back what was there, if anything is temporary. Raises what says that the controller is lost."""
+        """Restore the former values, if any are kept. Raises the errors of `LOST`."""
         found = self._kept.get(_KEY)
         if found is None:
             return
@@ -75,7 +76,7 @@ class TemporarySettings:
                 apply(self._driver, found["former"])
         except LOST:
             raise
-        except Exception as error:
+        except Exception as error:  # a driver may raise anything; a person must learn the values to restore
             self._log.critical("can't restore %s: %s; set it by hand", found["former"], error)
         self._forget()
 
@@ -85,5 +86,5 @@ class TemporarySettings:
 
 
 def state_for(values: Mapping[str, Value]) -> ScopeState:
-    """Return the state of the microscope while such values are in force for a while."""
+    """Return the state of the microscope while such values are in force."""
     return ScopeState.MOVING if MOVES & values.keys() else ScopeState.BUSY_PARAM

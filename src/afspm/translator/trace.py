@@ -1,8 +1,8 @@
-"""The trace of a controller: all that is said to it and by it, and the files that it writes, in one file of JSON lines.
+"""The trace of a controller: its exchanges and the files that it writes, as JSON lines.
 
-One process talks to one controller, so there is one trace in a process: `begin` opens it, and each vendor's connection
-tells it of an exchange by one line. Without `begin` nothing is kept. Secrets are left out by the connection that has
-them. Texts are kept as they are, other bytes in base64, so that a person can read the file.
+One process talks to one controller, so there is one trace in a process. `begin` opens it, and each vendor's connection
+adds an exchange as one line. Without `begin` nothing is recorded. A connection leaves out its own secrets. Text is
+written as it is, other bytes in base64, so that a person can read the file.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class TracedExchange:
 
     Attributes:
         connection: the number of the connection, from 0; transport: `TCP` or `ZEROMQ`.
-        what: the name of what was asked, for people.
+        what: the name of the question, for people.
         asked: None: a secret.
         answered: empty with `lost`: there was no answer, for this reason.
-        command: the request that the exchange carries out; empty: it only looks at the controller.
-        after: so many lines were in the file when it was asked: those between were said on other connections meanwhile.
+        command: the request that the exchange belongs to; empty: it only observes the controller.
+        after: number of lines in the file when the question was sent: the lines between belong to other connections.
         at_s, took_s: real seconds since the beginning, and until the answer.
     """
 
@@ -64,7 +64,7 @@ class TracedExchange:
 
 @dataclass(frozen=True)
 class TracedFile:
-    """A file of the controller that was read, and when it was written, in real seconds since the beginning."""
+    """A file of the controller that was read, and its time of writing, in real seconds since the beginning."""
 
     file: str
     content: bytes
@@ -78,7 +78,7 @@ def read_trace(file: Path) -> list[TraceLine]:
     """Read a trace; a last line that was cut off by a power cut is left out.
 
     Raises:
-        FileError: it is none, or of another version.
+        FileError: it is no trace, or one of another version.
     """
     try:
         lines = file.read_text(encoding="utf-8").split("\n")[:-1]
@@ -103,7 +103,7 @@ class Trace:
         self._files: set[tuple[Path, int]] = set()
 
     def begin(self, file: Path, header: TraceHeader, clock: Clock) -> None:
-        """Keep what is said from now on."""
+        """Record all exchanges from now on."""
         with self._lock:
             self._file, self._clock, self._began_s = file.open("w", encoding="utf-8"), clock, clock.monotonic_s()
             self._began_at_s = ExperimentClock.real().now_s()
@@ -111,7 +111,7 @@ class Trace:
             self._write(asdict(header))
 
     def end(self) -> None:
-        """Keep nothing more."""
+        """Record nothing more."""
         with self._lock:
             if self._file is not None:
                 self._file.close()
@@ -122,17 +122,17 @@ class Trace:
         return self._file is not None
 
     def connection(self, transport: str) -> TracedConnection:
-        """Number a connection that has just been made."""
+        """Number a new connection."""
         with self._lock:
             self._connections += 1
             return TracedConnection(self, self._connections - 1, transport)
 
     def command(self, request: str) -> None:
-        """What is asked from now on carries out this request; empty: it only looks."""
+        """Assign all further exchanges to this request; empty: they only observe."""
         self._command = request
 
     def file(self, path: Path) -> None:
-        """Keep a file that the controller wrote, if it is one."""
+        """Record a file of the controller, if it exists and is new or changed."""
         state = (path, path.stat().st_mtime_ns) if self.is_kept and path.is_file() else None
         if state is not None and state not in self._files:
             self._files.add(state)
@@ -150,7 +150,7 @@ class Trace:
         return 0.0 if self._clock is None else self._clock.monotonic_s() - self._began_s
 
     def exchange(self, one: TracedExchange) -> None:
-        """Write an exchange that is over."""
+        """Write a finished exchange."""
         facts = {**asdict(one), "asked": _shown(one.asked), "answered": _shown(one.answered), "command": self._command}
         with self._lock:
             self._write({key: value for key, value in facts.items() if value or key not in ("lost", "command")})
@@ -158,7 +158,7 @@ class Trace:
     def _write(self, facts: Plain) -> None:
         if self._file is not None:
             self._file.write(json.dumps(facts, ensure_ascii=False) + "\n")
-            self._file.flush()
+            self._file.flush()  # a killed process leaves all its exchanges
             self._lines += 1
 
 
@@ -172,17 +172,17 @@ class TracedConnection:
         self._question: tuple[str, bytes | None, int, float] = ("", b"", 0, 0.0)
 
     def asked(self, what: str, content: bytes | None) -> None:
-        """Note a question that is going to be sent; None: a secret."""
+        """Record a question that is about to be sent; None: a secret."""
         self._question = (what, content, self._trace.lines, self._trace.now_s())
 
     @contextmanager
     def answering(self) -> Iterator[TracedAnswer]:
-        """Note at the end of the block what came in answer to the last question, also an error."""
+        """Record at the end of the block the answer to the last question, or its error."""
         answer = TracedAnswer(is_kept=self._trace.is_kept)
         lost = ""
         try:
             yield answer
-        except BaseException as error:
+        except BaseException as error:  # raised again; the trace shows any end of an exchange, also an interruption
             lost = "" if answer.is_whole else f"{type(error).__name__}: {error}"
             raise
         finally:
@@ -191,16 +191,16 @@ class TracedConnection:
 
     @contextmanager
     def failing(self) -> Iterator[None]:
-        """Note that the last question could not be sent, if the block raises."""
+        """Record that the last question could not be sent, if the block raises."""
         try:
             yield
-        except BaseException as error:
+        except BaseException as error:  # raised again; the trace shows any end of an exchange, also an interruption
             self._write(b"", f"{type(error).__name__}: {error}")
             raise
 
     @contextmanager
     def asking(self, what: str, content: bytes | None) -> Iterator[TracedAnswer]:
-        """As `asked` and `answering`, where the question is sent and answered in one block."""
+        """Combine `asked` and `answering`, for a question that is sent and answered in one block."""
         self.asked(what, content)
         with self.answering() as answer:
             yield answer
@@ -213,10 +213,10 @@ class TracedConnection:
 
 
 class TracedAnswer:
-    """The bytes of an answer, as they come.
+    """The bytes of an answer, as they arrive.
 
     Attributes:
-        is_whole: all of it has come, whatever is then made of it.
+        is_whole: all of it has arrived, valid or not.
     """
 
     def __init__(self, *, is_kept: bool) -> None:
@@ -225,7 +225,6 @@ class TracedAnswer:
         self.content = bytearray()
 
     def add(self, part: bytes) -> None:
-        """Note a part of the answer."""
         if self.is_kept:
             self.content += part
 

@@ -1,4 +1,4 @@
-"""A ZeroMQ connection to a controller that answers one request after the other, and never speaks unasked."""
+"""A ZeroMQ connection to a controller that answers one request after the other, and sends nothing unasked."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ _OUTCOMES: Final = zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_CLOSED | zmq.EVENT_
 
 
 class ZmqConnection:
-    """A connection. For one thread.
+    """A connection, for one thread.
 
-    A DEALER, since a REQ socket is of no use any more after one lost reply. Whatever goes wrong, it is closed: a late
-    reply must never be taken for that to the next request. It never connects a second time: there may be somebody else
-    by then.
+    It uses a DEALER socket, since a REQ socket is unusable after one lost reply. Any error closes it: a late reply must
+    never be taken for the reply to the next request. It never reconnects: another program may listen there by then.
 
     Args:
         address: e.g. "tcp://127.0.0.1:5555".
         timeout_s: how long a reply may take, in real time.
         monotonic_s: real time.
-        hints: what to look at where the address is none, where nobody listens, and where no reply comes.
+        hints: what to check when the address is invalid, when no program listens, and when no reply comes.
 
     Raises:
-        ControllerLost: nobody listens there. ConfigError: it is no address.
+        ControllerLost: no program listens there. ConfigError: it is no address.
     """
 
     def __init__(
@@ -42,12 +41,12 @@ class ZmqConnection:
         self._address, self._timeout_s, self._monotonic_s, self._hints = address, timeout_s, monotonic_s, hints
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket: zmq.Socket[bytes] = self._context.socket(zmq.DEALER)
-        self._socket.setsockopt(zmq.LINGER, 0)
-        # nothing waits for a peer that is not there, and is then done when nobody expects it any more
+        self._socket.setsockopt(zmq.LINGER, 0)  # closing must not wait for a controller that reads no more
+        # a request must not wait for an absent peer, and be executed when it is not expected any more
         self._socket.setsockopt(zmq.IMMEDIATE, 1)
         self._socket.setsockopt(zmq.RECONNECT_IVL, _NEVER)
         self._socket.setsockopt(zmq.SNDTIMEO, max(1, round(timeout_s * 1000)))
-        monitor = self._socket.get_monitor_socket(_OUTCOMES)  # before connecting, else the outcome may come unseen
+        monitor = self._socket.get_monitor_socket(_OUTCOMES)  # before connecting, else its outcome may be missed
         try:
             self._socket.connect(address)
         except zmq.ZMQError as error:
@@ -57,10 +56,10 @@ class ZmqConnection:
         self._trace = TRACE.connection(ZEROMQ)
 
     def ask(self, what: str, message: bytes, parse: Callable[[bytes], T | None]) -> T:
-        """Send a request, and return what `parse` makes of the reply; None: it is a reply to something else.
+        """Send a request, and return `parse` of the reply; None from `parse`: the reply belongs to another request.
 
         Raises:
-            ControllerLost: no reply, or none to be trusted, as `parse` may say, too.
+            ControllerLost: no reply, or one that `parse` rejects.
         """
         try:
             with self._trace.asking(what, message) as traced:
@@ -78,7 +77,7 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def begin(self, what: str, message: bytes) -> None:
-        """Send a request whose reply takes its time: see `reply`. Raises ControllerLost."""
+        """Send a request whose reply takes long: see `reply`. Raises ControllerLost."""
         self._trace.asked(what, message)
         try:
             with self._trace.failing():
@@ -94,7 +93,7 @@ class ZmqConnection:
             raise self._lost("a reply", error) from error
 
     def reply(self, what: str) -> bytes | None:
-        """Return the reply to what was begun, or None while there is none. Raises ControllerLost."""
+        """Return the reply to `begin`, or None while there is none. Raises ControllerLost."""
         try:
             if not self._socket.poll(0):
                 return None
@@ -104,11 +103,10 @@ class ZmqConnection:
             raise self._lost(what, error) from error
 
     def close(self) -> None:
-        """Let go of it."""
+        """Close the connection and its context."""
         self._context.destroy(linger=0)
 
     def _await_connection(self, monitor: zmq.Socket[bytes]) -> None:
-        """Return once the connection stands. Raises ControllerLost."""
         with monitor:
             came = monitor.poll(max(1, round(self._timeout_s * 1000)))
             stands = bool(came) and recv_monitor_message(monitor)["event"] == zmq.EVENT_HANDSHAKE_SUCCEEDED

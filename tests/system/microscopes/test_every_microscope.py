@@ -34,7 +34,7 @@ Kept = list[tuple[list[Any], NDArray[np.float64]]]
 
 
 def scans_on(microscope: str, folder: Path, more: str = "") -> Kept:
-    """Run the experiment, with `more` in its file; the heights as they were published."""
+    """Run the experiment, with `more` in its file; return the published heights."""
     overlay = folder / "overlay.toml"
     overlay.write_text(OVERLAY + more, encoding="utf-8")
     (folder / "keeper.py").write_text(Path(__file__).with_name("keeper.py").read_text(encoding="utf-8"))
@@ -67,7 +67,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Kept:
 
 
 def apart_m(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
-    """The rms of the difference, less its plane: z has no zero, and the slope of a sample is nobody's."""
+    """Return the rms of the difference without its plane: zero and tilt of z are arbitrary."""
     rows, columns = np.indices(a.shape).reshape(2, -1)
     plane = np.stack([rows, columns, np.ones(a.size)], axis=1)
     difference = (a - b).ravel()
@@ -77,7 +77,7 @@ def apart_m(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 @pytest.mark.xdist_group("every_microscope")
 @pytest.mark.parametrize("microscope", sorted(MAKERS))
 def test_the_same_scans_of_the_same_sample(microscope: str, simulated: Kept, tmp_path: Path, stranger: Any) -> None:
-    """And none of it is asked of the controller that the file names, which is not this run's emulator."""
+    """No request reaches the controller that the file names, which is not the emulator of this run."""
     address = MAKERS[microscope].address.format(port=stranger.port)
     found = scans_on(microscope, tmp_path, ELSEWHERE.format(address=address))
     assert len(found) == len(simulated) == 3

@@ -1,4 +1,4 @@
-"""The rigs that the tests of the scheduler's process share."""
+"""Rigs shared by the tests of the scheduler's process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 @pytest.fixture
 def locked_rig(tmp_path: Path) -> Iterator[Rig]:
-    """With a key for each: scheduler, translator, Experiment and Visitor."""
+    """A rig with keys: scheduler, translator, Experiment and Visitor."""
     keys.generate(tmp_path / "keys", ["scheduler", "translator", "Experiment", "Visitor"])
     made = Rig(tmp_path, tmp_path / "keys")
     yield made

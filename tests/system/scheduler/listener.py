@@ -1,4 +1,4 @@
-"""`listener.py <address> <name>`: a component in a process of its own that tells the time of every scan it receives."""
+"""`listener.py <address> <name>`: a component in its own process that prints the time of every scan received."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A part of the soak: malformed messages leave scheduler, translator and component serving, and no larger."""
+"""A part of the soak: after malformed messages scheduler, translator and component still serve, and have not grown."""
 
 from __future__ import annotations
 

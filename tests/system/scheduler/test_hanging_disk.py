@@ -1,4 +1,4 @@
-"""A disk that does not answer: the scheduler goes on serving, and writes down what it has to once it does again."""
+"""A hanging disk: the scheduler goes on serving, and catches up on its writes afterwards."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HOOK = Path(__file__).parents[2] / "support" / "hanging_disk"
 
 @pytest.fixture
 def switch(rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """While this file is there, the disk hangs."""
+    """The disk hangs while this file exists."""
     state = tmp_path / "state"
     state.mkdir()
     monkeypatch.setenv("PYTHONPATH", str(HOOK))
@@ -28,7 +28,7 @@ def switch(rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterato
     file.unlink(missing_ok=True)
 
 
-def test_requests_flags_and_packets_do_not_wait_for_a_disk_that_hangs(rig: Any, switch: Path, tmp_path: Path) -> None:
+def test_requests_flags_and_packets_do_not_wait_for_a_hanging_disk(rig: Any, switch: Path, tmp_path: Path) -> None:
     rig.start()
     holder = rig.component("Experiment")
     rig.linked(holder)

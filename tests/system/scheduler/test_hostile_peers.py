@@ -28,7 +28,7 @@ HALF_OPEN = 400
 
 
 class Raw:
-    """A connection that speaks ZMTP byte by byte, without a key."""
+    """A connection that sends ZMTP byte by byte, without a key."""
 
     made: ClassVar[list[Raw]] = []
 
@@ -41,7 +41,7 @@ class Raw:
         self.socket.setblocking(False)
 
     def say(self, data: bytes, within_s: float = SECONDS) -> bool:
-        """Send until all is gone, or the time is over; False: the connection was ended."""
+        """Send all data, or until the time is over; False: the connection was closed."""
         until_s = time.monotonic() + within_s
         view = memoryview(data)
         while view and time.monotonic() < until_s:
@@ -78,7 +78,7 @@ def friend(locked_rig: Any) -> Any:
 
 @pytest.fixture
 def serves_as_before(locked_rig: Any, friend: Any) -> Iterator[None]:
-    """Afterwards another client is answered, and the process has not grown."""
+    """Check afterwards that another client is answered, and that the process has not grown."""
     before = memory_mb(locked_rig.process.pid, "VmRSS")
     yield
     assert friend.ask(ControlRequest.ACTION_SUPPORT, "start-scan").ok
@@ -112,7 +112,7 @@ ATTACKS: dict[str, tuple[bytes, Callable[[int], bytes]]] = {
 
 @pytest.mark.usefixtures("serves_as_before")
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_program_without_a_key_is_disconnected_whatever_it_sends(locked_rig: Any, attack: str) -> None:
+def test_program_without_a_key_is_disconnected_after_any_input(locked_rig: Any, attack: str) -> None:
     kind, data = ATTACKS[attack]
     peer = Raw(address_of(locked_rig, kind), kind)
     assert not all(peer.say(data(n)) for n in range(2000))

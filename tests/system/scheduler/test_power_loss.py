@@ -1,4 +1,4 @@
-"""The power goes the moment after a problem was told: it stands when the scheduler is back."""
+"""The power fails right after a problem was published: the problem is still flagged after the restart."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOSSY = Path(__file__).parents[2] / "support" / "lossy_disk"
 FLAGS = (Problem.TIP_SHAPE_CHANGED, Problem.FEEDBACK_NON_OPTIMAL, Problem.DEVICE_MALFUNCTION)
 
 
-def test_a_problem_that_was_told_stands_after_a_power_cut(
+def test_published_problem_is_still_flagged_after_a_power_cut(
     rig: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     state = tmp_path / "state"

@@ -42,7 +42,7 @@ def control_states(component: Any) -> list[ControlState]:
     return [wire.decode("ControlState", payload) for _, payload in component.packets("ControlState")]
 
 
-def test_a_request_reaches_the_translator_only_from_who_is_in_control(rig: Any) -> None:
+def test_request_reaches_the_translator_only_from_the_holder(rig: Any) -> None:
     rig.start()
     one, two = rig.component("One"), rig.component("Two")
     rig.linked(one)
@@ -55,7 +55,7 @@ def test_a_request_reaches_the_translator_only_from_who_is_in_control(rig: Any) 
     assert [(request.kind, request.subject) for request in rig.asked] == [(ACTION, START)]
 
 
-def test_a_part_that_is_back_while_its_old_connection_stands_asks_for_its_run_until_that_is_gone(rig: Any) -> None:
+def test_reconnecting_component_gets_the_run_once_its_old_connection_closes(rig: Any) -> None:
     rig.start()
     former = rig.component("left")
     rig.until(lambda: former.ask(ControlRequest.ACTION_SUPPORT, START).ok)
@@ -70,7 +70,7 @@ def test_a_part_that_is_back_while_its_old_connection_stands_asks_for_its_run_un
         assert asking.result().clock == rig.clock
 
 
-def test_a_packet_passes_as_it_is_under_its_envelope_with_times_that_increase(rig: Any) -> None:
+def test_packet_passes_unchanged_under_its_envelope_with_increasing_times(rig: Any) -> None:
     rig.start()
     component = rig.component("Component")
     small, large = scan(1), scan(2, 512)
@@ -82,7 +82,7 @@ def test_a_packet_passes_as_it_is_under_its_envelope_with_times_that_increase(ri
     assert times == sorted(set(times))
 
 
-def test_what_is_no_packet_is_dropped_and_what_follows_arrives(rig: Any) -> None:
+def test_malformed_packet_is_dropped_and_the_next_one_arrives(rig: Any) -> None:
     rig.start()
     component = rig.component("Component")
     for name, payload in (("Scan2d", b"\xff\xff"), ("Unknown", b""), ("", b""), ("Scan2d", scan(1)[:40])):
@@ -92,7 +92,7 @@ def test_what_is_no_packet_is_dropped_and_what_follows_arrives(rig: Any) -> None
     assert component.packets("Scan2d") == [("Scan2d_2000.0_Height", scan(3))]
 
 
-def test_killed_and_restarted_it_knows_mode_holder_problems_and_cache_and_misses_no_scan(rig: Any) -> None:
+def test_restarted_scheduler_keeps_mode_holder_problems_and_cache_and_misses_no_scan(rig: Any) -> None:
     rig.start()
     holder, other = rig.component("Holder"), rig.component("Other")
     assert other.ask(FLAG, int(Problem.TIP_SHAPE_CHANGED)).ok
@@ -114,7 +114,7 @@ def test_killed_and_restarted_it_knows_mode_holder_problems_and_cache_and_misses
     assert holder.ask(ACTION, START).ok
 
 
-def test_killed_again_and_again_in_a_stream_of_scans_every_one_arrives_once(rig: Any) -> None:
+def test_every_scan_arrives_once_although_the_scheduler_is_killed_repeatedly(rig: Any) -> None:
     rig.settings = {"cache": {"history": {"Scan2d": 100}}}
     rig.start()
     component = rig.component("Component", ["Scan2d"])
@@ -128,7 +128,7 @@ def test_killed_again_and_again_in_a_stream_of_scans_every_one_arrives_once(rig:
     assert [payload for _, payload in component.packets()] == [scan(number) for number in range(60)]
 
 
-def test_while_the_translator_is_slow_everyone_else_is_served_and_its_late_reply_is_nobody_elses(rig: Any) -> None:
+def test_slow_translator_does_not_delay_others_and_its_late_reply_reaches_only_its_client(rig: Any) -> None:
     rig.request_timeout_s = 0.5
     rig.answer = lambda request: Response(0, id=request.id) if request.subject != "slow" else None
     rig.start()
@@ -143,7 +143,7 @@ def test_while_the_translator_is_slow_everyone_else_is_served_and_its_late_reply
     assert (unanswered.code, "outcome unknown" in unanswered.reason) == (ControlResponse.NO_RESPONSE, True)
 
 
-def test_without_a_translator_a_request_is_refused_at_once_and_it_goes_on_when_the_translator_is_back(rig: Any) -> None:
+def test_request_without_a_translator_is_refused_at_once_until_it_is_back(rig: Any) -> None:
     rig.start()
     component = rig.component("Component")
     assert component.ask(REQUEST, 0).ok
@@ -160,7 +160,7 @@ def test_without_a_translator_a_request_is_refused_at_once_and_it_goes_on_when_t
     rig.until(lambda: component.packets("ScopeStateMsg"))
 
 
-def test_the_end_is_told_to_all_and_the_process_ends_with_its_own_exit_code(rig: Any) -> None:
+def test_end_is_published_and_the_process_ends_with_its_own_exit_code(rig: Any) -> None:
     rig.start()
     one, two = rig.component("One"), rig.component("Two", ["Scan2d"])
     rig.until(lambda: any(isinstance(i, CaughtUp) for i in two.found))
@@ -169,7 +169,7 @@ def test_the_end_is_told_to_all_and_the_process_ends_with_its_own_exit_code(rig:
     assert rig.process.wait(timeout=5) == 80
 
 
-def test_it_ends_at_once_when_its_parent_is_gone(rig: Any) -> None:
+def test_scheduler_ends_at_once_when_its_parent_is_gone(rig: Any) -> None:
     rig.start()
     rig.component("Component")
     rig.process.stdin.close()
@@ -208,7 +208,7 @@ def test_a_packet_at_the_end_of_the_log_that_is_damaged_is_left_out(rig: Any, tm
     assert set(late.packets()) < set(component.packets("Scan2d"))
 
 
-def test_a_component_that_connects_anew_is_known_before_it_asks_with_a_key_of_its_own(rig: Any) -> None:
+def test_reconnecting_component_is_known_before_a_request_with_a_key(rig: Any) -> None:
     rig.start()
     component = rig.component("experiment")
     assert component.ask(ControlRequest.REQUEST_CTRL, 0).ok

@@ -1,4 +1,4 @@
-"""A scheduler that knows whose keys it hears."""
+"""A scheduler that authenticates its peers by their keys."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from afspm.model import ControlRequest, ControlResponse, ScopeState, ScopeStatus
 from afspm.wire import encode
 
 
-def test_with_keys_everything_works_as_without(locked_rig: Any) -> None:
+def test_scheduler_with_keys_works_as_without(locked_rig: Any) -> None:
     locked_rig.start()
     experiment = locked_rig.component("Experiment")
     assert experiment.ask(ControlRequest.REQUEST_CTRL, 0).ok
@@ -20,7 +20,7 @@ def test_with_keys_everything_works_as_without(locked_rig: Any) -> None:
     locked_rig.until(lambda: experiment.packets("ScopeStateMsg"))
 
 
-def test_nobody_speaks_for_another_even_with_a_key_that_is_known(locked_rig: Any) -> None:
+def test_known_key_does_not_allow_the_name_of_another_component(locked_rig: Any) -> None:
     locked_rig.start()
     experiment = locked_rig.component("Experiment")
     assert experiment.ask(ControlRequest.REQUEST_CTRL, 0).ok
@@ -30,7 +30,7 @@ def test_nobody_speaks_for_another_even_with_a_key_that_is_known(locked_rig: Any
     assert not locked_rig.asked
 
 
-def test_without_a_key_nothing_is_heard(locked_rig: Any, plain: Any) -> None:
+def test_subscriber_without_a_key_receives_nothing(locked_rig: Any, plain: Any) -> None:
     locked_rig.start()
     experiment = locked_rig.component("Experiment")
     stranger, listener = plain(zmq.DEALER), plain(zmq.SUB)

@@ -1,4 +1,4 @@
-"""A subscriber that is stopped while large scans are published: its packets are dropped, and sent again later."""
+"""A subscriber that is stopped while large scans are published: its packets are dropped, and replayed later."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DROPPED_WITHIN_S = 15.0
 
 
 class Listener:
-    """`listener.py`, and the times of the scans that it has received."""
+    """`listener.py`, with the times of the scans that it has received."""
 
     def __init__(self, address: str, name: str) -> None:
         self.times: list[int] = []
@@ -69,7 +69,7 @@ def listener(rig: Any) -> Iterator[Callable[[str], Listener]]:
 
 
 def memory_bytes(pid: int, field: str) -> int:
-    """VmRSS: resident now; VmHWM: resident at most until now."""
+    """Return a field of /proc in bytes. VmRSS: resident now; VmHWM: the most resident so far."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return 1024 * next(int(line.split()[1]) for line in lines if line.startswith(field))
 

@@ -189,9 +189,9 @@ BROKEN = {
         '[[cache.rules]]\nabove = "2 um"\nup_to = "1 um"\n', FRAME, "above must be less than up_to"
     ),
     "an envelope that does not say what is in it": (
-        '[[cache.rules]]\nmessage = "Scan2d"\nenvelope = "wide_{channel}"\n', FRAME, "nobody could read it"
+        '[[cache.rules]]\nmessage = "Scan2d"\nenvelope = "wide_{channel}"\n', FRAME, "no subscriber could"
     ),
-    "a mapping that does not say what is in it": ('[cache]\nmapping = "parts.mute"\n', FRAME, "nobody could read it"),
+    "a mapping that does not say what is in it": ('[cache]\nmapping = "parts.mute"\n', FRAME, "no subscriber could"),
     "a mapping that fails": ('[cache]\nmapping = "parts.narrow"\n', FRAME, "[cache] mapping"),
     "a mapping that is not there": ('[cache]\nmapping = "parts.no_such"\n', FRAME, "[cache] mapping"),
 }  # fmt: skip

@@ -6,7 +6,7 @@ from tests.unit.scheduler.logic_lab import Lab
 
 @pytest.fixture
 def lab() -> Lab:
-    """A core whose translator is there."""
+    """A core with a connected translator."""
     made = Lab()
     made.translator()
     return made

@@ -1,4 +1,4 @@
-"""Frozen parts of the scheduler's state, told one thing after the other."""
+"""Frozen parts of the scheduler's state, changed step by step."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class Held(Generic[T]):
-    """Calls the methods of a part; where one returns the next part (and perhaps a result), that takes its place."""
+    """Calls the methods of a part; a part returned by a method (perhaps with a result) replaces the former one."""
 
     def __init__(self, part: T) -> None:
         self.part = part
@@ -34,7 +34,7 @@ class Held(Generic[T]):
 
 
 class Dog:
-    """A watchdog with the microscope that it watches."""
+    """A watchdog with its microscope."""
 
     def __init__(self, settings: WatchdogSettings) -> None:
         self.watchdog = Watchdog(settings)
@@ -57,7 +57,7 @@ class Dog:
 
     def state(self, state: ScopeState) -> None:
         self.microscope = self.microscope.with_state(state, 0.0)
-        self.watchdog = self.watchdog.state_told(self.microscope)
+        self.watchdog = self.watchdog.state_reported(self.microscope)
 
     def feedback(self, *, on: bool) -> None:
         self.microscope = self.microscope.with_feedback(Feedback(on=on))
@@ -94,5 +94,5 @@ class Dog:
         return told
 
     def tell(self, name: str, *args: Any) -> None:
-        """Call a method of the watchdog's that returns the next one."""
+        """Call a method of the watchdog that returns the next one."""
         self.watchdog = getattr(self.watchdog, name)(*args)

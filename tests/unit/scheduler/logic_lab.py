@@ -1,4 +1,4 @@
-"""A scheduler's core to talk to, without sockets."""
+"""A scheduler's core without sockets, with short calls for tests."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ NS = 10**9
 
 
 class Lab:
-    """A core, what it has done, and short ways to make things happen. Names get a connection when they first speak."""
+    """A core with its effects so far, and short calls for events. A name gets a connection with its first request."""
 
     def __init__(
         self,
@@ -91,7 +91,7 @@ class Lab:
         self.now_ns += round(experiment_s * NS)
 
     def entries(self) -> list[JournalEntry]:
-        """Wait until what has happened is published; returns what was since the last time."""
+        """Wait for the next publication of entries; return the entries since the last call."""
         self.later(PERIOD_S)
         self.step(Tick())
         told = [self.codec.decode(p.payload) for p in published(self.effects) if p.envelope == "JournalEntries"]
@@ -105,7 +105,7 @@ class Lab:
         return self.newest
 
     def translator(self, retracts: ControlResponse = ControlResponse.SUCCESS) -> None:
-        """The translator is there, ours, and has answered the scheduler's question, whether it retracts."""
+        """Connect a translator that answers the scheduler's question whether it retracts."""
         self.step(TranslatorUp())
         self.step(TranslatorCaughtUp())
         question = next(one for one in self.forwarded if one.request.kind == ControlRequest.ACTION_SUPPORT)
@@ -126,11 +126,11 @@ class Lab:
     def answer_reads(
         self, lacking: ControlResponse = ControlResponse.PARAM_NOT_SUPPORTED, **values: str
     ) -> list[Effect]:
-        """The microscope answers reads, in SI, until another request is sent.
+        """Answer reads, in SI, until another request is sent.
 
         Args:
-            lacking: its answer for a parameter that it does not have.
-            values: by name, with underscores; it does not have the others.
+            lacking: the answer for a parameter that the microscope does not have.
+            values: by name, with underscores; the microscope has no others.
         """
         effects: list[Effect] = []
         while (asked := self.in_flight()) is not None and is_get(asked.request):
@@ -142,7 +142,7 @@ class Lab:
         return effects
 
     def in_flight(self) -> Forward | None:
-        """What the translator has and did not answer yet."""
+        """Return the request that the translator has not answered yet."""
         flight = self.core.state.forwarder.flight
         return None if flight is None else next(one for one in self.forwarded if one.number == flight.number)
 
@@ -152,7 +152,7 @@ class Lab:
         return self.step(RequestIn(connection, name, Request(int(kind), subject, payload, id_), user))
 
     def says(self, name: str, kind: ControlRequest, subject: Any = None, id_: str = "") -> ControlResponse:
-        """Ask, and return the code of the answer that comes at once."""
+        """Send a request, and return the code of its immediate answer."""
         return ControlResponse(replies(self.ask(name, kind, subject, id_))[-1].response.code)
 
     def take_control(self, name: str, problem: int = 0) -> ControlResponse:
@@ -176,18 +176,18 @@ class Lab:
         return self.publish("ScopeStateMsg", ScopeStatus(state))
 
     def is_gone(self, name: str) -> None:
-        """Its connection is lost."""
+        """Disconnect a component."""
         if (connection := self.connections.pop(name, None)) is not None:
             self.step(Disconnected(connection))
 
     def tell(self, *states: ProcessState, supervisor: str = "supervisor:lab") -> list[Effect]:
-        """A supervisor says how it is with its processes, and whatever is due because of that is done."""
+        """Report process states as a supervisor, then process the due deadlines."""
         thing = ProcessStates(self.now_ns, supervisor.partition(":")[2], states)
         self.ask(supervisor, RELAY_REQUEST, RelayedMessage("ProcessStates", self.codec.encode(thing)))
         return self.step(Tick())
 
     def give_up(self, name: str) -> list[Effect]:
-        """The process of a component has died, and is not started again."""
+        """Let the process of a component die without a restart."""
         self.is_gone(name)
         return self.tell(ProcessState(name, "component", ProcessCondition.GIVEN_UP, 1))
 
@@ -197,7 +197,7 @@ class Lab:
 
 
 def as_saved(state: SavedState) -> SavedState:
-    """As it comes out of a file."""
+    """Return the state as read back from a file."""
     return restored(SavedState, json.loads(json.dumps(snapshot(state, KIND, VERSION))), KIND, VERSION)
 
 
@@ -221,7 +221,7 @@ def in_control(settings: SchedulerSettings) -> Lab:
 
 
 def killed(lab: Lab, settings: SchedulerSettings) -> Lab:
-    """The scheduler that is started with what was saved last."""
+    """Return a scheduler restarted with the state saved last."""
     saved = [effect.state for effect in lab.effects if isinstance(effect, SaveState)][-1]
     again = Lab(settings, state=saved, codec=lab.codec)
     again.now_s, again.now_ns = lab.now_s, lab.now_ns
@@ -230,7 +230,7 @@ def killed(lab: Lab, settings: SchedulerSettings) -> Lab:
 
 
 def resumed(lab: Lab, settings: SchedulerSettings) -> Lab:
-    """The same, when it has caught up with the translator."""
+    """Return a restarted scheduler that has received the translator's missed packets."""
     again = killed(lab, settings)
     for _ in range(3):  # one decision in each
         again.later(real_s=settings.waits.catch_up_s)

@@ -1,4 +1,4 @@
-"""The transition table of control: what the paper says, and what it leaves open."""
+"""The arbitration table: the rules of the paper, and the cases that the paper leaves open."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MANUAL, AUTOMATED = int(ControlMode.MANUAL), int(ControlMode.AUTOMATED)
 
 
 def after(*asks: ControlInput, rules: Rules = RULES) -> tuple[ArbitrationState, Transition]:
-    """The state after a story, and the row that its last event met."""
+    """Return the state after a sequence of events, and the row of its last event."""
     control = ArbitrationState()
     for ask in asks:
         row = row_for(control, ask, rules)
@@ -83,7 +83,7 @@ def test_a_cause_is_given_where_control_is_taken_and_only_there() -> None:
         assert (row.cause is not None) == any(do.name == "TAKE" for do in row.do)
 
 
-def test_the_first_to_ask_gets_control_and_no_other_until_it_is_given_back() -> None:
+def test_first_client_gets_control_until_it_is_released() -> None:
     control, row = after(request("experiment"), request("greedy"))
     assert (control.holder, row.response) == ("experiment", ControlResponse.ALREADY_UNDER_CONTROL)
     control, row = after(
@@ -107,7 +107,7 @@ def test_the_paper_s_story_of_a_tip_that_changes() -> None:
 
 
 @pytest.mark.parametrize("who", ["classifier", "corrector", "person"])
-def test_anybody_may_clear_a_flag_unless_roles_are_given(who: str) -> None:
+def test_any_component_may_clear_a_flag_without_roles(who: str) -> None:
     control, row = after(flag("classifier", TIP), clear(who, TIP))
     assert (dict(control.problems), row.response) == ({}, ControlResponse.SUCCESS)
 
@@ -134,7 +134,7 @@ def test_a_flag_raised_again_does_not_take_control_from_its_solver() -> None:
     assert control.holder == "corrector"
 
 
-def test_a_flag_that_is_not_set_is_removed_with_success_and_takes_control_from_nobody() -> None:
+def test_clearing_an_unset_flag_succeeds_and_changes_no_control() -> None:
     control, row = after(request("experiment"), clear("classifier", TIP))
     assert (control.holder, row.response) == ("experiment", ControlResponse.SUCCESS)
 
@@ -155,7 +155,7 @@ def test_a_solver_may_go_over_to_another_flagged_problem() -> None:
     assert after(flag("c", TIP), flag("c", FEEDBACK), request("fixer", TIP), clear("c", TIP))[0].holder is None
 
 
-def test_control_is_not_given_to_solve_what_is_not_flagged() -> None:
+def test_control_for_an_unflagged_problem_is_refused() -> None:
     assert after(request("corrector", TIP))[1].response is ControlResponse.WRONG_EXP_PROBLEM
     assert after(flag("c", FEEDBACK), request("corrector", TIP))[1].response is ControlResponse.WRONG_EXP_PROBLEM
 
@@ -168,7 +168,7 @@ def test_a_second_problem_leaves_control_with_the_solver_of_the_first() -> None:
     assert (control.holder, set(control.problems)) == (None, {FEEDBACK})
 
 
-def test_a_malfunction_takes_control_from_who_solves_something_else_and_comes_first() -> None:
+def test_malfunction_takes_control_from_solvers_of_other_problems() -> None:
     story = [flag("c", TIP), request("corrector", TIP), flag("scheduler", MALFUNCTION)]
     control, row = after(*story)
     assert (control.holder, row.cause) == (None, Cause.PROBLEM)
@@ -177,7 +177,7 @@ def test_a_malfunction_takes_control_from_who_solves_something_else_and_comes_fi
     assert after(*story, clear("person", MALFUNCTION), request("corrector", TIP))[0].holder == "corrector"
 
 
-def test_manual_disengages_the_holder_and_lets_nobody_in_until_automated() -> None:
+def test_manual_takes_control_and_refuses_requests_until_automated() -> None:
     story = [request("experiment"), mode(MANUAL)]
     control, row = after(*story)
     assert (control.holder, row.cause) == (None, Cause.MANUAL)
@@ -190,12 +190,12 @@ def test_problems_may_be_flagged_and_cleared_in_manual() -> None:
     assert set(control.problems) == {FEEDBACK}
 
 
-def test_a_mode_that_is_none_is_refused() -> None:
+def test_unknown_mode_is_refused() -> None:
     control, row = after(mode(0))
     assert (control.mode, row.response) == (ControlMode.AUTOMATED, ControlResponse.WRONG_CONTROL_MODE)
 
 
-def test_setting_the_mode_that_is_takes_control_from_nobody() -> None:
+def test_setting_the_present_mode_changes_no_control() -> None:
     assert after(request("experiment"), mode(AUTOMATED))[0].holder == "experiment"
 
 
@@ -205,13 +205,13 @@ def test_problems_named_in_the_experiment_file_work_like_the_numbered_ones() -> 
 
 
 @pytest.mark.parametrize("problem", [0, 77, 255])
-def test_a_problem_that_nobody_named_is_refused(problem: int) -> None:
+def test_unknown_problem_is_refused(problem: int) -> None:
     for ask in (flag("c", problem), clear("c", problem)):
         control, row = after(ask)
         assert (dict(control.problems), row.response) == ({}, ControlResponse.WRONG_EXP_PROBLEM)
 
 
-def test_only_the_holder_commands_and_everybody_reads() -> None:
+def test_only_the_holder_commands_and_all_components_read() -> None:
     assert after(request("experiment"), ControlInput(ArbitrationEvent.COMMAND, "experiment"))[1].response is None
     assert (
         after(request("experiment"), ControlInput(ArbitrationEvent.COMMAND, "other"))[1].response
@@ -243,7 +243,7 @@ def test_an_operator_adjusts_beside_the_holder_while_no_problem_is_flagged() -> 
     assert response("corrector", flag("c", TIP), request("corrector", TIP)) is None
 
 
-def test_roles_say_who_may_end_and_switch() -> None:
+def test_roles_limit_ending_and_switching_the_mode() -> None:
     rules = Rules(RoleTable(end_experiment=("boss",), set_mode=("boss",)))
     assert after(ControlInput(ArbitrationEvent.END, "other"), rules=rules)[1].response is ControlResponse.FAILURE
     assert after(ControlInput(ArbitrationEvent.END, "boss"), rules=rules)[0].ended
@@ -251,14 +251,14 @@ def test_roles_say_who_may_end_and_switch() -> None:
     assert after(mode(MANUAL, "boss"), rules=rules)[0].mode is ControlMode.MANUAL
 
 
-def test_a_problem_ends_the_experiment_where_the_file_says_so() -> None:
+def test_problem_in_end_on_ends_the_experiment() -> None:
     rules = Rules(end_on=frozenset({TIP}))
     control, row = after(request("experiment"), flag("classifier", TIP), rules=rules)
     assert (control.ended, row.response) == (True, ControlResponse.SUCCESS)
     assert not after(flag("classifier", FEEDBACK), rules=rules)[0].ended
 
 
-def test_a_refusal_says_who_and_what() -> None:
+def test_refusal_names_client_and_holder() -> None:
     control, _ = after(request("experiment"))
     ask = request("greedy")
     assert reason(row_for(control, ask, RULES), control, ask, RULES).startswith("experiment is in control")
@@ -266,7 +266,7 @@ def test_a_refusal_says_who_and_what() -> None:
     assert "tip-shape-changed" in reason(row_for(flagged, ask, RULES), flagged, ask, RULES)
 
 
-def test_every_refusal_has_a_reason_that_can_be_told() -> None:
+def test_every_refusal_has_a_reason_that_can_be_formatted() -> None:
     for event, row in [(event, row) for event, rows in TABLE.items() for row in rows]:
         if row.response not in (None, ControlResponse.SUCCESS):
             assert reason(row, ArbitrationState(), ControlInput(event, "somebody", 1), RULES)
@@ -281,7 +281,7 @@ asks = st.builds(
 
 
 @given(st.lists(asks, max_size=40))
-def test_no_story_breaks_what_must_always_hold(story: list[ControlInput]) -> None:
+def test_no_sequence_of_events_breaks_the_invariants(story: list[ControlInput]) -> None:
     control = ArbitrationState()
     for ask in story:
         before, row = control, row_for(control, ask, RULES)
@@ -300,8 +300,8 @@ def test_no_story_breaks_what_must_always_hold(story: list[ControlInput]) -> Non
 def test_the_diagram_is_drawn_from_the_table() -> None:
     drawn = edges()
     assert ("free", "asks for control", "in control") in drawn
-    assert ("in control", "flags a problem", "flagged, nobody in control") in drawn
-    assert ("flagged, nobody in control", "asks for control", "solver in control") in drawn
+    assert ("in control", "flags a problem", "flagged, no component in control") in drawn
+    assert ("flagged, no component in control", "asks for control", "solver in control") in drawn
     assert ("solver in control", "the last flag is removed", "free") in drawn
     assert not any(before == "manual" and after == "in control" for before, _, after in drawn)
     assert mermaid().startswith("stateDiagram-v2")
@@ -325,7 +325,7 @@ def test_giving_control_back_and_taking_it_again_is_routine_to_the_log() -> None
     assert is_routine(free, held, ask, "series")
 
 
-def test_what_says_how_the_experiment_goes_is_told() -> None:
+def test_changes_beyond_routine_are_logged() -> None:
     free, held = ArbitrationState(), ArbitrationState(holder="series")
     ask = ControlInput(ArbitrationEvent.REQUEST_CONTROL, "series")
     flagged = ArbitrationState(problems={1: "classifier"})

@@ -1,4 +1,4 @@
-"""What is kept, under which envelope, in which order, and who gets it."""
+"""The cache: which packets are kept, under which envelope and in which order, and their replay."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_sizes_below_a_nanometre_stay_apart() -> None:
     assert [size_text(width) for width in (2.5e-10, 3e-10, 9e-10)] == ["0.25", "0.3", "0.9"]
 
 
-def test_lines_of_a_running_scan_are_passed_on_and_not_kept() -> None:
+def test_lines_of_a_running_scan_are_published_and_not_cached() -> None:
     cache = PacketCache()
     put(cache, scan(), NOW)
     for number in range(1, 200):
@@ -62,7 +62,7 @@ def test_lines_of_a_running_scan_are_passed_on_and_not_kept() -> None:
     assert [source_ns for source_ns, _ in cache.recent()] == [NOW]  # what is to keep its time after a kill is known
 
 
-def test_the_default_envelopes_are_those_of_the_wire_format() -> None:
+def test_default_envelopes_follow_the_wire_format() -> None:
     assert default_envelope(scan(2e-6, "Height Retrace")) == "Scan2d_2000.0_Height Retrace"
     assert default_envelope(scan(2e-6, "a_b_c")) == "Scan2d_2000.0_a_b_c"
     assert default_envelope(PacketHeader("Spec1d", kind="IV")) == "Spec1d_IV"
@@ -81,7 +81,7 @@ def test_wide_and_narrow_scans_can_be_kept_apart() -> None:
     assert envelopes.of(PacketHeader("ScopeStateMsg")) == ("ScopeStateMsg", 10)
 
 
-def test_a_rule_may_say_only_how_many_are_kept() -> None:
+def test_rule_may_set_only_the_history() -> None:
     assert Envelopes([CacheRule("Scan2d", channel="Height", history=99)]).of(scan()) == ("Scan2d_2000.0_Height", 99)
     assert Envelopes(history={"Peaks": 3}).of(PacketHeader("Peaks")) == ("Peaks", 3)
 
@@ -117,7 +117,7 @@ def test_a_rule_that_can_not_work_is_refused(rule: dict[str, object]) -> None:
         CacheRule("Scan2d", **rule)  # type: ignore[arg-type]
 
 
-def test_of_each_envelope_the_newest_are_kept() -> None:
+def test_newest_packets_of_each_envelope_are_kept() -> None:
     cache = PacketCache(Envelopes(history={"Scan2d": 3}))
     for n in range(1, 11):
         put(cache, scan(channel="a"), n * NS)
@@ -143,19 +143,19 @@ def test_times_increase_though_the_translator_s_clock_goes_back() -> None:
     assert [p.time_ns for p in given if p] == [100 * NS, 100 * NS + TIME_STEP_NS, 100 * NS + 2 * TIME_STEP_NS, 200 * NS]
 
 
-def test_a_clock_far_ahead_is_not_believed() -> None:
+def test_time_far_ahead_is_replaced() -> None:
     packet = put(PacketCache(), scan(), NOW + 100 * 3600 * NS)
     assert packet is not None
     assert packet.time_ns == NOW
 
 
-def test_a_packet_without_a_time_is_published_at_ours() -> None:
+def test_packet_without_a_time_gets_the_present_time() -> None:
     packet = put(PacketCache(), scan(), None)
     assert packet is not None
     assert packet.time_ns == NOW
 
 
-def test_what_a_translator_sends_again_when_it_reconnects_is_dropped() -> None:
+def test_duplicates_of_a_reconnecting_translator_are_dropped() -> None:
     cache = PacketCache()
     assert put(cache, scan(), 5 * NS) is not None
     assert put(cache, scan(), 5 * NS) is None
@@ -180,7 +180,7 @@ def test_a_flood_of_envelopes_is_bounded() -> None:
     assert len(cache) < 40
 
 
-def test_what_is_too_large_is_published_and_not_kept() -> None:
+def test_packet_larger_than_the_cache_is_published_and_not_kept() -> None:
     cache = PacketCache(max_bytes=1000)
     taken = cache.take(Packet("Scan2d", b"x" * 2000, NS), scan(), NOW)
     assert taken is not None
@@ -188,7 +188,7 @@ def test_what_is_too_large_is_published_and_not_kept() -> None:
     assert len(cache) == 0
 
 
-def test_a_restart_brings_everything_back_and_goes_on_after_it() -> None:
+def test_restart_restores_the_cache_and_continues_after_it() -> None:
     cache = PacketCache()
     for n in range(1, 5):
         put(cache, scan(), n * NS)
@@ -204,7 +204,7 @@ def test_a_restart_brings_everything_back_and_goes_on_after_it() -> None:
     assert new.time_ns == 10 * NS + TIME_STEP_NS
 
 
-def test_what_was_published_but_not_written_down_comes_again_at_its_first_time() -> None:
+def test_packet_published_but_not_logged_keeps_its_first_time() -> None:
     cache = PacketCache()
     cache.not_before(10 * NS)
     first = put(cache, scan(), 5 * NS)
@@ -227,7 +227,7 @@ packets = st.tuples(
 
 
 @given(st.lists(packets, max_size=60), st.integers(400, 3000))
-def test_whatever_comes_is_kept_in_order_within_its_bounds(
+def test_any_sequence_of_packets_is_kept_in_order_within_bounds(
     story: list[tuple[str, str, int | None, bytes]], limit: int
 ) -> None:
     cache, newest, last = PacketCache(max_bytes=limit), dict[str, int](), 0
@@ -250,7 +250,7 @@ def test_whatever_comes_is_kept_in_order_within_its_bounds(
             assert last in got
 
 
-def test_what_was_passed_over_is_not_published_after_a_restart_either() -> None:
+def test_packet_passed_over_is_not_published_after_a_restart() -> None:
     cache = PacketCache()
     passed, after = (
         Packet("ScopeStateMsg", b"FREE", 10 * TIME_STEP_NS),

@@ -1,4 +1,4 @@
-"""A microscope that is lost, or says what can't be: the scheduler flags it, and the flag goes when it is back."""
+"""A microscope that is lost or reports impossible values is flagged, and the flag is cleared when it is back."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def lab() -> Lab:
 
 
 def lose(lab: Lab, for_s: float) -> None:
-    """The microscope is lost; the scheduler wakes up when it said that it wants to."""
+    """Lose the microscope for a time, with a tick at each deadline of the scheduler."""
     lab.scope_is(ScopeState.UNDEFINED)
     until_s = lab.now_s + for_s
     while (due_s := lab.core.deadline_s()) is not None and due_s <= until_s:
@@ -36,7 +36,7 @@ def problems(lab: Lab) -> dict[int, str]:
     return dict(lab.core.control.problems)
 
 
-def test_a_microscope_that_is_soon_found_again_costs_nothing(lab: Lab) -> None:
+def test_microscope_lost_for_a_moment_costs_nothing(lab: Lab) -> None:
     lose(lab, PATIENCE_S - 0.1)
     lab.scope_is(ScopeState.SCANNING)
     lab.later(100.0)
@@ -45,7 +45,7 @@ def test_a_microscope_that_is_soon_found_again_costs_nothing(lab: Lab) -> None:
     assert lab.core.deadline_s() is None
 
 
-def test_a_microscope_that_stays_lost_is_a_malfunction_and_nobody_stays_in_control(lab: Lab) -> None:
+def test_microscope_that_stays_lost_is_a_malfunction_and_frees_control(lab: Lab) -> None:
     lose(lab, PATIENCE_S)
     assert (problems(lab), lab.holder) == ({LOST: "translator"}, None)
     assert lab.take_control("series") is ControlResponse.WRONG_EXP_PROBLEM
@@ -53,14 +53,14 @@ def test_a_microscope_that_stays_lost_is_a_malfunction_and_nobody_stays_in_contr
     assert lab.core.deadline_s() is None  # there is nothing more to wait for
 
 
-def test_it_is_over_when_the_microscope_is_back(lab: Lab) -> None:
+def test_malfunction_ends_when_the_microscope_is_back(lab: Lab) -> None:
     lose(lab, 10.0)
     lab.scope_is(ScopeState.FREE)
     assert problems(lab) == {}
     assert lab.take_control("series") is ControlResponse.SUCCESS
 
 
-def test_a_flag_of_somebody_else_stays(lab: Lab) -> None:
+def test_flag_of_another_component_stays(lab: Lab) -> None:
     lab.flag("corrector", LOST)
     lose(lab, 10.0)
     lab.scope_is(ScopeState.FREE)
@@ -74,7 +74,7 @@ def test_the_flag_comes_again_as_long_as_the_microscope_is_lost(lab: Lab) -> Non
     assert problems(lab) == {LOST: "translator"}
 
 
-def test_a_restarted_scheduler_knows_whose_flag_it_is(lab: Lab) -> None:
+def test_restarted_scheduler_knows_the_author_of_a_flag(lab: Lab) -> None:
     lose(lab, 10.0)
     again = Lab(state=lab.core.snapshot())
     again.translator()
@@ -83,7 +83,7 @@ def test_a_restarted_scheduler_knows_whose_flag_it_is(lab: Lab) -> None:
     assert problems(again) == {}
 
 
-def test_being_lost_for_longer_is_counted_from_the_first_that_was_heard_of_it(lab: Lab) -> None:
+def test_loss_counts_from_its_first_report(lab: Lab) -> None:
     lose(lab, PATIENCE_S - 1.0)
     lose(lab, 1.0)  # the translator says it again to a scheduler that connects
     assert problems(lab) == {LOST: "translator"}

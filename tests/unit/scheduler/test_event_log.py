@@ -1,4 +1,4 @@
-"""What happened is published, some at a time: each request with its answer, each change of control, each order."""
+"""The event log is published in batches: each request with its answer, each change of control, each order."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from afspm.model import (
     ScanParameters,
     ShapeChange,
 )
-from afspm.scheduler.control.descriptions import asked
+from afspm.scheduler.control.descriptions import request_text
 from afspm.scheduler.events import Effect, Forward, Kill, Publish, SaveState, Tick, Unreadable
 from afspm.scheduler.publishing import event_log
 
@@ -46,7 +46,7 @@ def said(entries: list[JournalEntry], kind: str) -> list[tuple[str, str]]:
     return [(entry.who, entry.what) for entry in entries if entry.kind == kind]
 
 
-def test_a_request_is_written_down_with_its_answer_and_how_long_that_took(lab: Lab) -> None:
+def test_request_is_logged_with_its_answer_and_duration(lab: Lab) -> None:
     lab.take_control("series")
     lab.ask("series", R.ACTION, "start-scan", "series/a/1")
     lab.later(0.05)
@@ -57,7 +57,7 @@ def test_a_request_is_written_down_with_its_answer_and_how_long_that_took(lab: L
     assert scan.time_ns >= control.time_ns
 
 
-def test_a_measurement_is_written_down_with_its_key_and_the_time_at_which_it_was_passed_on(lab: Lab) -> None:
+def test_measurement_is_logged_with_its_key_and_time_of_forwarding(lab: Lab) -> None:
     lab.take_control("survey")
     lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/2")
     sent_ns = lab.now_ns
@@ -71,7 +71,7 @@ def test_a_measurement_is_written_down_with_its_key_and_the_time_at_which_it_was
     assert (refused.key, refused.sent_ns) == ("tile-2", None)
 
 
-def test_key_outlives_a_scheduler_that_is_killed_right_after_it_passed_the_start_on(lab: Lab) -> None:
+def test_key_outlives_a_kill_right_after_forwarding(lab: Lab) -> None:
     lab.take_control("survey")
     lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
     sent_ns = lab.now_ns
@@ -82,7 +82,7 @@ def test_key_outlives_a_scheduler_that_is_killed_right_after_it_passed_the_start
     assert "restarted" in start.reason
 
 
-def test_start_that_is_repeated_after_a_kill_keeps_the_time_at_which_it_was_passed_on_first(lab: Lab) -> None:
+def test_repeated_start_keeps_its_first_time_of_forwarding_over_a_kill(lab: Lab) -> None:
     lab.take_control("survey")
     lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
     sent_ns = lab.now_ns
@@ -97,7 +97,7 @@ def test_start_that_is_repeated_after_a_kill_keeps_the_time_at_which_it_was_pass
     ]
 
 
-def test_start_whose_entry_outlived_the_kill_is_not_written_down_again(lab: Lab) -> None:
+def test_start_whose_entry_outlived_the_kill_is_not_logged_again(lab: Lab) -> None:
     lab.take_control("survey")
     lab.ask("survey", R.ACTION, "start-scan", "survey/key/tile-1/1")
     lab.answer(lab.forwarded[-1])
@@ -106,7 +106,7 @@ def test_start_whose_entry_outlived_the_kill_is_not_written_down_again(lab: Lab)
 
 
 def killed_after(lab: Lab, kind: type[Effect]) -> Lab:
-    """Return the next life of a scheduler that carried out nothing after its last effect of a kind."""
+    """Return the restart of a scheduler killed after its last effect of a kind."""
     last = max(n for n, effect in enumerate(lab.effects) if isinstance(effect, kind))
     done = lab.effects[: last + 1]
     saved = [effect.state for effect in done if isinstance(effect, SaveState)]
@@ -116,15 +116,15 @@ def killed_after(lab: Lab, kind: type[Effect]) -> Lab:
     return after
 
 
-def test_a_refusal_is_written_down_with_its_reason(lab: Lab) -> None:
+def test_refusal_is_logged_with_its_reason(lab: Lab) -> None:
     lab.ask("stranger", R.ACTION, "start-scan")
     (entry,) = lab.entries()
     assert entry.refused
-    assert (entry.response, entry.reason) == (C.NOT_IN_CONTROL, "stranger is not in control, nobody is")
+    assert (entry.response, entry.reason) == (C.NOT_IN_CONTROL, "stranger is not in control, no component is")
 
 
 @pytest.mark.parametrize("flagged", [True, False])
-def test_who_waits_for_control_is_not_refused(lab: Lab, flagged: bool) -> None:
+def test_request_for_control_that_must_wait_is_no_refusal(lab: Lab, flagged: bool) -> None:
     if flagged:
         lab.ask("judge", R.ADD_EXP_PRBLM, 1)
     else:
@@ -136,11 +136,11 @@ def test_who_waits_for_control_is_not_refused(lab: Lab, flagged: bool) -> None:
 
 
 @pytest.mark.parametrize(("code", "refused"), [(C.NOT_FREE, False), (C.NO_RESPONSE, False), (C.PARAM_ERROR, True)])
-def test_a_refusal_is_told_by_its_code(code: C, refused: bool) -> None:
+def test_refusal_is_recognised_by_its_code(code: C, refused: bool) -> None:
     assert JournalEntry(0, "request", "series", "start-scan", int(code), request=int(R.ACTION)).refused is refused
 
 
-def test_nothing_is_published_oftener_than_its_period_nor_without_having_happened(lab: Lab) -> None:
+def test_entries_are_published_once_a_period_and_only_if_there_are_any(lab: Lab) -> None:
     lab.take_control("series")
     due_s = lab.core.deadline_s()
     assert due_s == lab.now_s + event_log.PERIOD_S
@@ -152,7 +152,7 @@ def test_nothing_is_published_oftener_than_its_period_nor_without_having_happene
     assert lab.entries() == []
 
 
-def test_every_change_of_control_is_written_down_with_who_and_why(lab: Lab) -> None:
+def test_every_change_of_control_is_logged_with_author_and_reason(lab: Lab) -> None:
     lab.take_control("series")
     lab.flag("classifier", TIP)
     lab.take_control("corrector", TIP)
@@ -173,7 +173,7 @@ def test_every_change_of_control_is_written_down_with_who_and_why(lab: Lab) -> N
     assert reasons["cleared tip-shape-changed"] == "it was flagged by classifier"
 
 
-def test_what_the_scheduler_asks_by_itself_is_written_down_too(lab: Lab) -> None:
+def test_requests_of_the_scheduler_are_logged(lab: Lab) -> None:
     from afspm.model import ScopeState
 
     lab.take_control("series")
@@ -185,7 +185,7 @@ def test_what_the_scheduler_asks_by_itself_is_written_down_too(lab: Lab) -> None
     assert ("scheduler", "stop-scan") in said(lab.entries(), "request")
 
 
-def test_an_answer_that_comes_late_is_written_down_after_that_there_was_none(lab: Lab) -> None:
+def test_late_answer_is_logged_after_the_missing_one(lab: Lab) -> None:
     lab.take_control("series")
     lab.ask("series", R.ACTION, "start-scan", "series/a/1")
     lab.later(5.0)
@@ -198,19 +198,19 @@ def test_an_answer_that_comes_late_is_written_down_after_that_there_was_none(lab
     assert late.reason.startswith("late")
 
 
-def test_a_repetition_is_not_written_down_again(lab: Lab) -> None:
+def test_retry_is_not_logged_again(lab: Lab) -> None:
     for _ in range(3):
         lab.ask("series", R.REQUEST_CTRL, 0, "series/a/1")
     assert len(said(lab.entries(), "request")) == 1
 
 
-def test_what_could_not_be_read_is_written_down(lab: Lab) -> None:
+def test_unreadable_request_is_logged(lab: Lab) -> None:
     lab.step(Unreadable("stranger", Response(int(C.CMD_NOT_SUPPORTED), b"", "there is no request 77")))
     (entry,) = lab.entries()
     assert (entry.who, entry.response, entry.reason) == ("stranger", C.CMD_NOT_SUPPORTED, "there is no request 77")
 
 
-def test_however_long_what_is_asked_is_what_is_written_down_is_not(lab: Lab) -> None:
+def test_entry_of_a_long_request_is_shortened(lab: Lab) -> None:
     lab.ask("stranger", R.PARAM, Parameter("scan-speed", "9" * 10**6))
     lab.step(Unreadable("stranger", Response(int(C.FAILURE), b"", "x" * 10**6)))
     asked_, unreadable = lab.entries()
@@ -218,12 +218,12 @@ def test_however_long_what_is_asked_is_what_is_written_down_is_not(lab: Lab) -> 
     assert len(asked_.what) == len(unreadable.reason) == event_log.LONGEST
 
 
-def test_the_time_is_asked_for_too_often_to_be_written_down(lab: Lab) -> None:
+def test_clock_requests_are_not_logged(lab: Lab) -> None:
     lab.ask("series", CLOCK_REQUEST)
     assert lab.entries() == []
 
 
-def test_of_a_flood_is_said_how_much_is_left_out_and_no_change_of_control_is(lab: Lab) -> None:
+def test_flood_of_requests_is_counted_and_no_change_of_control_left_out(lab: Lab) -> None:
     for n in range(event_log.MOST + 20):
         lab.ask("stranger", R.RELEASE_CTRL, None, f"stranger/a/{n}")
     lab.step(Unreadable("stranger", Response(int(C.FAILURE))))
@@ -234,7 +234,7 @@ def test_of_a_flood_is_said_how_much_is_left_out_and_no_change_of_control_is(lab
     assert len(entries) == event_log.MOST + 2
 
 
-def test_before_the_end_all_of_it_is_published(lab: Lab) -> None:
+def test_all_entries_are_published_before_the_end(lab: Lab) -> None:
     effects = lab.ask("boss", R.END_EXPERIMENT)
     assert isinstance(effects[-1], Kill)
     (packet,) = published(effects)
@@ -242,14 +242,14 @@ def test_before_the_end_all_of_it_is_published(lab: Lab) -> None:
     assert what == ["ended the experiment", "ends the experiment"]
 
 
-def test_what_was_published_is_replayed_to_who_comes_late(lab: Lab) -> None:
+def test_published_entries_are_replayed_to_late_joiners(lab: Lab) -> None:
     for n in range(5):
         lab.take_control(f"series-{n}")
         lab.entries()
     assert sum(packet.envelope == "JournalEntries" for packet, *_ in lab.core.cached()) == 6
 
 
-def test_it_is_saved_before_it_is_published_so_that_its_time_is_not_given_twice(lab: Lab) -> None:
+def test_time_of_entries_is_saved_before_they_are_published(lab: Lab) -> None:
     lab.take_control("series")
     lab.later(event_log.PERIOD_S)
     save, publish = lab.step(Tick())
@@ -257,7 +257,7 @@ def test_it_is_saved_before_it_is_published_so_that_its_time_is_not_given_twice(
     assert save.state.last_ns == published([publish])[0].time_ns
 
 
-def test_a_restart_is_written_down_once_control_has_been_told() -> None:
+def test_restart_is_logged_after_control_is_published() -> None:
     lab = Lab()
     lab.translator()
     lab.take_control("series")
@@ -311,4 +311,4 @@ SQUARE = Region((0.0, 0.0), (5e-7, 5e-7))
     ],
 )
 def test_requests_in_words(kind: int, subject: Any, words: str) -> None:
-    assert asked(Request(int(kind), subject), ProblemNames()) == words
+    assert request_text(Request(int(kind), subject), ProblemNames()) == words

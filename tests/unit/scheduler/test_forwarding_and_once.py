@@ -1,4 +1,4 @@
-"""Requests on their way: one in flight, everybody answered, late answers told apart."""
+"""Forwarded requests: one is in flight, each is answered, and late answers find their request."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def up(**settings: float) -> Held[Forwarder]:
     return forwarder
 
 
-def test_one_is_in_flight_and_the_others_wait_their_turn() -> None:
+def test_one_request_is_in_flight_and_the_others_wait() -> None:
     forwarder = up()
     for name in "abc":
         assert forwarder.ask(job(name), 0.0) is None
@@ -47,14 +47,14 @@ def test_one_is_in_flight_and_the_others_wait_their_turn() -> None:
     assert (settled.job.client, settled.end, sends(forwarder, 0.1)) == ("a", ForwardOutcome.ANSWERED, [2])
 
 
-def test_without_a_translator_everybody_is_answered_at_once() -> None:
+def test_without_a_translator_every_request_is_answered_at_once() -> None:
     refused = Held(Forwarder()).ask(job("a"), 0.0)
     assert refused is not None
     assert (refused.end, refused.response.code) == (ForwardOutcome.NOT_SENT, ControlResponse.NO_RESPONSE)
     assert refused.response.detail is ResponseDetail.NOT_SENT
 
 
-def test_a_loss_says_what_may_have_been_done_and_what_was_not() -> None:
+def test_loss_separates_unknown_outcomes_from_unsent_requests() -> None:
     forwarder = up()
     forwarder.ask(job("a"), 0.0)
     forwarder.ask(job("b"), 0.0)
@@ -65,7 +65,7 @@ def test_a_loss_says_what_may_have_been_done_and_what_was_not() -> None:
     assert ends["b"].end is ForwardOutcome.NOT_SENT
 
 
-def test_after_its_timeout_everybody_is_told_there_was_no_response() -> None:
+def test_every_request_is_answered_after_its_timeout() -> None:
     forwarder = up(timeout_s=5.0, patience_s=5.0)
     forwarder.ask(job("a"), 0.0)
     assert sends(forwarder, 0.0) == [1]
@@ -107,7 +107,7 @@ def test_an_overdue_request_that_is_repeated_is_waited_for_again() -> None:
     assert settled.end is ForwardOutcome.ANSWERED
 
 
-def test_who_repeats_for_ever_does_not_keep_the_line() -> None:
+def test_endless_retries_do_not_block_the_line() -> None:
     forwarder = up(timeout_s=5.0, patience_s=5.0)
     forwarder.ask(job("a", "k"), 0.0)
     assert sends(forwarder, 0.0) == [1]
@@ -121,7 +121,7 @@ def test_who_repeats_for_ever_does_not_keep_the_line() -> None:
     assert sends(forwarder, 15.0) == [2]
 
 
-def test_our_own_requests_go_before_those_that_wait() -> None:
+def test_requests_of_the_scheduler_go_first() -> None:
     forwarder = up()
     forwarder.ask(job("a"), 0.0)
     forwarder.ask(job("b"), 0.0)
@@ -140,7 +140,7 @@ def test_the_queue_is_bounded() -> None:
     assert all(r.response.detail is ResponseDetail.NOT_SENT for r in refused)
 
 
-def test_what_waits_can_be_called_back_and_what_was_sent_not() -> None:
+def test_waiting_requests_can_be_called_back_and_sent_ones_not() -> None:
     forwarder = up()
     for name in ("a", "a", "b"):
         forwarder.ask(job(name), 0.0)

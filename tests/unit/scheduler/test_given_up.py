@@ -1,4 +1,4 @@
-"""A holder whose process is over loses control at once, and nobody else does."""
+"""A holder whose process has ended for good loses control at once; no other component does."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def state(condition: ProcessCondition, name: str = "series", starts: int = 1) ->
 
 @pytest.fixture
 def lab() -> Lab:
-    """One in which the series is in control, and its supervisor has told that it lives."""
+    """A core with the series in control, whose supervisor has reported it alive."""
     made = Lab()
     made.translator()
     made.take_control("series")
@@ -31,14 +31,14 @@ def lab() -> Lab:
 
 
 @pytest.mark.parametrize("condition", [ENDED, GIVEN_UP])
-def test_who_is_over_loses_control_at_once_and_all_are_told(lab: Lab, condition: ProcessCondition) -> None:
+def test_ended_holder_loses_control_at_once_and_it_is_published(lab: Lab, condition: ProcessCondition) -> None:
     lab.is_gone("series")
     effects = lab.tell(state(condition))
     assert lab.holder is None
     assert "ControlState" in [packet.envelope for packet in published(effects)]
 
 
-def test_who_is_being_restarted_keeps_control_for_its_grace(lab: Lab) -> None:
+def test_restarting_holder_keeps_control_for_its_grace(lab: Lab) -> None:
     lab.is_gone("series")
     lab.tell(state(RESTARTING))
     assert lab.holder == "series"
@@ -47,7 +47,7 @@ def test_who_is_being_restarted_keeps_control_for_its_grace(lab: Lab) -> None:
     assert lab.holder is None
 
 
-def test_that_it_is_over_may_be_known_before_its_connection_is_lost(lab: Lab) -> None:
+def test_exit_may_be_known_before_the_connection_is_lost(lab: Lab) -> None:
     lab.tell(state(ENDED))
     assert lab.holder == "series"
     assert lab.core.deadline_s() is None
@@ -56,7 +56,7 @@ def test_that_it_is_over_may_be_known_before_its_connection_is_lost(lab: Lab) ->
     assert lab.holder is None
 
 
-def test_who_is_connected_long_after_its_process_was_over_is_another_and_has_its_grace(lab: Lab) -> None:
+def test_holder_connected_long_after_an_exit_is_another_process_with_its_grace(lab: Lab) -> None:
     lab.tell(state(ENDED))
     lab.later(GRACE_S + 1.0)
     lab.is_gone("series")
@@ -64,7 +64,7 @@ def test_who_is_connected_long_after_its_process_was_over_is_another_and_has_its
     assert lab.holder == "series"
 
 
-def test_who_was_started_anew_by_hand_does_not_lose_control_by_what_is_said_again(lab: Lab) -> None:
+def test_holder_restarted_by_hand_keeps_control_when_the_exit_is_reported_again(lab: Lab) -> None:
     lab.give_up("series")
     lab.later(1.0)
     lab.take_control("series")
@@ -77,7 +77,7 @@ def test_who_was_started_anew_by_hand_does_not_lose_control_by_what_is_said_agai
     assert lab.holder == "series"  # it may have lost its connection only
 
 
-def test_one_that_was_ordered_anew_and_is_over_again_loses_control_again(lab: Lab) -> None:
+def test_holder_restarted_by_order_that_ends_again_loses_control_again(lab: Lab) -> None:
     lab.give_up("series")
     for starts in (2, 3):  # also where nothing was told of its life in between
         lab.later(1.0)
@@ -88,14 +88,14 @@ def test_one_that_was_ordered_anew_and_is_over_again_loses_control_again(lab: La
         assert lab.holder is None
 
 
-def test_who_is_over_on_one_computer_and_was_started_on_another_stays_in_control(lab: Lab) -> None:
+def test_holder_moved_to_another_computer_stays_in_control(lab: Lab) -> None:
     lab.is_gone("series")
     lab.tell(state(ALIVE), supervisor="supervisor:other")
     lab.tell(state(ENDED))
     assert lab.holder == "series"
 
 
-def test_a_supervisor_that_has_not_been_heard_of_for_long_does_not_speak_for_it(lab: Lab) -> None:
+def test_report_of_a_silent_supervisor_does_not_count(lab: Lab) -> None:
     lab.tell(state(ALIVE), supervisor="supervisor:other")
     lab.later(SILENT_S + 1.0)
     lab.is_gone("series")
@@ -103,13 +103,13 @@ def test_a_supervisor_that_has_not_been_heard_of_for_long_does_not_speak_for_it(
     assert lab.holder is None
 
 
-def test_only_a_supervisor_is_believed(lab: Lab) -> None:
+def test_only_reports_of_a_supervisor_count(lab: Lab) -> None:
     lab.is_gone("series")
     lab.tell(state(GIVEN_UP), supervisor="stranger:lab")
     assert lab.holder == "series"
 
 
-def test_a_person_who_acts_by_a_component_that_is_over_loses_control(lab: Lab) -> None:
+def test_person_loses_control_with_the_ended_component(lab: Lab) -> None:
     lab.ask("series", ControlRequest.RELEASE_CTRL)
     lab.take_control("dashboard:Ada")
     lab.is_gone("dashboard:Ada")
@@ -117,7 +117,7 @@ def test_a_person_who_acts_by_a_component_that_is_over_loses_control(lab: Lab) -
     assert lab.holder is None
 
 
-def test_the_scheduler_that_was_killed_meanwhile_hears_of_it_and_waits_for_what_was_before(lab: Lab) -> None:
+def test_restarted_scheduler_revokes_control_of_an_ended_holder_after_missed_packets(lab: Lab) -> None:
     settings = SchedulerSettings()
     again = Lab(settings, state=lab.core.snapshot())
     again.tell(state(GIVEN_UP))
@@ -128,7 +128,7 @@ def test_the_scheduler_that_was_killed_meanwhile_hears_of_it_and_waits_for_what_
     assert again.holder is None
 
 
-def test_what_a_killed_scheduler_knew_already_takes_nothing_from_who_was_in_control_since(lab: Lab) -> None:
+def test_exit_known_before_a_kill_does_not_take_control_from_a_later_holder(lab: Lab) -> None:
     lab.give_up("series")
     lab.later(1.0)
     lab.take_control("series")

@@ -1,4 +1,4 @@
-"""Limits: what is refused, with which words."""
+"""Limits: which requests are refused, and with which reasons."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def probe(x: float, y: float) -> Request:
 
 
 def why(guard: Held[LimitChecker], request: Request, who: str = "experiment", now_ns: int = 0) -> str:
-    """The reason of the refusal; empty if there is none."""
+    """Return the reason of the refusal; empty if there is none."""
     refusal = guard.check(who, request, now_ns)
     if refusal is None:
         return ""
@@ -95,7 +95,7 @@ def test_a_unit_of_the_wrong_kind_is_refused() -> None:
     assert why(checker(), set_("1", "nm"))
 
 
-def test_a_parameter_of_one_s_own_may_be_text_unless_it_is_limited() -> None:
+def test_custom_parameter_may_be_text_unless_limited() -> None:
     assert not why(checker(), set_("fast", None, "x-mode"))
     assert why(guard(x_mode=Limit(0.0, 1.0)), set_("fast", None, "x-mode"))
 
@@ -105,9 +105,9 @@ def test_getting_is_never_limited() -> None:
     assert not why(guard(tip_bias_voltage=Limit(only={"nobody"})), request)
 
 
-def test_a_step_is_measured_from_what_is_in_force() -> None:
+def test_step_is_measured_from_the_value_in_force() -> None:
     g = guard(tip_bias_voltage=Limit(step=0.5))
-    assert "does not tell" in why(g, set_("0.1", "V"))
+    assert "reports no value now" in why(g, set_("0.1", "V"))
     g.carried_out(Request(int(ControlRequest.PARAM), Parameter(BIAS)), 0, Parameter(BIAS, "1000", "mV"))
     assert not why(g, set_("1.5", "V"))
     assert "step" in why(g, set_("1.6", "V"))
@@ -115,7 +115,7 @@ def test_a_step_is_measured_from_what_is_in_force() -> None:
     assert not why(g, set_("2.0", "V"))
 
 
-def test_a_refused_value_is_not_what_the_next_step_is_measured_from() -> None:
+def test_step_is_not_measured_from_a_refused_value() -> None:
     g = guard(tip_bias_voltage=Limit(step=0.5))
     g.carried_out(set_("1", "V"), 0)
     for _ in range(5):
@@ -138,7 +138,7 @@ def test_an_interval_lies_between_two_uses() -> None:
     assert not why(g, pulse, now_ns=60 * NS)
 
 
-def test_only_those_named_may() -> None:
+def test_only_named_components_may_set_a_parameter() -> None:
     g = checker(ExperimentLimits({BIAS: Limit(only={"corrector"})}, {"x-crash": Limit(only={"corrector"})}))
     crash = Request(int(ControlRequest.ACTION), "x-crash")
     for request in (crash, set_("1", "V")):
@@ -245,7 +245,7 @@ def act(action: str, id_: str = "") -> Request:
 
 
 def here(guard: Held[LimitChecker], action: str) -> str:
-    """The reason why it is refused where the scan and the probe are; empty if it is not."""
+    """Return the reason of a refusal at the present place of the scan or probe; empty if there is none."""
     refusal = guard.check_place(act(action))
     if refusal is None:
         return ""
@@ -258,7 +258,7 @@ def restarted(limits: ExperimentLimits, before: Held[LimitChecker]) -> Held[Limi
     return Held(LimitChecker(limits, from_plain(LimitState, plain)))
 
 
-def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
+def test_scan_outside_the_region_is_refused_even_if_set_at_the_panel() -> None:
     g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not reported" in here(g, "start-scan")
     g.in_force(ScanParameters(Region((4.9e-6, 0), (1e-6, 1e-6)), (8, 8)), 0)
@@ -270,7 +270,7 @@ def test_nothing_is_scanned_outside_the_region_whoever_set_the_frame() -> None:
 
 
 @pytest.mark.parametrize("action", ["start-spec", "x-pulse", "x-crash"])
-def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action: str) -> None:
+def test_action_at_the_probe_outside_the_region_is_refused_even_if_moved_at_the_panel(action: str) -> None:
     g = checker(ExperimentLimits(region=STAGE, region_source="toml:9"))
     assert "not reported" in here(g, action)
     g.in_force(ProbePosition((9e-6, 0.0)), 0)
@@ -280,7 +280,7 @@ def test_nothing_is_done_at_the_probe_outside_the_region_whoever_moved_it(action
     assert here(g, action) == ""
 
 
-def test_a_frame_up_to_the_border_may_be_told_in_the_precision_of_the_controller() -> None:
+def test_frame_up_to_the_border_may_be_rounded_by_the_controller() -> None:
     g = checker(ExperimentLimits(region=STAGE))
     assert why(g, scan(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6))))
     g.in_force(ScanParameters(Region((4.5e-6, 0.0), (1.0000002e-6, 1e-6)), (8, 8)), 0)
@@ -313,7 +313,7 @@ def test_an_interval_counts_from_the_sending_and_over_a_restart() -> None:
     assert why(restarted(limits, g), act("x-pulse", "corrector/2"), "corrector", 60 * NS)
 
 
-def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
+def test_retry_is_not_too_soon_after_itself() -> None:
     g = checker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     assert g.check("corrector", act("x-pulse", "corrector/1"), NS, is_repeated=True) is None
@@ -323,14 +323,14 @@ def test_a_request_that_is_asked_again_is_not_too_soon_after_itself() -> None:
     assert why(g, act("x-pulse"), "corrector", NS)
 
 
-def test_what_was_refused_by_the_microscope_does_not_count_as_used() -> None:
+def test_request_refused_by_the_microscope_is_no_use() -> None:
     g = checker(ExperimentLimits(actions={"x-pulse": Limit(interval_s=60.0)}))
     g.sending("corrector", act("x-pulse", "corrector/1"), 0)
     g.not_done("corrector", act("x-pulse", "corrector/1"))
     assert not why(g, act("x-pulse", "corrector/2"), "corrector", NS)
 
 
-def test_only_what_is_measured_from_is_to_be_saved() -> None:
+def test_only_values_that_limits_are_measured_from_are_saved() -> None:
     g = checker(
         ExperimentLimits({BIAS: Limit(step=0.5), "scan-speed": Limit(high=1.0)}, {"x-crash": Limit(only=["corrector"])})
     )
@@ -360,8 +360,8 @@ def test_steps_rates_and_places_are_known_after_a_restart() -> None:
     assert again.state == g.state
 
 
-def test_a_setpoint_that_is_the_limit_is_not_above_it() -> None:
-    """The message has it in 32 bits, where 0.1 is a little more."""
+def test_setpoint_at_the_limit_is_not_above_it() -> None:
+    """The message has 32 bits, in which 0.1 is a little more."""
     limits = guard(zctrl_setpoint=Limit(0.0, 0.1))
     for setpoint, fits in ((0.1, True), (0.100001, False)):
         asked = wire.decode("ZCtrlParameters", wire.encode(Feedback(setpoint=setpoint))[1])
@@ -372,17 +372,17 @@ def test_a_setpoint_that_is_the_limit_is_not_above_it() -> None:
     ("name", "value", "unit"),
     [(BIAS, "nan", "V"), (BIAS, "0,5", "V"), (BIAS, "1", "Hz"), ("zctrl-setpoint", "1", "pineapples")],
 )
-def test_what_a_microscope_tells_without_sense_is_no_value_and_no_harm(name: str, value: str, unit: str) -> None:
+def test_malformed_value_of_a_microscope_is_ignored(name: str, value: str, unit: str) -> None:
     g = guard(tip_bias_voltage=Limit(step=0.5), zctrl_setpoint=Limit(step=0.5, unit="V"))
     get = Request(int(ControlRequest.PARAM), Parameter(name))
     g.carried_out(get, 0, Parameter(name, "1", "V"))
     assert not why(g, set_("1.2", "V", name))
     assert not g.carried_out(get, 0, Parameter(name, value, unit))
-    assert "does not tell" in why(g, set_("1.2", "V", name))
+    assert "reports no value now" in why(g, set_("1.2", "V", name))
     assert not g.in_force(Feedback(setpoint=math.nan), 0)
 
 
-def test_who_may_set_counts_for_switches_and_texts_too() -> None:
+def test_only_applies_to_switches_and_texts() -> None:
     g = guard(x_feedback_on=Limit(only={"corrector"}), x_spec_kind=Limit(only={"corrector"}, interval_s=10.0))
     off = Request(int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(on=False))
     requests = (off, set_("false", None, "x-feedback-on"), set_("IV", None, "x-spec-kind"))
@@ -396,7 +396,7 @@ def test_who_may_set_counts_for_switches_and_texts_too() -> None:
 HIGH = {"x-high": (Parameter(BIAS, "8", "V"),)}
 
 
-def test_an_action_is_limited_by_what_it_sets() -> None:
+def test_action_is_limited_by_the_parameters_it_sets() -> None:
     act = Request(int(ControlRequest.ACTION), "x-high", id="i")
     for limit, word in (
         (Limit(high=3.0), "above the highest"),
@@ -412,14 +412,14 @@ def test_an_action_is_limited_by_what_it_sets() -> None:
     assert "outside the region" in why(away, Request(int(ControlRequest.ACTION), "x-away", id="i"))
 
 
-def test_what_an_action_has_set_is_in_force() -> None:
+def test_parameters_set_by_an_action_are_in_force() -> None:
     g = checker(ExperimentLimits({BIAS: Limit(step=0.5)}, sets=HIGH))
     g.carried_out(Request(int(ControlRequest.ACTION), "x-high"), 0)
     assert not why(g, set_("8.4", "V"))
     assert why(g, set_("1.0", "V"))
 
 
-def test_what_an_action_sets_is_limited_as_a_whole() -> None:
+def test_parameters_set_by_an_action_are_limited_together() -> None:
     large = (Parameter("scan-resolution-x", "2048"), Parameter("scan-resolution-y", "2048"))
     to_the_left = (Parameter("scan-top-left-x", "-5", "um"), Parameter("scan-size-x", "10", "um"))
     g = checker(ExperimentLimits(region=STAGE, most_pixels=1_000_000, sets={"x-large": large, "x-left": to_the_left}))
@@ -431,14 +431,14 @@ def test_what_an_action_sets_is_limited_as_a_whole() -> None:
 @pytest.mark.parametrize(
     ("name", "value"), [("scan-resolution-x", "0"), ("scan-resolution-y", "2.5"), ("scan-size-x", "0")]
 )
-def test_a_place_without_sense_that_a_microscope_tells_is_none_and_no_harm(name: str, value: str) -> None:
+def test_malformed_place_of_a_microscope_is_ignored(name: str, value: str) -> None:
     g = checker(ExperimentLimits(region=STAGE))
     g.in_force(ScanParameters(Region((0.0, 0.0), (2e-6, 2e-6)), (256, 256)), 0)
     g.carried_out(Request(int(ControlRequest.PARAM), Parameter(name)), 0, Parameter(name, value))
     assert here(g, "start-scan") == ""
 
 
-def test_what_a_request_without_sense_would_have_set_is_still_known() -> None:
+def test_value_stays_known_after_a_malformed_request() -> None:
     g = guard(zctrl_setpoint=Limit(step=0.5))
     g.in_force(Feedback(setpoint=1.0), 0)
     assert why(g, set_("nan", None, "zctrl-setpoint"))
@@ -447,7 +447,7 @@ def test_what_a_request_without_sense_would_have_set_is_still_known() -> None:
 
 
 def test_a_rate_is_not_measured_from_when_the_value_was_read() -> None:
-    """What a controller tells is never just what was set; and what changed meanwhile is part of the change."""
+    """A controller rounds its values, and a change at the panel is part of the total change."""
     g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
     get = Request(int(ControlRequest.PARAM), Parameter(BIAS))
     g.carried_out(set_("1", "V"), 0)
@@ -459,18 +459,18 @@ def test_a_rate_is_not_measured_from_when_the_value_was_read() -> None:
     assert not why(g, set_("1.5", "V"), now_ns=12 * NS)
 
 
-def test_a_microscope_that_does_not_say_the_value_when_asked_is_not_taken_to_have_the_one_before() -> None:
+def test_read_without_a_value_forgets_the_former_value() -> None:
     g = guard(tip_bias_voltage=Limit(step=0.5))
     get = Request(int(ControlRequest.PARAM), Parameter(BIAS))
     for told in (None, Parameter(BIAS), Parameter("scan-speed", "1")):
         g.carried_out(set_("1", "V"), 0)
         assert not why(g, set_("1.2", "V"))
         g.carried_out(get, 0, told)
-        assert "does not tell" in why(g, set_("1.2", "V"))
+        assert "reports no value now" in why(g, set_("1.2", "V"))
 
 
 @pytest.mark.parametrize("by_action", [True, False])
-def test_a_parameter_that_may_be_set_every_so_often_counts_from_when_it_is_sent(by_action: bool) -> None:
+def test_interval_of_a_parameter_counts_from_its_sending(by_action: bool) -> None:
     limits = ExperimentLimits({BIAS: Limit(interval_s=600.0)}, sets=HIGH)
     request = Request(int(ControlRequest.ACTION), "x-high", id="1") if by_action else set_("1", "V")
     g = checker(limits)
@@ -587,6 +587,6 @@ def test_rate_counts_as_before_after_a_refused_change() -> None:
     g = guard(tip_bias_voltage=Limit(rate_per_s=0.1))
     g.carried_out(set_("1", "V"), 0)
     g.sending("experiment", set_("2", "V"), 20 * NS)
-    assert "does not tell" in why(g, set_("2", "V"), now_ns=20 * NS)
+    assert "reports no value now" in why(g, set_("2", "V"), now_ns=20 * NS)
     g.not_done("experiment", set_("2", "V"))
     assert not why(g, set_("3", "V"), now_ns=20 * NS)

@@ -1,4 +1,4 @@
-"""The scheduler's decisions composed: what comes in, what goes out, in which order."""
+"""The scheduler's decisions together: inputs, effects and their order."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_change_is_saved_published_and_then_answered(lab: Lab) -> None:
     assert lab.codec.decode(published(effects)[0].payload) == ControlState(ControlMode.AUTOMATED, "experiment", ())
 
 
-def test_what_changes_nothing_is_only_answered(lab: Lab) -> None:
+def test_request_without_a_change_is_only_answered(lab: Lab) -> None:
     lab.flag("classifier", TIP)
     assert kinds(lab.ask("other", ControlRequest.ADD_EXP_PRBLM, TIP)) == ["Reply"]
     assert kinds(lab.ask("other", ControlRequest.RELEASE_CTRL)) == ["Reply"]
@@ -88,7 +88,7 @@ def test_requests_of_extensions_are_for_the_holder(lab: Lab) -> None:
     assert kinds(lab.ask("experiment", 150)) == ["Forward"]  # type: ignore[arg-type]
 
 
-def test_a_request_without_a_meaning_is_not_supported(lab: Lab) -> None:
+def test_unknown_request_is_not_supported(lab: Lab) -> None:
     assert lab.says("experiment", ControlRequest.UNDEFINED) is ControlResponse.CMD_NOT_SUPPORTED
 
 
@@ -104,7 +104,7 @@ def test_a_flag_stops_the_scan_before_anything_else_is_sent(lab: Lab) -> None:
     assert lab.forwarded[-1].request.subject == "x-pulse"
 
 
-def test_a_start_of_which_nobody_knows_is_stopped_as_well(lab: Lab) -> None:
+def test_start_of_unknown_outcome_is_stopped(lab: Lab) -> None:
     """The translator was killed while it began the scan; the instrument scans on."""
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
@@ -115,7 +115,7 @@ def test_a_start_of_which_nobody_knows_is_stopped_as_well(lab: Lab) -> None:
     assert lab.forwarded[-1].request.subject == "stop-scan"
 
 
-def test_manual_stops_a_scan_that_nobody_holds_as_well(lab: Lab) -> None:
+def test_manual_stops_a_scan_without_a_holder(lab: Lab) -> None:
     lab.scope_is(ScopeState.SCANNING)
     lab.mode("person", ControlMode.MANUAL)
     assert lab.forwarded[-1].request.subject == "stop-scan"
@@ -130,7 +130,7 @@ def test_the_experiment_file_may_let_the_scan_run_on() -> None:
     assert lab.forwarded == []
 
 
-def test_what_a_former_holder_has_waiting_is_not_sent_any_more(lab: Lab) -> None:
+def test_waiting_commands_of_a_former_holder_are_not_sent(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", PARAM, Parameter("scan-speed", "1"), "experiment/a/1")
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/2")
@@ -168,7 +168,7 @@ def test_a_holder_that_comes_back_in_time_keeps_control(lab: Lab) -> None:
     assert lab.core.deadline_s() is None
 
 
-def test_a_connection_that_says_nothing_does_not_keep_control(lab: Lab) -> None:
+def test_silent_connection_does_not_keep_control(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.step(Disconnected(lab.connections["experiment"]))
     lab.connect("experiment")
@@ -177,7 +177,7 @@ def test_a_connection_that_says_nothing_does_not_keep_control(lab: Lab) -> None:
     assert lab.holder is None
 
 
-def test_a_holder_that_will_not_come_back_is_given_up_at_once(lab: Lab) -> None:
+def test_holder_given_up_by_its_supervisor_loses_control_at_once(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.give_up("other")
     assert lab.holder == "experiment"
@@ -203,7 +203,7 @@ def test_a_restarted_holder_that_gives_control_back_leaves_no_danger_behind(
     assert (again.forwarded[-1].request.subject if again.forwarded else None) == last
 
 
-def test_the_tip_of_a_holder_that_died_in_danger_is_retracted_and_nobody_disturbs_that(lab: Lab) -> None:
+def test_tip_of_a_dead_holder_is_retracted_before_other_commands(lab: Lab) -> None:
     lab.publish("ZCtrlParameters", Feedback(on=False))
     lab.take_control("experiment")
     lab.give_up("experiment")
@@ -214,7 +214,7 @@ def test_the_tip_of_a_holder_that_died_in_danger_is_retracted_and_nobody_disturb
     assert lab.says("other", ACTION, "start-scan") is ControlResponse.NOT_FREE  # the tip is not at the surface
 
 
-def test_a_holder_that_does_nothing_loses_control_with_its_lease() -> None:
+def test_idle_holder_loses_control_with_its_lease() -> None:
     lab = Lab(SchedulerSettings(control=ControlSettings(lease_s=60.0)))
     lab.translator()
     lab.scope_is(ScopeState.FREE)
@@ -226,7 +226,7 @@ def test_a_holder_that_does_nothing_loses_control_with_its_lease() -> None:
     assert lab.holder is None
 
 
-def test_a_second_of_the_same_name_is_refused_with_a_reason(lab: Lab) -> None:
+def test_second_client_of_a_name_is_refused_with_a_reason(lab: Lab) -> None:
     lab.take_control("experiment")
     second = lab.newest + 1
     lab.connect("second")
@@ -237,7 +237,7 @@ def test_a_second_of_the_same_name_is_refused_with_a_reason(lab: Lab) -> None:
     assert lab.forwarded == []
 
 
-def test_a_peer_without_ids_that_connects_anew_is_answered_once_its_old_connection_closes(lab: Lab) -> None:
+def test_reconnecting_peer_without_ids_is_answered_once_its_old_connection_closes(lab: Lab) -> None:
     lab.take_control("plain")
     old = lab.connections.pop("plain")
     assert lab.ask("plain", ControlRequest.REQUEST_CTRL, 0) == []
@@ -247,7 +247,7 @@ def test_a_peer_without_ids_that_connects_anew_is_answered_once_its_old_connecti
     assert lab.core.deadline_s() is None
 
 
-def test_two_without_ids_that_both_go_on_are_two(lab: Lab) -> None:
+def test_two_open_connections_without_ids_are_two_peers(lab: Lab) -> None:
     lab.take_control("plain")
     lab.connections.pop("plain")
     assert lab.ask("plain", ControlRequest.REQUEST_CTRL, 0) == []
@@ -258,14 +258,14 @@ def test_two_without_ids_that_both_go_on_are_two(lab: Lab) -> None:
     assert replies(lab.step(Tick()))[0].response.code == ControlResponse.FAILURE
 
 
-def test_who_is_authenticated_as_another_is_refused(lab: Lab) -> None:
+def test_client_with_the_key_of_another_is_refused(lab: Lab) -> None:
     answer = replies(lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, user="mallory"))[0]
     assert answer.response.code == ControlResponse.FAILURE
     assert lab.holder is None
     assert replies(lab.ask("experiment", ControlRequest.REQUEST_CTRL, 0, user="experiment"))[0].response.code == OK
 
 
-def test_the_nameless_are_told_to_say_who_they_are(lab: Lab) -> None:
+def test_nameless_client_is_asked_for_its_name(lab: Lab) -> None:
     assert "without a name" in replies(lab.ask("", ControlRequest.REQUEST_CTRL, 0))[0].response.reason
 
 
@@ -279,7 +279,7 @@ def test_a_repeated_request_is_answered_and_not_done_again(lab: Lab) -> None:
     assert len(lab.forwarded) == 1
 
 
-def test_the_answer_goes_to_the_connection_that_the_client_has_then(lab: Lab) -> None:
+def test_answer_goes_to_the_newest_connection_of_the_client(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.step(Disconnected(lab.connections["experiment"]))
@@ -297,7 +297,7 @@ def test_without_an_id_an_answer_is_not_given_to_a_new_life(lab: Lab) -> None:
     assert replies(lab.answer(lab.forwarded[-1])) == []
 
 
-def test_a_silent_translator_is_told_of_and_its_late_answer_is_kept_for_a_repetition(lab: Lab) -> None:
+def test_silence_of_the_translator_is_logged_and_its_late_answer_kept_for_a_retry(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.later(5.0)
@@ -308,14 +308,14 @@ def test_a_silent_translator_is_told_of_and_its_late_answer_is_kept_for_a_repeti
     assert len(lab.forwarded) == 1
 
 
-def test_while_the_translator_is_slow_everybody_else_is_served(lab: Lab) -> None:
+def test_slow_translator_does_not_delay_other_clients(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "start-scan", "experiment/a/1")
     assert lab.flag("classifier", TIP) is OK
     assert published(lab.scope_is(ScopeState.SCANNING))
 
 
-def test_what_nobody_knows_the_end_of_is_asked_again_of_a_translator_that_knows_ids(lab: Lab) -> None:
+def test_retry_of_unknown_outcome_is_forwarded_to_the_translator(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.step(TranslatorDown())
@@ -323,7 +323,7 @@ def test_what_nobody_knows_the_end_of_is_asked_again_of_a_translator_that_knows_
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
 
 
-def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:
+def test_unsent_request_may_be_repeated(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.step(TranslatorDown())
     answer = replies(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1"))[0].response
@@ -332,7 +332,7 @@ def test_what_was_not_sent_may_be_asked_again(lab: Lab) -> None:
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
 
 
-def test_what_the_translator_could_not_even_begin_is_asked_again(lab: Lab) -> None:
+def test_request_that_the_translator_could_not_begin_is_sent_again(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     answer = replies(lab.answer(lab.forwarded[-1], NO_RESPONSE, detail=ResponseDetail.NOT_SENT))[0].response
@@ -340,7 +340,7 @@ def test_what_the_translator_could_not_even_begin_is_asked_again(lab: Lab) -> No
     assert kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")) == ["Forward"]
 
 
-def test_what_a_translator_had_no_answer_to_is_for_it_to_say_when_asked_again(lab: Lab) -> None:
+def test_retry_of_a_request_without_an_answer_is_left_to_the_translator(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.answer(lab.forwarded[-1], NO_RESPONSE, reason="the controller can't be reached")
@@ -373,7 +373,7 @@ def test_packets_pass_renamed_and_late_joiners_get_them_in_order(lab: Lab) -> No
     assert lab.step(ReplayRequested("late", ("Scan2d", "Scope"), newest_ns)) == [Replay("late", ())]
 
 
-def test_a_mapping_that_fails_is_told_once_and_costs_only_its_own_packets() -> None:
+def test_failing_mapping_is_logged_once_and_costs_only_its_own_packets() -> None:
     lab = Lab(SchedulerSettings(envelopes=Envelopes(mapping=lambda header: str(1 / len(header.channel or "")))))
     lab.translator()
     effects = [e for _ in range(3) for e in lab.scope_is(ScopeState.FREE)]
@@ -381,30 +381,30 @@ def test_a_mapping_that_fails_is_told_once_and_costs_only_its_own_packets() -> N
     assert len(effects) == 1
 
 
-def test_a_control_state_of_the_translator_s_is_dropped(lab: Lab) -> None:
+def test_control_state_of_a_translator_is_dropped(lab: Lab) -> None:
     assert published(lab.publish("ControlState", ControlState(ControlMode.AUTOMATED, "mallory"))) == []
 
 
-def test_control_is_told_after_what_the_translator_published_before() -> None:
+def test_control_is_published_after_missed_packets() -> None:
     lab = Lab()
     assert published(lab.effects) == []
     lab.scope_is(ScopeState.FREE)
     assert [p.envelope for p in published(lab.step(TranslatorCaughtUp()))] == ["ControlState"]
 
 
-def test_without_a_translator_control_is_told_soon_all_the_same() -> None:
+def test_control_is_published_soon_without_a_translator() -> None:
     lab = Lab()
     lab.later(1.0)
     assert [p.envelope for p in published(lab.step(Tick()))] == ["ControlState", "JournalEntries"]
 
 
 def restarted(lab: Lab) -> Lab:
-    """A new core with what the former had saved."""
+    """Return a new core with the saved state of the former."""
     saved = [e for e in lab.effects if isinstance(e, SaveState)][-1]
     return Lab(state=saved.state, codec=lab.codec)
 
 
-def test_killed_and_restarted_it_has_mode_problems_and_holder_back(lab: Lab) -> None:
+def test_restarted_scheduler_keeps_mode_problems_and_holder(lab: Lab) -> None:
     lab.flag("classifier", TIP)
     lab.take_control("corrector", TIP)
     after = restarted(lab)
@@ -416,9 +416,7 @@ def test_killed_and_restarted_it_has_mode_problems_and_holder_back(lab: Lab) -> 
 
 
 @pytest.mark.parametrize("translator", ["comes", "stays away"])
-def test_after_a_restart_control_changes_once_what_was_published_before_has_come_again(
-    lab: Lab, translator: str
-) -> None:
+def test_control_changes_after_a_restart_only_once_missed_packets_have_come(lab: Lab, translator: str) -> None:
     lab.take_control("experiment")
     saved = lab.core.snapshot()
     scan_ns = lab.now_ns + 5000  # published, and not written down any more when the scheduler was killed
@@ -439,7 +437,7 @@ def test_after_a_restart_control_changes_once_what_was_published_before_has_come
     assert after.holder is None
 
 
-def test_a_holder_not_heard_of_after_a_restart_is_given_up() -> None:
+def test_holder_silent_after_a_restart_is_given_up() -> None:
     lab = Lab()
     lab.take_control("experiment")
     after = restarted(lab)
@@ -451,7 +449,7 @@ def test_a_holder_not_heard_of_after_a_restart_is_given_up() -> None:
     assert after.holder is None
 
 
-def test_a_stop_that_was_due_in_the_kill_is_made_up_for(lab: Lab) -> None:
+def test_stop_due_at_a_kill_is_sent_after_the_restart(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.scope_is(ScopeState.SCANNING)
     lab.flag("classifier", TIP)
@@ -461,14 +459,14 @@ def test_a_stop_that_was_due_in_the_kill_is_made_up_for(lab: Lab) -> None:
     assert after.forwarded[-1].request.subject == "stop-scan"
 
 
-def test_the_end_is_saved_answered_and_then_told_to_all(lab: Lab) -> None:
+def test_end_is_saved_answered_and_then_published(lab: Lab) -> None:
     effects = lab.ask("boss", ControlRequest.END_EXPERIMENT)
     assert kinds(effects) == ["SaveState", "Reply", "Publish", "Kill"]
     assert lab.says("experiment", ControlRequest.REQUEST_CTRL, 0) is ControlResponse.FAILURE
     assert any(isinstance(e, Kill) for e in restarted(lab).effects)
 
 
-def test_only_who_has_the_role_ends_the_experiment() -> None:
+def test_only_the_role_ends_the_experiment() -> None:
     lab = Lab(SchedulerSettings(rules=Rules(RoleTable(end_experiment=("boss",)))))
     assert lab.says("other", ControlRequest.END_EXPERIMENT) is ControlResponse.FAILURE
     assert not any(isinstance(e, Kill) for e in lab.effects)
@@ -482,7 +480,7 @@ def test_an_operator_commands_in_manual() -> None:
     assert kinds(lab.ask("console", ACTION, "start-scan")) == ["SaveState", "Forward"]
 
 
-def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
+def test_only_adjustable_parameters_are_set_beside_the_holder() -> None:
     lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)), adjustable=frozenset({"zctrl-setpoint"}))))
     lab.translator()
     lab.take_control("experiment")
@@ -493,7 +491,7 @@ def test_only_what_the_file_names_is_adjusted_beside_the_holder() -> None:
     assert lab.says("console", ACTION, "start-scan") is NOT_IN_CONTROL
 
 
-def test_what_is_set_by_hand_and_stays_in_force_is_said_when_components_go_on() -> None:
+def test_settings_left_by_hand_are_logged_when_the_mode_is_automated() -> None:
     lab = Lab(SchedulerSettings(rules=Rules(RoleTable(operate=("console",)))))
     lab.translator()
     lab.publish("ZCtrlParameters", Feedback(on=True, setpoint=1e-9))
@@ -512,7 +510,7 @@ def test_what_is_set_by_hand_and_stays_in_force_is_said_when_components_go_on() 
     assert len(said()) == 1  # told once, and nothing was set this time
 
 
-def test_a_feedback_that_is_set_back_by_hand_is_not_worth_a_word() -> None:
+def test_feedback_restored_by_hand_is_not_logged() -> None:
     lab = Lab()
     lab.translator()
     for mode, setpoint in [(ControlMode.AUTOMATED, 1.0), (ControlMode.MANUAL, 2.0), (ControlMode.MANUAL, 1.0)]:
@@ -522,7 +520,7 @@ def test_a_feedback_that_is_set_back_by_hand_is_not_worth_a_word() -> None:
     assert not [one for one in lab.effects if isinstance(one, Log) and "by hand" in one.text]
 
 
-def test_a_stop_that_fails_is_said_loudly(lab: Lab) -> None:
+def test_failed_stop_is_logged_as_an_error(lab: Lab) -> None:
     lab.take_control("experiment")
     lab.scope_is(ScopeState.SCANNING)
     lab.flag("classifier", TIP)
@@ -552,7 +550,7 @@ def test_odd_requests_are_answered(lab: Lab, garbage: Request) -> None:
     assert [type(e) for e in lab.step(RequestIn(1, "odd", garbage)) if isinstance(e, Reply | Publish)]
 
 
-def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> None:
+def test_clock_request_returns_time_and_speed_of_the_experiment() -> None:
     lab = Lab(SchedulerSettings(run=RunFacts({"origin_s": 5.0, "start_s": 7.0, "speed": 600.0})))
     answer = replies(lab.ask("elsewhere", CLOCK_REQUEST, id_="elsewhere/a/1"))[0].response
     assert (answer.code, answer.id) == (OK, "elsewhere/a/1")
@@ -560,7 +558,7 @@ def test_whoever_asks_is_told_the_time_of_the_experiment_and_how_it_passes() -> 
     assert json.loads(answer.payload) == {**clock, "run": "", "simulated": False, "versions": {}, "in_use": ""}
 
 
-def test_the_answer_with_the_time_says_whether_the_microscope_is_in_use() -> None:
+def test_clock_request_returns_why_the_microscope_is_in_use() -> None:
     lab = Lab()
 
     def in_use() -> str:

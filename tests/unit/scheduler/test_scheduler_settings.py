@@ -1,4 +1,4 @@
-"""The settings of a scheduler go from the experiment file through the launch line to its decisions, described once."""
+"""The settings of a scheduler, from the experiment file through the launch line to its decisions."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_section_is_checked_by_the_keys_of_the_file() -> None:
         ({"roles": {"set_mod": ["boss"]}}, "set_mod"),
     ],
 )
-def test_setting_that_makes_no_sense_is_refused(table: dict[str, Any], error: str) -> None:
+def test_impossible_setting_is_refused(table: dict[str, Any], error: str) -> None:
     with pytest.raises(pydantic.ValidationError, match=error):
         pydantic.TypeAdapter(ControlSettings).validate_python(table)
 

@@ -1,4 +1,4 @@
-"""Who may speak for a name: restarts, losses of connection, impostors."""
+"""Which connection owns a name: restarts, losses of connection, impostors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from afspm.model.sessions import Hearing, SessionTable, token_of
 ACCEPTED, TAKEN, STALE, UNCLEAR = Hearing.ACCEPTED, Hearing.TAKEN, Hearing.STALE, Hearing.UNCLEAR
 
 
-def test_the_token_is_read_from_ids_of_our_form_only() -> None:
+def test_token_is_read_only_from_ids_of_the_usual_form() -> None:
     assert token_of("exp", "exp/a1/7") == "a1"
     assert token_of("exp", "exp/a1/7/2") == "a1"
     assert token_of("exp", "exp/key/7/2") is None
@@ -30,7 +30,7 @@ def test_a_restarted_component_is_the_same_client() -> None:
     assert (sessions.connection_of("exp"), sessions.lost_since_s("exp")) == (2, None)
 
 
-def test_a_second_live_one_of_the_same_name_is_refused() -> None:
+def test_second_live_process_of_a_name_is_refused() -> None:
     sessions = Held(SessionTable())
     for connection in (1, 2):
         sessions.connected(connection)
@@ -40,7 +40,7 @@ def test_a_second_live_one_of_the_same_name_is_refused() -> None:
 
 
 def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
-    """ROUTER closes the owner's connection when the impostor connects; the owner comes back, and so on."""
+    """ROUTER closes the owner's connection when the impostor connects; then the owner reconnects, and so on."""
     sessions = Held(SessionTable(takeover_s=3.0))
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
@@ -55,7 +55,7 @@ def test_handing_the_name_over_does_not_make_the_impostor_its_owner() -> None:
     assert sessions.hear(4, "exp", "exp/b/1", 1.2) is TAKEN
 
 
-def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_seen_first() -> None:
+def test_reconnecting_peer_without_ids_is_the_same_client_in_either_order() -> None:
     sessions = Held(SessionTable())
     sessions.connected(1)
     assert sessions.hear(1, "old", "", 0.0) is ACCEPTED
@@ -65,7 +65,7 @@ def test_a_peer_without_ids_that_connects_anew_is_the_same_client_whichever_is_s
     assert sessions.hear(2, "old", "", 1.002) is ACCEPTED
 
 
-def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
+def test_peer_without_ids_does_not_take_the_name_of_a_peer_with_ids() -> None:
     sessions = Held(SessionTable(takeover_s=3.0))
     sessions.connected(1)
     assert sessions.hear(1, "exp", "exp/a/1", 0.0) is ACCEPTED
@@ -76,7 +76,7 @@ def test_a_peer_without_ids_does_not_take_the_name_of_one_with_ids() -> None:
 
 
 def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
-    """Its connection had died without our noticing: the restarted process looked like an impostor."""
+    """Its connection had died unnoticed, so its restarted process looked like an impostor."""
     sessions = Held(SessionTable(takeover_s=3.0))
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
@@ -86,7 +86,7 @@ def test_a_name_whose_owner_never_comes_back_is_free_in_the_end() -> None:
     assert sessions.hear(2, "exp", "exp/b/2", 4.0) is ACCEPTED
 
 
-def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
+def test_presumed_dead_client_regains_its_name() -> None:
     sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
@@ -98,7 +98,7 @@ def test_who_was_taken_for_dead_has_its_name_back_when_it_speaks() -> None:
     assert sessions.hear(2, "exp", "exp/b/2", 1.3) is TAKEN
 
 
-def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> None:
+def test_presumed_dead_client_regains_its_name_from_silent_connections() -> None:
     sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
@@ -110,7 +110,7 @@ def test_also_when_others_had_it_in_between_that_never_said_who_they_are() -> No
     assert sessions.hear(5, "exp", "exp/a/2", 5.0) is ACCEPTED
 
 
-def test_what_comes_by_a_closed_connection_is_stale() -> None:
+def test_message_of_a_closed_connection_is_stale() -> None:
     sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
@@ -118,7 +118,7 @@ def test_what_comes_by_a_closed_connection_is_stale() -> None:
     assert sessions.hear(1, "exp", "exp/a/2", 1.1) is STALE
 
 
-def test_a_connection_that_never_speaks_is_nobody() -> None:
+def test_silent_connection_has_no_name() -> None:
     sessions = Held(SessionTable())
     sessions.connected(1)
     sessions.hear(1, "exp", "exp/a/1", 0.0)
@@ -127,7 +127,7 @@ def test_a_connection_that_never_speaks_is_nobody() -> None:
     assert (sessions.connection_of("exp"), sessions.lost_since_s("exp")) == (None, 1.0)
 
 
-def test_an_owner_that_lives_on_over_our_restart_has_its_name_back() -> None:
+def test_owner_regains_its_name_over_a_restart_of_the_scheduler() -> None:
     before = Held(SessionTable())
     before.connected(1)
     before.hear(1, "exp", "exp/a/1", 0.0)
@@ -140,7 +140,7 @@ def test_an_owner_that_lives_on_over_our_restart_has_its_name_back() -> None:
     assert sessions.hear(1, "exp", "exp/b/2", 0.2) is TAKEN
 
 
-def test_names_that_are_gone_are_forgotten_some_day() -> None:
+def test_number_of_remembered_names_is_bounded() -> None:
     sessions = Held(SessionTable(keep=10))
     for n in range(1000):
         sessions.connected(n)

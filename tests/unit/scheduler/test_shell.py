@@ -1,4 +1,4 @@
-"""What the scheduler's shell writes down around the end of an experiment, with the real decisions and the real log."""
+"""The shell's records around the end of an experiment, with the real decisions and the real log."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ LOG = logging.getLogger("scheduler")
 
 
 class Lab:
-    """A shell without sockets: what peers ask is handed to it."""
+    """A shell without sockets: requests are handed to it."""
 
     def __init__(self, folder: Path) -> None:
         self.log = folder / "packets"
@@ -62,7 +62,7 @@ def states_of(name: str) -> bytes:
     return wire.encode(ProcessStates(1, "supervisor", (alive,)))[1]
 
 
-def test_last_words_after_the_end_are_recorded_and_not_in_the_cache_of_a_restarted_scheduler(tmp_path: Path) -> None:
+def test_packets_after_the_end_are_recorded_and_not_cached(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
     before, after = states_of("before"), states_of("after")
     lab.ask("supervisor", RELAY_REQUEST, RelayedMessage("ProcessStates", before))

@@ -1,4 +1,4 @@
-"""After the end the scheduler stays while somebody still has something to finish, and no longer."""
+"""After the end the scheduler stays while a component still runs, and no longer."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def state(condition: ProcessCondition, role: str = "component") -> ProcessState:
 
 @pytest.fixture
 def lab() -> Lab:
-    """One whose experiment has just ended."""
+    """A core whose experiment has just ended."""
     made = Lab()
     made.translator()
     made.tell(state(ALIVE))
@@ -31,7 +31,7 @@ def lab() -> Lab:
 
 
 @pytest.mark.parametrize("condition", AT_WORK)
-def test_it_stays_while_a_component_is_at_work_and_some_time_after(lab: Lab, condition: ProcessCondition) -> None:
+def test_scheduler_stays_while_a_component_runs_and_some_time_after(lab: Lab, condition: ProcessCondition) -> None:
     for _ in range(4):
         lab.later(2.0)
         lab.tell(state(condition))
@@ -42,7 +42,7 @@ def test_it_stays_while_a_component_is_at_work_and_some_time_after(lab: Lab, con
     assert lab.core.leave_at_s == leave_at_s
 
 
-def test_it_does_not_stay_for_ever(lab: Lab) -> None:
+def test_scheduler_stays_for_a_bounded_time(lab: Lab) -> None:
     latest_s = lab.now_s + LONGEST_GRACE_S
     while lab.now_s < latest_s:
         lab.later(2.0)
@@ -59,14 +59,14 @@ def test_it_does_not_stay_for_ever(lab: Lab) -> None:
         state(ALIVE, "scheduler"),
     ],
 )
-def test_for_nobody_else_it_stays_any_longer(lab: Lab, told: ProcessState) -> None:
+def test_scheduler_stays_no_longer_for_other_processes(lab: Lab, told: ProcessState) -> None:
     leave_at_s = lab.core.leave_at_s
     lab.later(1.0)
     lab.tell(told)
     assert lab.core.leave_at_s == leave_at_s
 
 
-def test_what_a_supervisor_said_before_does_not_count_when_another_speaks(lab: Lab) -> None:
+def test_former_report_does_not_count_when_another_supervisor_reports(lab: Lab) -> None:
     leave_at_s = lab.core.leave_at_s
     lab.later(1.0)
     lab.tell(state(ENDED), supervisor="supervisor:other")
@@ -78,7 +78,7 @@ def test_a_scheduler_that_was_killed_at_the_end_stays_too(lab: Lab) -> None:
     assert again.core.leave_at_s == again.now_s + SHUTDOWN_GRACE_S
 
 
-def test_a_problem_that_is_seen_after_the_end_is_written_down_at_once(lab: Lab) -> None:
+def test_problem_after_the_end_is_recorded_at_once(lab: Lab) -> None:
     lab.entries()
     lab.ask("judge", ControlRequest.ADD_EXP_PRBLM, 1)
     (entry,) = lab.entries()

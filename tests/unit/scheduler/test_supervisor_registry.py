@@ -1,4 +1,4 @@
-"""What supervisors and components have the scheduler publish, and orders to supervisors."""
+"""Messages that supervisors and components have published by the scheduler, and orders to supervisors."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def cached(lab: Lab) -> list[str]:
     return [packet.envelope for packet, *_ in lab.core.cached()]
 
 
-def test_what_a_supervisor_tells_is_published_cached_and_not_forwarded(lab: Lab) -> None:
+def test_report_of_a_supervisor_is_published_cached_and_not_forwarded(lab: Lab) -> None:
     sent = len(lab.forwarded)
     assert orders(lab, tell(lab, states("a"))) == ()
     assert orders(lab, tell(lab, states("a", "b"))) == ()
@@ -85,7 +85,7 @@ def test_two_supervisors_have_an_envelope_each(lab: Lab) -> None:
     assert {"ProcessStates_host", "ProcessStates_lab"} <= set(cached(lab))
 
 
-def test_it_is_not_in_the_journal_and_changes_no_lease(lab: Lab) -> None:
+def test_report_of_a_supervisor_is_not_in_the_journal_and_changes_no_lease(lab: Lab) -> None:
     lab.take_control("series")
     lab.entries()
     deadline_ns = lab.core.deadline_ns()
@@ -95,7 +95,7 @@ def test_it_is_not_in_the_journal_and_changes_no_lease(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize("thing", [ScopeStatus(1), "no message", None])  # type: ignore[arg-type]
-def test_nothing_else_is_published_for_others(lab: Lab, thing: Any) -> None:
+def test_other_messages_are_not_relayed(lab: Lab, thing: Any) -> None:
     before = len(published(lab.effects))
     assert tell(lab, thing).code == ControlResponse.FAILURE
     told = RelayedMessage("ProcessStates", lab.codec.encode(thing))
@@ -103,26 +103,26 @@ def test_nothing_else_is_published_for_others(lab: Lab, thing: Any) -> None:
     assert len(published(lab.effects)) == before
 
 
-def test_what_is_too_long_or_nobodys_is_refused(lab: Lab) -> None:
+def test_announcement_too_long_or_without_an_owner_is_refused(lab: Lab) -> None:
     told = RelayedMessage("LogLines", b"0" * (LONGEST_ANNOUNCEMENT + 1))
     assert "at most" in replies(lab.ask(HOST, RELAY_REQUEST, told))[-1].response.reason
     assert "owner" in tell(lab, states("a", supervisor="")).reason
 
 
 @pytest.mark.parametrize("name", ["", "a\" autofocus onfocus='steal()'", "<b>", "a\0b", "x" * 101])
-def test_what_can_not_be_the_name_of_a_process_is_refused(lab: Lab, name: str) -> None:
+def test_report_with_an_impossible_process_name_is_refused(lab: Lab, name: str) -> None:
     for thing in (states("a", name), LogLines((LogLine(1, name, "INFO", "hello"),)), states("a", supervisor=name)):
         assert tell(lab, thing).code == ControlResponse.FAILURE
     assert orders(lab, tell(lab, states("tip corrector-2.b"))) == ()
 
 
-def test_with_keys_it_takes_that_of_the_supervisor(lab: Lab) -> None:
+def test_report_needs_the_key_of_the_supervisor(lab: Lab) -> None:
     assert tell(lab, states("a"), user="supervisor").code == OK
     assert tell(lab, states("a"), "series", user="series").code == ControlResponse.FAILURE
     assert tell(lab, states("a"), "supervisor:other", user="series").code == ControlResponse.FAILURE
 
 
-def test_progress_is_told_by_whose_it_is(lab: Lab) -> None:
+def test_progress_is_published_only_by_its_owner(lab: Lab) -> None:
     assert tell(lab, Progress(1, "series", 3, 9), "series", user="series").code == OK
     assert "Progress_series" in cached(lab)
     assert tell(lab, Progress(1, "series", 3, 9), "other").code == ControlResponse.FAILURE
@@ -138,7 +138,7 @@ def test_a_note_is_published_once_in_the_name_of_its_author(lab: Lab) -> None:
     assert (refused.code, refused.reason) == (ControlResponse.FAILURE, "dashboard:Bob is not 'dashboard:Ada'")
 
 
-def test_after_the_end_the_author_is_told_to_write_the_note_elsewhere(lab: Lab) -> None:
+def test_note_after_the_end_is_refused_so_that_its_author_records_it(lab: Lab) -> None:
     lab.ask("series", ControlRequest.END_EXPERIMENT)
     answer = tell(lab, Note(5, "series", "too late"), "series")
     assert (answer.code, answer.detail) == (ControlResponse.FAILURE, ResponseDetail.EXPERIMENT_ENDED)
@@ -156,7 +156,7 @@ def test_an_order_comes_with_the_next_answer_once(lab: Lab) -> None:
     assert (first.kind, first.who, first.what, first.response) == ("order", "dashboard:Ada", "restart b", 0)
 
 
-def test_an_order_goes_to_who_has_the_process(lab: Lab) -> None:
+def test_order_goes_to_the_supervisor_of_the_process(lab: Lab) -> None:
     tell(lab, states("a"))
     tell(lab, states("b", supervisor="lab"), "supervisor:lab")
     order(lab, "b")
@@ -164,7 +164,7 @@ def test_an_order_goes_to_who_has_the_process(lab: Lab) -> None:
     assert orders(lab, tell(lab, states("b", supervisor="lab"), "supervisor:lab")) == ("b",)
 
 
-def test_an_unknown_process_is_refused_with_those_that_are_known(lab: Lab) -> None:
+def test_order_for_an_unknown_process_is_refused_with_the_known_names(lab: Lab) -> None:
     tell(lab, states("a"))
     refused = order(lab, "c")
     assert (refused.code, refused.reason) == (
@@ -174,13 +174,13 @@ def test_an_unknown_process_is_refused_with_those_that_are_known(lab: Lab) -> No
     assert lab.entries()[0].refused
 
 
-def test_a_supervisor_that_is_silent_is_given_no_orders(lab: Lab) -> None:
+def test_silent_supervisor_gets_no_orders(lab: Lab) -> None:
     tell(lab, states("a"))
     lab.later(SILENT_S + 1.0)
-    assert "has not been heard of for 11 s" in order(lab, "a").reason
+    assert "has sent no report for 11 s" in order(lab, "a").reason
 
 
-def test_it_takes_the_role_to_order() -> None:
+def test_order_needs_the_role_restart() -> None:
     lab = Lab(SchedulerSettings(rules=Rules(RoleTable(restart=("dashboard",)))))
     tell(lab, states("a"))
     assert order(lab, "a", "stranger:Ada").reason == "stranger:Ada does not have the role restart ([control.roles])"
@@ -196,7 +196,7 @@ def test_orders_outlive_a_kill_of_the_scheduler(lab: Lab) -> None:
     assert orders(again, tell(again, states("a"))) == ("a",)
 
 
-def test_what_a_killed_scheduler_had_published_and_not_answered_is_published_once(lab: Lab) -> None:
+def test_report_published_before_a_kill_but_not_answered_is_published_once(lab: Lab) -> None:
     lines = LogLines((LogLine(1, "a", "INFO", "hello"),))
     tell(lab, lines, id_="supervisor:host/x/1")
     state = [effect for effect in lab.effects if isinstance(effect, SaveState)][-1].state
@@ -208,14 +208,14 @@ def test_what_a_killed_scheduler_had_published_and_not_answered_is_published_onc
     assert cached(again).count("LogLines") == 2
 
 
-def test_after_the_end_last_words_are_taken_and_no_orders(lab: Lab) -> None:
+def test_reports_after_the_end_are_accepted_and_orders_refused(lab: Lab) -> None:
     tell(lab, states("a"))
     lab.ask("boss", ControlRequest.END_EXPERIMENT)
     assert order(lab, "a").code == ControlResponse.FAILURE
     assert tell(lab, states("a")).code == OK
 
 
-def test_a_person_has_the_roles_of_the_component_that_acts_for_it() -> None:
+def test_person_has_the_roles_of_the_component_acting_for_them() -> None:
     roles = RoleTable(end_experiment=("dashboard:Ada",), set_mode=("dashboard",), operate=("dashboard",))
     lab = Lab(SchedulerSettings(rules=Rules(roles)))
     lab.translator()
@@ -226,7 +226,7 @@ def test_a_person_has_the_roles_of_the_component_that_acts_for_it() -> None:
     assert lab.says("dashboard:Ada", ControlRequest.END_EXPERIMENT) is OK
 
 
-def test_the_key_of_a_component_speaks_for_any_person_by_it_and_for_no_other_component(lab: Lab) -> None:
+def test_key_of_a_component_is_valid_for_its_persons_and_no_other_component(lab: Lab) -> None:
     asked = replies(lab.ask("dashboard:Ada", ControlRequest.REQUEST_CTRL, 0, user="dashboard"))[-1]
     assert asked.response.code == OK
     other = replies(lab.ask("series:Ada", ControlRequest.REQUEST_CTRL, 0, user="dashboard"))[-1]

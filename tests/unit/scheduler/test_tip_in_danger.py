@@ -1,4 +1,4 @@
-"""A tip that is left in danger, through the whole scheduler."""
+"""A tip left in danger, through the whole scheduler."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def feedback_off(settings: SchedulerSettings | None = None) -> Lab:
 
 
 def sent(lab: Lab) -> list[object]:
-    """The actions and settings that the microscope was asked for."""
+    """Return the actions and settings sent to the microscope."""
     asked = [one.request for one in lab.forwarded]
     return [request.subject for request in asked if request.kind != ControlRequest.ACTION_SUPPORT]
 
@@ -42,7 +42,7 @@ def said(lab: Lab, level: str) -> list[str]:
     return [effect.text for effect in lab.effects if isinstance(effect, Log) and effect.level == level]
 
 
-def test_who_solves_another_problem_does_not_measure_with_a_tip_that_was_withdrawn() -> None:
+def test_solver_of_another_problem_does_not_measure_with_a_withdrawn_tip() -> None:
     lab = feedback_off()
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     assert sent(lab) == ["x-retract"]
@@ -57,7 +57,7 @@ def test_who_solves_another_problem_does_not_measure_with_a_tip_that_was_withdra
     assert sent(lab) == ["x-retract"]
 
 
-def test_a_tip_brought_back_by_hand_is_withdrawn_again_when_it_is_endangered_again() -> None:
+def test_tip_approached_by_hand_is_withdrawn_at_the_next_danger() -> None:
     lab = in_control(SchedulerSettings())
     lab.scope_is(ScopeState.COARSE_MOTOR)
     lab.publish("ZCtrlParameters", Feedback(on=True))
@@ -73,7 +73,7 @@ def test_a_tip_brought_back_by_hand_is_withdrawn_again_when_it_is_endangered_aga
     assert sent(lab) == ["x-retract", "x-retract"]
 
 
-def test_a_tip_that_is_withdrawn_when_nobody_waits_for_it_any_more_is_left_to_people() -> None:
+def test_tip_withdrawn_late_is_left_to_a_person() -> None:
     lab = feedback_off(SchedulerSettings(control=ControlSettings(request_timeout_s=1.0), waits=Waits(answer_s=1.0)))
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     overdue = lab.forwarded[-1]
@@ -89,7 +89,7 @@ def test_a_tip_that_is_withdrawn_when_nobody_waits_for_it_any_more_is_left_to_pe
 
 
 @pytest.mark.parametrize("word", ["false", "0", "0.0", "Off", "no"])
-def test_a_feedback_that_is_just_being_switched_off_counts(word: str) -> None:
+def test_feedback_being_switched_off_counts_as_off(word: str) -> None:
     for answered in (False, True):
         lab = in_control(SchedulerSettings())
         lab.ask("experiment", ControlRequest.SET_ZCTRL_PARAMS, OFF, "experiment/a/1")
@@ -126,7 +126,7 @@ def test_a_solver_may_work_with_the_feedback_off_and_is_not_disturbed() -> None:
         (ControlMode.MANUAL, "x-retract", False),
     ],
 )
-def test_who_resumes_a_run_that_was_stopped_with_the_feedback_off_is_called(
+def test_person_who_resumes_a_run_stopped_with_the_feedback_off_is_called(
     mode: ControlMode, retract: str | None, is_called: bool
 ) -> None:
     settings = SchedulerSettings(watchdog=WatchdogSettings(retract=retract))
@@ -136,7 +136,7 @@ def test_who_resumes_a_run_that_was_stopped_with_the_feedback_off_is_called(
     assert (Problem.DEVICE_MALFUNCTION in resumed(lab, settings).core.control.problems) is is_called
 
 
-def test_who_resumes_a_run_that_was_stopped_without_danger_is_not_called() -> None:
+def test_person_who_resumes_a_run_stopped_without_danger_is_not_called() -> None:
     lab = feedback_off()
     lab.publish("ZCtrlParameters", Feedback(on=True))
     lab.step(Stopped())
@@ -151,7 +151,7 @@ def test_a_lease_that_runs_out_leaves_no_danger() -> None:
     assert sent(lab) == ["x-retract"]
 
 
-def test_whoever_gives_control_back_with_the_feedback_off_is_heard_of_once() -> None:
+def test_release_with_the_feedback_off_is_logged_once() -> None:
     lab = feedback_off()
     lab.says("experiment", ControlRequest.RELEASE_CTRL)
     lab.take_control("experiment")
@@ -160,7 +160,7 @@ def test_whoever_gives_control_back_with_the_feedback_off_is_heard_of_once() -> 
     assert sent(lab) == []
 
 
-def test_a_person_who_takes_over_is_told_and_not_disturbed_nor_when_the_experiment_ends() -> None:
+def test_danger_taken_over_by_a_person_is_logged_and_not_retracted_also_at_the_end() -> None:
     lab = feedback_off()
     lab.mode("person", ControlMode.MANUAL)
     assert said(lab, "WARNING") == ["the feedback is off, and no component is in control: the mode changed to MANUAL"]
@@ -169,7 +169,7 @@ def test_a_person_who_takes_over_is_told_and_not_disturbed_nor_when_the_experime
     assert sent(lab) == []
 
 
-def test_what_can_not_be_retracted_is_critical() -> None:
+def test_tip_that_can_not_be_retracted_is_critical() -> None:
     lab = Lab()
     lab.translator(ControlResponse.ACTION_NOT_SUPPORTED)
     lab.take_control("experiment")
@@ -180,7 +180,7 @@ def test_what_can_not_be_retracted_is_critical() -> None:
 
 
 @pytest.mark.parametrize("code", [ControlResponse.SUCCESS, ControlResponse.ACTION_ERROR])
-def test_after_the_tip_was_retracted_or_could_not_be_nobody_goes_on_until_a_person_says_so(
+def test_after_a_retract_no_component_commands_until_a_person_clears_the_malfunction(
     code: ControlResponse,
 ) -> None:
     lab = feedback_off()
@@ -204,7 +204,7 @@ def test_after_the_tip_was_retracted_or_could_not_be_nobody_goes_on_until_a_pers
 
 
 def not_retracted(settings: SchedulerSettings) -> Lab:
-    """A tip whose holder is dead, and that the microscope did not retract; people were called."""
+    """Return a core with a dead holder and a failed retract, after the call for a person."""
     lab = feedback_off(settings)
     lab.give_up("experiment")
     lab.answer(lab.forwarded[-1], ControlResponse.ACTION_ERROR, reason="a dialog is open")
@@ -218,14 +218,14 @@ def not_retracted(settings: SchedulerSettings) -> Lab:
 
 
 def tried_again(lab: Lab) -> bool:
-    """Whether retracting is asked once more, when it is due."""
+    """Return whether the retract is sent once more when it is due."""
     before = len(lab.forwarded)
     lab.later(real_s=10.0)
     lab.step(Tick())
     return [forward.request.subject for forward in lab.forwarded[before:]] == ["x-retract"]
 
 
-def test_a_tip_that_was_not_retracted_is_until_it_is() -> None:
+def test_retract_is_retried_until_it_succeeds() -> None:
     lab = not_retracted(SchedulerSettings())
     deadline_s = lab.core.deadline_s()
     assert deadline_s is not None
@@ -236,7 +236,7 @@ def test_a_tip_that_was_not_retracted_is_until_it_is() -> None:
     assert not tried_again(lab)
 
 
-def test_a_component_that_solves_it_is_not_disturbed() -> None:
+def test_solver_of_the_malfunction_is_not_disturbed() -> None:
     lab = not_retracted(SchedulerSettings())
     lab.take_control("doctor", Problem.DEVICE_MALFUNCTION)
     assert "Forward" in kinds(lab.ask("doctor", PARAM, Parameter("x-feedback-on", "true"), "doctor/a/1"))
@@ -244,7 +244,7 @@ def test_a_component_that_solves_it_is_not_disturbed() -> None:
     assert not tried_again(lab)
 
 
-def test_who_solves_something_else_is_not_let_at_a_tip_in_danger() -> None:
+def test_solver_of_another_problem_may_not_command_a_tip_in_danger() -> None:
     lab = feedback_off()
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     lab.take_control("corrector", Problem.TIP_SHAPE_CHANGED)
@@ -259,7 +259,7 @@ def test_who_solves_something_else_is_not_let_at_a_tip_in_danger() -> None:
 
 
 @pytest.mark.parametrize("by_hand", [False, True])
-def test_a_person_who_has_taken_over_or_says_that_all_is_well_is_not_disturbed(by_hand: bool) -> None:
+def test_person_who_took_over_or_cleared_the_malfunction_is_not_disturbed(by_hand: bool) -> None:
     lab = not_retracted(SchedulerSettings())
     if by_hand:
         lab.mode("person", ControlMode.MANUAL)
@@ -272,7 +272,7 @@ def test_a_person_who_has_taken_over_or_says_that_all_is_well_is_not_disturbed(b
 
 
 @pytest.mark.parametrize("seen_to", [False, True])
-def test_a_scheduler_that_was_killed_has_not_forgotten_such_a_tip(seen_to: bool) -> None:
+def test_duty_to_retract_outlives_a_kill(seen_to: bool) -> None:
     lab = not_retracted(SchedulerSettings())
     if seen_to:
         lab.take_control("doctor", Problem.DEVICE_MALFUNCTION)
@@ -284,7 +284,7 @@ def test_a_scheduler_that_was_killed_has_not_forgotten_such_a_tip(seen_to: bool)
     assert sent(again) == ([] if seen_to else ["x-retract"])
 
 
-def test_who_resumes_with_a_tip_that_was_put_right_meanwhile_is_not_disturbed() -> None:
+def test_resumed_run_with_a_tip_out_of_danger_is_not_disturbed() -> None:
     lab = not_retracted(SchedulerSettings())
     again = killed(lab, SchedulerSettings())
     again.publish("ZCtrlParameters", Feedback(on=True))
@@ -294,7 +294,7 @@ def test_who_resumes_with_a_tip_that_was_put_right_meanwhile_is_not_disturbed() 
     assert sent(again) == []
 
 
-def test_a_retract_that_waits_for_the_translator_is_dropped_by_who_sees_to_the_tip() -> None:
+def test_retract_waiting_for_the_translator_is_dropped_once_the_tip_is_attended() -> None:
     lab = feedback_off()
     lab.step(TranslatorDown())
     lab.give_up("experiment")
@@ -331,7 +331,7 @@ def test_a_scan_that_goes_on_when_the_controller_is_found_again_is_stopped_and_t
 
 
 def asks_to_switch_off() -> Lab:
-    """A holder's request to switch the feedback off is with the translator."""
+    """Return a core whose holder's request to switch the feedback off is with the translator."""
     lab = in_control(SchedulerSettings())
     lab.scope_is(ScopeState.FREE)
     lab.publish("ZCtrlParameters", Feedback(on=True))
@@ -340,7 +340,7 @@ def asks_to_switch_off() -> Lab:
 
 
 @pytest.mark.parametrize("in_time", [False, True])
-def test_a_feedback_that_nobody_knows_of_counts_as_off(in_time: bool) -> None:
+def test_feedback_of_unknown_state_counts_as_off(in_time: bool) -> None:
     lab = asks_to_switch_off()
     if in_time:
         lab.answer(lab.forwarded[-1], ControlResponse.NO_RESPONSE, reason="the controller can't be reached")
@@ -351,7 +351,7 @@ def test_a_feedback_that_nobody_knows_of_counts_as_off(in_time: bool) -> None:
     assert sent(lab)[-1] == "x-retract"
 
 
-def test_a_feedback_that_was_left_on_after_all_is_no_danger() -> None:
+def test_refused_switch_off_of_the_feedback_is_no_danger() -> None:
     lab = asks_to_switch_off()
     late = lab.forwarded[-1]
     lab.later(real_s=5.0)
@@ -377,7 +377,7 @@ def feedback_off_and_saved() -> Lab:
     return lab
 
 
-def test_what_was_done_by_hand_is_told_when_the_mode_is_automated_again() -> None:
+def test_danger_left_by_hand_is_logged_when_the_mode_is_automated() -> None:
     lab = in_control(SchedulerSettings())
     lab.mode("person", ControlMode.MANUAL)
     lab.publish("ZCtrlParameters", OFF)
@@ -387,7 +387,7 @@ def test_what_was_done_by_hand_is_told_when_the_mode_is_automated_again() -> Non
     )
 
 
-def test_an_experiment_that_ends_with_such_a_tip_tries_until_it_is_time_and_leaves_it_to_the_translator() -> None:
+def test_ending_experiment_retries_the_retract_and_then_leaves_it_to_the_translator() -> None:
     lab = not_retracted(SchedulerSettings())
     lab.ask("person", END)
     before = len(lab.forwarded)
@@ -400,7 +400,7 @@ def test_an_experiment_that_ends_with_such_a_tip_tries_until_it_is_time_and_leav
     assert [effect.tip_is_safe for effect in lab.effects if isinstance(effect, Kill)] == [False]
 
 
-def test_what_waits_when_the_experiment_ends_is_not_done_after_the_tip_is_away() -> None:
+def test_waiting_commands_are_not_sent_after_the_final_retract() -> None:
     lab = feedback_off()
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.ask("experiment", ACTION, "x-engage", "experiment/a/2")
@@ -410,7 +410,7 @@ def test_what_waits_when_the_experiment_ends_is_not_done_after_the_tip_is_away()
     assert sent(lab) == ["x-pulse", "x-retract"]
 
 
-def test_a_run_that_is_stopped_with_nobody_there_to_retract_says_so() -> None:
+def test_run_stopped_in_danger_without_a_translator_is_critical() -> None:
     lab = feedback_off()
     lab.step(TranslatorDown())
     lab.step(Stopped())
@@ -419,7 +419,7 @@ def test_a_run_that_is_stopped_with_nobody_there_to_retract_says_so() -> None:
     ]
 
 
-def test_end_that_is_asked_for_again_while_the_tip_is_seen_to_gets_one_answer_by_the_newest_connection() -> None:
+def test_repeated_end_during_a_retract_gets_one_answer_by_the_newest_connection() -> None:
     lab = feedback_off()
     lab.ask("experiment", END, None, "experiment/a/9")
     lab.ask("experiment", END, None, "experiment/a/9")
@@ -448,7 +448,7 @@ def test_the_experiment_ends_when_the_tip_is_out_of_danger() -> None:
     assert kinds(effects)[-1] == "Kill"
 
 
-def test_an_experiment_that_ends_does_not_wait_for_ever() -> None:
+def test_ending_experiment_waits_for_a_bounded_time() -> None:
     lab = feedback_off()
     lab.ask("experiment", END)
     deadline_s = lab.core.deadline_s()
@@ -461,7 +461,7 @@ def test_an_experiment_that_ends_does_not_wait_for_ever() -> None:
     assert any("did not retract" in text for text in said(lab, "CRITICAL"))
 
 
-def test_a_scheduler_that_is_killed_while_it_ends_sees_to_the_tip_first() -> None:
+def test_scheduler_killed_during_the_end_retracts_first() -> None:
     lab = feedback_off()
     lab.ask("experiment", END)
     again = killed(lab, SchedulerSettings())
@@ -476,7 +476,7 @@ def test_an_experiment_without_danger_ends_at_once() -> None:
 
 
 def restarted_over_a_retract() -> Lab:
-    """A scheduler that was killed over a retract; a person took over and gave back, and the translator still hangs."""
+    """Return a core restarted during a retract; a person took and gave back control, and the translator still hangs."""
     lab = feedback_off()
     lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
     assert sent(lab) == ["x-retract"]
@@ -491,13 +491,13 @@ def restarted_over_a_retract() -> Lab:
     return again
 
 
-def test_retract_of_before_a_restart_keeps_the_microscope_until_the_translator_answers() -> None:
+def test_unanswered_retract_blocks_commands_after_a_restart_until_the_translator_answers() -> None:
     lab = restarted_over_a_retract()
     assert lab.says("corrector", ACTION, "start-scan") is ControlResponse.NOT_FREE
     assert "start-scan" not in sent(lab)
 
 
-def test_retract_that_a_killed_scheduler_asked_for_and_a_person_called_off_calls_a_person() -> None:
+def test_retract_of_a_killed_scheduler_that_a_person_overrode_calls_a_person() -> None:
     lab = restarted_over_a_retract()
     lab.answer(lab.forwarded[0])  # the first question: the translator has served everything before it
     assert lab.core.state.watchdog.left_to_people

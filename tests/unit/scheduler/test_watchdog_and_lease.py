@@ -1,4 +1,4 @@
-"""What the scheduler does to the microscope by itself."""
+"""The actions that the scheduler itself sends to the microscope."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def watchdog(*states: ScopeState, **settings: object) -> Dog:
 
 
 @pytest.mark.parametrize(("state", "stop"), [(SCANNING, ["stop-scan"]), (SPEC, ["stop-spec"]), (FREE, [])])
-def test_what_runs_is_stopped_when_control_is_taken(state: ScopeState, stop: list[str]) -> None:
+def test_running_measurement_is_stopped_when_control_is_taken(state: ScopeState, stop: list[str]) -> None:
     assert watchdog(FREE, state).control_taken(Cause.PROBLEM, None) == stop
 
 
 @pytest.mark.parametrize("cause", [Cause.RELEASED, Cause.SOLVED])
-def test_what_runs_goes_on_when_control_was_given_back(cause: Cause) -> None:
+def test_running_measurement_goes_on_when_control_is_released(cause: Cause) -> None:
     assert watchdog(SCANNING).control_taken(cause, None) == []
 
 
-def test_the_experiment_file_may_say_to_let_it_run() -> None:
+def test_experiment_file_may_let_the_measurement_run() -> None:
     assert watchdog(SCANNING, stop_when={Cause.MANUAL}).control_taken(Cause.PROBLEM, None) == []
 
 
@@ -49,7 +49,7 @@ def test_a_scan_that_is_just_being_started_is_stopped_too() -> None:
     assert begun.control_taken(Cause.PROBLEM, None) == ["stop-scan"]
 
 
-def test_a_start_whose_states_have_come_already_is_not_taken_for_running() -> None:
+def test_start_whose_states_have_come_already_is_not_running() -> None:
     done = watchdog(FREE)
     seen = done.states_seen
     done.state(SCANNING)
@@ -79,7 +79,7 @@ def test_a_dead_holder_s_tip_is_retracted_in_a_dangerous_state_once_it_has_stopp
 
 
 def off(*states: ScopeState, **settings: object) -> Dog:
-    """One that knows that the feedback is off."""
+    """Return a watchdog that knows that the feedback is off."""
     made = watchdog(*states, **settings)
     made.feedback(on=False)
     return made
@@ -93,7 +93,7 @@ def test_the_tip_is_retracted_where_the_holder_could_not_put_the_danger_right(ca
 
 
 @pytest.mark.parametrize("cause", [Cause.RELEASED, Cause.SOLVED, Cause.MANUAL])
-def test_what_the_holder_or_a_person_does_knowingly_is_told_once_and_left_alone(cause: Cause) -> None:
+def test_danger_left_knowingly_is_logged_once_and_not_retracted(cause: Cause) -> None:
     dog = off(FREE)
     assert dog.control_taken(cause, None, by_holder=cause is not Cause.MANUAL) == []
     assert dog.untold() == "the feedback is off"
@@ -104,7 +104,7 @@ def test_what_the_holder_or_a_person_does_knowingly_is_told_once_and_left_alone(
     assert dog.untold() == "the feedback is off"
 
 
-def test_a_danger_that_is_seen_to_is_not_told_nor_seen_to_again() -> None:
+def test_attended_danger_is_neither_logged_nor_retracted() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.PROBLEM, None)
     assert dog.next_action() == "x-retract"
@@ -123,7 +123,7 @@ def retracted() -> Dog:
     return dog
 
 
-def test_a_tip_that_is_away_is_in_no_danger_until_it_may_be_back() -> None:
+def test_withdrawn_tip_is_in_no_danger_until_it_may_be_back() -> None:
     dog = retracted()
     dog.started("start-scan", dog.states_seen)
     assert dog.danger is None
@@ -141,7 +141,7 @@ def test_a_tip_that_is_away_is_in_no_danger_until_it_may_be_back() -> None:
         assert dog.danger is None
 
 
-def test_a_danger_that_can_not_be_seen_to_is_told() -> None:
+def test_danger_without_a_retract_is_logged() -> None:
     dog = off(FREE, retract=None)
     assert dog.control_taken(Cause.PROBLEM, None) == []
     assert dog.untold() == "the feedback is off"
@@ -149,7 +149,7 @@ def test_a_danger_that_can_not_be_seen_to_is_told() -> None:
     assert off(FREE, dangerous=()).untold() is None
 
 
-def test_with_the_feedback_on_a_scan_of_the_dead_is_only_stopped() -> None:
+def test_scan_of_a_dead_holder_is_only_stopped_with_the_feedback_on() -> None:
     dog = watchdog(SCANNING)
     dog.feedback(on=True)
     assert dog.control_taken(Cause.DEAD, None) == ["stop-scan"]
@@ -162,7 +162,7 @@ def test_a_microscope_that_can_not_retract_is_not_asked_to() -> None:
     assert watchdog(ScopeState.COARSE_MOTOR, retract=None).control_taken(Cause.DEAD, None) == []
 
 
-def test_silence_is_tried_again_and_given_up_loudly() -> None:
+def test_action_without_a_response_is_retried_and_then_fails() -> None:
     dog = watchdog(SCANNING, attempts=3)
     dog.control_taken(Cause.MANUAL, None)
     results = []
@@ -173,7 +173,7 @@ def test_silence_is_tried_again_and_given_up_loudly() -> None:
     assert dog.tip.stops == ()
 
 
-def test_what_could_not_be_sent_is_sent_when_the_translator_is_back_unless_it_is_free_by_then() -> None:
+def test_unsent_stop_is_sent_when_the_translator_is_back_unless_the_scan_has_ended() -> None:
     dog = watchdog(SCANNING)
     dog.control_taken(Cause.MANUAL, None)
     dog.next_action()
@@ -188,7 +188,7 @@ ERROR = int(ControlResponse.ACTION_ERROR)
 
 
 def refused(**settings: object) -> Dog:
-    """One whose tip the microscope did not retract, at 100 s."""
+    """Return a watchdog whose retract failed at 100 s."""
     dog = off(FREE, **settings)
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "x-retract"
@@ -196,7 +196,7 @@ def refused(**settings: object) -> Dog:
     return dog
 
 
-def test_a_tip_that_was_not_retracted_is_tried_again_and_again_ever_less_often() -> None:
+def test_failed_retract_is_retried_at_growing_intervals() -> None:
     dog = refused(again_s=10.0, longest_s=30.0)
     times, now_s = [], 100.0
     for _ in range(4):
@@ -217,7 +217,7 @@ def test_a_tip_that_was_not_retracted_is_tried_again_and_again_ever_less_often()
     assert (dog.due_s, dog.danger, dog.owes_retract) == (None, None, False)
 
 
-def test_who_is_there_to_see_to_a_tip_is_not_disturbed() -> None:
+def test_component_attending_to_the_tip_is_not_disturbed() -> None:
     dog = refused()
     dog.look_again(110.0, is_seen_to=True)
     assert (dog.next_action(), dog.due_s) == (None, None)
@@ -229,7 +229,7 @@ def test_who_is_there_to_see_to_a_tip_is_not_disturbed() -> None:
     assert (dog.next_action(), dog.due_s) == (None, None)
 
 
-def test_who_gives_control_back_and_was_not_there_for_the_tip_knows_nothing_of_it() -> None:
+def test_release_by_a_holder_not_attending_to_the_tip_keeps_the_duty() -> None:
     dog = refused()
     dog.control_taken(Cause.SOLVED, None, by_holder=True)
     assert dog.put_off
@@ -237,20 +237,20 @@ def test_who_gives_control_back_and_was_not_there_for_the_tip_knows_nothing_of_i
     assert dog.next_action() == "x-retract"
 
 
-def test_who_came_to_see_to_a_tip_and_died_leaves_it_to_be_retracted_at_once() -> None:
+def test_tip_is_retracted_at_once_when_its_solver_dies() -> None:
     dog = refused()
     assert dog.control_taken(Cause.DEAD, None, was_seen_to=True) == ["x-retract"]
     assert dog.next_action() == "x-retract"
 
 
-def test_a_tip_that_is_out_of_danger_by_then_is_left_where_it_is() -> None:
+def test_tip_out_of_danger_by_then_is_not_retracted() -> None:
     dog = refused()
     dog.feedback(on=True)
     dog.look_again(110.0, is_seen_to=False)
     assert (dog.next_action(), dog.due_s) == (None, None)
 
 
-def test_a_microscope_that_is_never_free_for_it_is_left_to_people_and_tried_later() -> None:
+def test_retract_at_a_microscope_never_free_is_put_off_and_a_person_called() -> None:
     dog = off(FREE, again_s=10.0)
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
@@ -263,7 +263,7 @@ def test_a_microscope_that_is_never_free_for_it_is_left_to_people_and_tried_late
     assert dog.next_action() == "x-retract"
 
 
-def test_nobody_who_could_retract_is_there() -> None:
+def test_retract_without_a_translator_is_put_off_and_logged() -> None:
     dog = off(FREE, again_s=10.0)
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
@@ -283,7 +283,7 @@ def restarted(dog: Dog) -> Dog:
     return again
 
 
-def test_nor_is_one_there_for_a_scheduler_that_is_restarted() -> None:
+def test_retract_without_a_translator_after_a_restart_is_put_off_and_logged() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.DEAD, None)
     again = restarted(dog)
@@ -292,7 +292,7 @@ def test_nor_is_one_there_for_a_scheduler_that_is_restarted() -> None:
     assert again.left_to_people
 
 
-def test_a_restarted_scheduler_asks_again_for_what_it_was_asking() -> None:
+def test_restarted_scheduler_repeats_its_unanswered_retract() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "x-retract"
@@ -310,7 +310,7 @@ def test_a_late_withdrawal_leaves_nothing_owed_but_a_person_to_call() -> None:
 
 
 @pytest.mark.parametrize("answer", [OK, ERROR, NOT_FREE])
-def test_a_scan_that_goes_on_whatever_it_is_told_does_not_keep_the_tip_at_the_surface(answer: int) -> None:
+def test_unstoppable_scan_does_not_prevent_the_retract(answer: int) -> None:
     dog = off(SCANNING, again_s=10.0)
     dog.control_taken(Cause.DEAD, None)
     assert dog.next_action() == "stop-scan"
@@ -336,13 +336,13 @@ def test_a_scan_that_was_not_seen_when_control_was_taken_is_stopped_first() -> N
     assert dog.next_action() == "x-retract"
 
 
-def test_a_lost_microscope_goes_on_with_what_it_did() -> None:
+def test_lost_microscope_keeps_its_last_state() -> None:
     dog = watchdog(ScopeState.COARSE_MOTOR, ScopeState.UNDEFINED)
     assert dog.danger == "the microscope is in COARSE_MOTOR"
     assert dog.control_taken(Cause.PROBLEM, None) == ["x-retract"]
 
 
-def test_what_nobody_knows_of_the_feedback_counts_as_off_until_it_is_known() -> None:
+def test_unknown_feedback_counts_as_off_until_known() -> None:
     dog = watchdog(FREE)
     dog.feedback(on=True)
     dog.feedback_may_be_off()
@@ -355,7 +355,7 @@ def test_what_nobody_knows_of_the_feedback_counts_as_off_until_it_is_known() -> 
     assert dog.danger == "the feedback is off"
 
 
-def test_what_a_microscope_can_not_do_is_not_tried_again() -> None:
+def test_unsupported_action_is_not_retried() -> None:
     dog = off(FREE)
     dog.control_taken(Cause.DEAD, None)
     dog.next_action()
@@ -366,7 +366,7 @@ def test_what_a_microscope_can_not_do_is_not_tried_again() -> None:
 NS = 10**9
 
 
-def test_a_holder_that_does_nothing_has_a_deadline_and_using_control_moves_it() -> None:
+def test_idle_holder_has_a_deadline_that_commands_move() -> None:
     lease = Lease(60 * NS).held_by("greedy", 0)
     assert lease.deadline_ns(is_free=True) == 60 * NS
     assert lease.used(30 * NS).deadline_ns(is_free=True) == 90 * NS
@@ -384,7 +384,7 @@ def test_while_the_microscope_works_its_holder_is_not_idle() -> None:
     assert lab.core.deadline_ns() == lab.now_ns + 60 * NS
 
 
-def test_asking_again_does_not_renew_a_lease() -> None:
+def test_repeated_request_for_control_does_not_renew_a_lease() -> None:
     lease = Lease(60 * NS).held_by("greedy", 0).held_by("greedy", 59 * NS)
     assert lease.deadline_ns(is_free=True) == 60 * NS
 
@@ -395,7 +395,7 @@ def test_without_a_lease_or_a_holder_there_is_no_deadline() -> None:
 
 
 def leased(lab: Lab, lease_s: float = 20.0) -> Lab:
-    """A lab with a scan under way whose holder asked for a lease."""
+    """Return a core with a running scan, whose holder requested a lease."""
     lab.translator()
     lab.scope_is(FREE)
     lab.take_control("gateway:Ada")
@@ -404,7 +404,7 @@ def leased(lab: Lab, lease_s: float = 20.0) -> Lab:
     return lab
 
 
-def test_a_lease_that_its_holder_asked_for_runs_out_in_the_middle_of_a_scan_which_is_stopped() -> None:
+def test_requested_lease_runs_out_during_a_scan_and_stops_it() -> None:
     lab = leased(Lab(SchedulerSettings()))
     until_s = lab.now_s + 20.0
     lab.entries()
@@ -419,7 +419,7 @@ def test_a_lease_that_its_holder_asked_for_runs_out_in_the_middle_of_a_scan_whic
     assert [entry.reason for entry in lab.entries() if entry.event is ControlEvent.CONTROL_LOST] == [Cause.IDLE.value]
 
 
-def test_renewals_and_commands_begin_such_a_lease_anew_and_control_ends_it() -> None:
+def test_renewals_and_commands_restart_a_requested_lease_and_a_release_ends_it() -> None:
     lab = leased(Lab(SchedulerSettings()))
     lab.later(real_s=15.0)
     assert lab.says("gateway:Ada", LEASE_REQUEST, 20.0) is ControlResponse.SUCCESS
@@ -443,7 +443,7 @@ def test_only_the_holder_has_a_lease() -> None:
     assert lab.holder == "gateway:Ada"
 
 
-def test_a_lease_outlives_the_scheduler_and_begins_anew() -> None:
+def test_requested_lease_outlives_the_scheduler_and_restarts() -> None:
     settings = SchedulerSettings(waits=Waits(restart_grace_s=1000.0))
     lab = killed(leased(Lab(settings)), settings)
     lab.later(real_s=19.0)

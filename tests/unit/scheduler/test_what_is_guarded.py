@@ -1,4 +1,4 @@
-"""Limits, through the whole scheduler: where something is done, over its own death."""
+"""Limits through the whole scheduler, also over its kill."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ REGION = SchedulerSettings(limits=ExperimentLimits(region=STAGE, region_source="
 
 
 @pytest.mark.parametrize("action", ["start-scan", "x-pulse"])
-def test_what_was_moved_out_of_the_region_at_the_panel_is_refused_when_it_is_to_be_used(action: str) -> None:
+def test_place_moved_out_of_the_region_at_the_panel_is_refused_when_used(action: str) -> None:
     lab = in_control(REGION)
     lab.publish("ScanParameters2d", ScanParameters(Region((0.0, 0.0), (1e-6, 1e-6)), (32, 32)))
     lab.publish("ProbePosition", ProbePosition((0.0, 0.0)))
@@ -64,7 +64,7 @@ def set_(name: str, value: str, number: int) -> tuple[ControlRequest, Parameter,
 
 
 def test_request_sent_without_waiting_is_checked_against_all_earlier_ones() -> None:
-    """The frame would be wider, and then moved, and both fit into the region by themselves."""
+    """The frame would be wider, and then moved; each change alone fits into the region."""
     lab = in_control(REGION)
     lab.publish("ScanParameters2d", ScanParameters(Region((0.0, 0.0), (1e-6, 1e-6)), (32, 32)))
     for request in (set_("scan-size-x", "3.4e-6", 1), set_("scan-top-left-x", "1.9e-6", 2)):
@@ -186,7 +186,7 @@ def test_refused_repetition_is_answered_as_unknown_outcome() -> None:
     assert "a step of 2.9 V" in reply.response.reason
 
 
-def test_an_interval_outlives_the_scheduler_that_was_killed_before_it_heard_the_answer() -> None:
+def test_interval_outlives_a_kill_before_the_answer() -> None:
     lab = in_control(PULSES)
     effects = lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     assert kinds(effects) == ["SaveState", "Forward"]
@@ -200,14 +200,14 @@ def test_an_interval_outlives_the_scheduler_that_was_killed_before_it_heard_the_
 
 
 @pytest.mark.parametrize("answer", [ControlResponse.ACTION_ERROR, ControlResponse.NOT_FREE])
-def test_what_the_microscope_refused_may_be_asked_at_once(answer: ControlResponse) -> None:
+def test_request_refused_by_the_microscope_may_be_repeated_at_once(answer: ControlResponse) -> None:
     lab = in_control(PULSES)
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.answer(lab.forwarded[-1], answer)
     assert "Forward" in kinds(lab.ask("experiment", ACTION, "x-pulse", "experiment/a/2"))
 
 
-def test_what_may_have_been_done_counts() -> None:
+def test_use_of_unknown_outcome_counts() -> None:
     lab = in_control(PULSES)
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.answer(lab.forwarded[-1], ControlResponse.NO_RESPONSE)
@@ -219,7 +219,7 @@ STEPS = SchedulerSettings(limits=ExperimentLimits({BIAS: Limit(step=0.1)}))
 
 
 def told(lab: Lab, value: str) -> list[Effect]:
-    """The microscope answers what the bias is."""
+    """Answer the read of the bias."""
     forward = lab.forwarded[-1]
     assert forward.request.subject == Parameter(BIAS)
     return lab.answer(forward, payload=lab.codec.encode(Parameter(BIAS, value, "V")))
@@ -229,7 +229,7 @@ def sent(effects: list[Effect]) -> list[object]:
     return [effect.request.subject for effect in effects if isinstance(effect, Forward)]
 
 
-def test_a_step_is_measured_from_what_the_microscope_says_then() -> None:
+def test_step_is_measured_from_the_value_read_at_that_time() -> None:
     lab = in_control(STEPS)
     assert sent(lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")) == [Parameter(BIAS)]
     assert sent(told(lab, "0.1")) == [Parameter(BIAS, "0.2", "V")]
@@ -240,15 +240,15 @@ def test_a_step_is_measured_from_what_the_microscope_says_then() -> None:
     assert reply.response.id == "experiment/a/2"
 
 
-def test_what_can_not_be_read_is_not_set() -> None:
+def test_unreadable_parameter_is_not_set() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
     (reply,) = replies(lab.answer(lab.forwarded[-1], ControlResponse.PARAM_NOT_SUPPORTED))
     assert reply.response.code == ControlResponse.PARAM_ERROR
-    assert "does not tell" in reply.response.reason
+    assert "reports no value now" in reply.response.reason
 
 
-def test_one_whose_value_the_microscope_does_not_tell_in_time_may_ask_again() -> None:
+def test_client_may_retry_after_a_read_in_vain() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
     lab.later(STEPS.control.request_timeout_s)
@@ -257,7 +257,7 @@ def test_one_whose_value_the_microscope_does_not_tell_in_time_may_ask_again() ->
     assert reply.response.detail is ResponseDetail.NOT_SENT
 
 
-def test_who_loses_control_while_the_value_is_read_does_not_set_it() -> None:
+def test_client_that_loses_control_during_the_read_sets_nothing() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "0.2", "V"), "experiment/a/1")
     effects = lab.ask("classifier", ControlRequest.ADD_EXP_PRBLM, Problem.TIP_SHAPE_CHANGED)
@@ -266,7 +266,7 @@ def test_who_loses_control_while_the_value_is_read_does_not_set_it() -> None:
     assert not sent(told(lab, "0.1"))
 
 
-def test_two_do_not_change_one_value_at_a_time() -> None:
+def test_two_changes_of_one_value_do_not_overlap() -> None:
     lab = in_control(replace(STEPS, rules=Rules(RoleTable(operate=("ada", "ben")))))
     lab.mode("ada", ControlMode.MANUAL)
     lab.ask("ada", PARAM, Parameter(BIAS, "0.1", "V"), "ada/a/1")
@@ -278,7 +278,7 @@ def test_two_do_not_change_one_value_at_a_time() -> None:
     assert (reply.name, "a step of 200 mV" in reply.response.reason) == ("ben", True)
 
 
-def test_what_a_person_waits_to_set_is_not_set_when_the_mode_is_automated_again() -> None:
+def test_waiting_change_by_a_person_is_dropped_when_the_mode_is_automated() -> None:
     lab = in_control(replace(STEPS, rules=Rules(RoleTable(operate=("ada", "ben")))))
     lab.mode("ada", ControlMode.MANUAL)
     lab.ask("ada", PARAM, Parameter(BIAS, "0.1", "V"), "ada/a/1")
@@ -289,7 +289,7 @@ def test_what_a_person_waits_to_set_is_not_set_when_the_mode_is_automated_again(
     assert not sent(lab.answer(read, payload=lab.codec.encode(Parameter(BIAS, "0", "V"))))
 
 
-def test_who_has_a_new_connection_by_the_time_it_is_refused_hears_so_there() -> None:
+def test_refusal_goes_to_the_newest_connection() -> None:
     lab = in_control(STEPS)
     lab.ask("experiment", PARAM, Parameter(BIAS, "3", "V"), "experiment/a/1")
     read = lab.forwarded[-1]
@@ -300,7 +300,7 @@ def test_who_has_a_new_connection_by_the_time_it_is_refused_hears_so_there() -> 
     assert (reply.connection, "step" in reply.response.reason) == (newest, True)
 
 
-def test_how_fast_a_value_may_change_is_known_once_the_translator_has_been_there_for_a_while() -> None:
+def test_rate_is_measured_from_the_read_at_connection() -> None:
     settings = SchedulerSettings(limits=ExperimentLimits({BIAS: Limit(rate_per_s=0.1)}))
     lab = Lab(settings)
     lab.step(TranslatorUp())

@@ -1,4 +1,4 @@
-"""What the scheduler writes before it tells: on a disk that works, is full, hangs, or loses its power."""
+"""The write-ahead log, on a disk that works, is full, hangs, or loses its power."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def own(time_ns: int, envelope: str = "JournalEntries", size: int = 1) -> Logged
 
 
 class Bench:
-    """A scheduler's disk: what is written with it, and what it caches."""
+    """A scheduler's disk, with the write-ahead log and the cache."""
 
     def __init__(self, folder: Path) -> None:
         self.packets = folder / "packets"
@@ -53,7 +53,7 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
     made.writes.close()
 
 
-def test_what_was_written_is_there_at_once(bench: Bench) -> None:
+def test_written_packets_are_in_the_log_at_once(bench: Bench) -> None:
     bench.publish(own(1))
     bench.writes.write(STATE, [own(2, "ControlState")])
     assert cached_packets(bench.packets) == [own(1), own(2, "ControlState")]
@@ -61,7 +61,7 @@ def test_what_was_written_is_there_at_once(bench: Bench) -> None:
 
 
 class FullDisk:
-    """No packet can be appended while it `is_full`."""
+    """A log that takes no packets while it `is_full`."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.is_full = True
@@ -75,7 +75,7 @@ class FullDisk:
         monkeypatch.setattr(PacketLog, "append", appended)
 
 
-def test_what_found_no_room_is_written_before_what_comes_once_there_is_room(
+def test_packets_that_found_no_room_are_written_before_later_ones(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -92,7 +92,7 @@ def test_what_found_no_room_is_written_before_what_comes_once_there_is_room(
     assert [record.levelname for record in caplog.records] == ["CRITICAL", "INFO"], "told once, and that it is over"
 
 
-def test_a_disk_that_hangs_is_not_waited_for_and_all_is_written_once_it_answers(
+def test_hanging_disk_is_not_waited_for_and_catches_up(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -116,9 +116,7 @@ def test_a_disk_that_hangs_is_not_waited_for_and_all_is_written_once_it_answers(
     assert [record.levelname for record in caplog.records if "has not answered" in record.getMessage()] == ["WARNING"]
 
 
-def test_what_was_too_much_for_a_disk_that_hangs_is_written_as_far_as_it_is_cached(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_packets_beyond_the_backlog_are_written_as_far_as_cached(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     answers = threading.Event()
     append = PacketLog.append
 
@@ -136,7 +134,7 @@ def test_what_was_too_much_for_a_disk_that_hangs_is_written_as_far_as_it_is_cach
     assert bench.logged() == list(range(1, 9))
 
 
-def test_what_is_cached_survives_the_log_being_written_over(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cached_packets_survive_the_cleaning_of_the_log(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(packet_log, "SEGMENT_BYTES", 1000)
     monkeypatch.setattr(packet_log, "CAPACITY_BYTES", 3000)
     bench.publish(own(1, "ControlState"))
@@ -149,7 +147,7 @@ def test_what_is_cached_survives_the_log_being_written_over(bench: Bench, monkey
     assert len(bench.logged()) < 30
 
 
-def test_it_is_told_when_the_recorder_does_not_keep_up(
+def test_recorder_that_falls_behind_is_logged(
     bench: Bench, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
@@ -170,9 +168,7 @@ def test_it_is_told_when_the_recorder_does_not_keep_up(
 
 
 @pytest.mark.parametrize("steps", range(3))
-def test_a_packet_is_logged_only_after_the_state_that_it_tells_of(
-    bench: Bench, monkeypatch: pytest.MonkeyPatch, steps: int
-) -> None:
+def test_packet_is_logged_after_the_state_it_reports(bench: Bench, monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
     done: list[str] = []
 
     def until_cut(name: str, do: Callable[..., Any]) -> Callable[..., Any]:

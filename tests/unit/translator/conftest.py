@@ -1,4 +1,4 @@
-"""A microscope, a network and a clock that do exactly what a test says."""
+"""A microscope, a network and a clock under the control of a test."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from afspm.model import (
 )
 from afspm.storage.memory import Memory
 from afspm.translator import Driver, Value, action
-from afspm.translator.translator import Translator
+from afspm.translator.translator import Translator, TranslatorRun
 from afspm.transport.port import RequestReceived, Served
 
 TABLE = """
@@ -54,7 +54,7 @@ tip-bias-voltage = { vendor = "Bias", unit = "mV", range = ["-10 V", "10 V"], wh
 
 
 class FakePort:
-    """Records what a translator answers and publishes."""
+    """Records the answers and packets of a translator."""
 
     def __init__(self, clock: FakeClock) -> None:
         self.clock = clock
@@ -176,7 +176,7 @@ def a_scan(channel: str = "Height") -> Scan:
 
 
 class Bench:
-    """A translator on a fake network, and the means to ask it."""
+    """A translator on a fake network, with short calls for requests."""
 
     def __init__(self, folder: Path, settings: dict[str, Any] | None = None) -> None:
         self.clock = FakeClock()
@@ -185,14 +185,15 @@ class Bench:
         self.start()
 
     def start(self, *, retracts: bool = True) -> None:
-        """Start the translator's process, or start it again after a kill: only the disk is left of the last."""
+        """Start the translator's process, or restart it after a kill: only the disk survives."""
         self.port = FakePort(self.clock)
         memory, log = Memory(self.folder / "translator.json"), logging.getLogger("test")
-        self.translator = Translator(self.microscope, self.port, memory, self.folder, log, retracts=retracts)
+        run = TranslatorRun(self.folder, retracts=retracts)
+        self.translator = Translator(self.microscope, self.port, memory, run, log)
         self.translator.look()
 
     def run_to_the_end(self, *last: Served, after_s: tuple[float, Callable[[], None]] = (math.inf, list)) -> ExitCode:
-        """Run it until it ends, after this came to it, all at once; and some time later this happens."""
+        """Run until the translator ends; `last` arrives at once, and `after_s` calls a function after a time."""
         at_s, happens = self.clock.t_s + after_s[0], after_s[1]
 
         def poll(timeout_s: float | None) -> list[Served]:
@@ -216,7 +217,7 @@ class Bench:
         self.translator.look()
 
     def heard(self) -> list[Any]:
-        """What was published since the last call: states as their names, else the name of the message."""
+        """Return the packets since the last call: states by name, other packets by the name of their message."""
         packets, self.port.packets, self.port.kept = self.port.packets, [], []
         return [thing.state.name if isinstance(thing, ScopeStatus) else name for name, thing, _ in packets]
 

@@ -35,14 +35,14 @@ with commanding(sys.argv[1], "runs/the-dead"):
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where the locks are."""
+    """The folder of the locks."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setenv("PROGRAMDATA", str(tmp_path))
     return tmp_path / "afspm-controllers"
 
 
 @pytest.mark.parametrize("other", ["lab-1:6501", "LAB-1:6501"])
-def test_a_second_run_is_refused_and_told_which_has_the_controller(other: str) -> None:
+def test_second_run_is_refused_with_the_name_of_the_first(other: str) -> None:
     with commanding("lab-1:6501", "runs/first"):
         with (
             pytest.raises(ControllerTaken, match=f"commands this controller: runs/first, process {os.getpid()}"),
@@ -56,14 +56,12 @@ def test_a_second_run_is_refused_and_told_which_has_the_controller(other: str) -
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file can't be removed there")
-def test_nothing_is_left_behind_and_nobody_holds_what_has_been_removed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lock_file_is_removed_and_a_removed_one_is_never_held(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Path] = []
     locked = controller_lock.lock
 
     def lock_too_late(file: BinaryIO) -> None:
-        """Whoever had it removes it just after it was opened."""
+        # its former holder deletes the file right after it was opened
         if not opened:
             opened.extend(folder.iterdir())
             opened[0].unlink()
@@ -98,7 +96,7 @@ def test_a_run_that_failed_or_was_killed_leaves_nothing_locked(tmp_path: Path, f
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links take a right there")
-def test_a_link_that_somebody_laid_is_not_followed(tmp_path: Path, folder: Path) -> None:
+def test_link_in_place_of_the_lock_is_not_followed(tmp_path: Path, folder: Path) -> None:
     precious = tmp_path / "thesis.tex"
     precious.write_text("years of work", encoding="utf-8")
     folder.mkdir()
@@ -145,7 +143,7 @@ def test_the_lock_of_another_user_holds_too(tmp_path: Path, folder: Path) -> Non
         pass
 
 
-def test_each_maker_says_where_its_controller_is_and_a_simulated_one_is_its_runs_own(tmp_path: Path) -> None:
+def test_each_driver_has_the_address_of_its_controller_and_a_simulated_one_has_none(tmp_path: Path) -> None:
     assert Asylum(address="tcp://lab:5555").controller_at == "tcp://lab:5555"
     assert Nanonis(address="lab:6501,6502").controller_at == "lab:6501,6502"
     assert Gxsm(address="lab:65431").controller_at == "lab:65431"
@@ -154,7 +152,7 @@ def test_each_maker_says_where_its_controller_is_and_a_simulated_one_is_its_runs
         assert not list(tmp_path.iterdir())
 
 
-def test_the_translator_of_a_second_run_says_which_has_it_and_ends_to_be_tried_again(
+def test_translator_of_a_second_run_logs_the_first_and_ends_for_a_retry(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     launch = Launch("microscope", sockets=Sockets(), run_dir="runs/second")

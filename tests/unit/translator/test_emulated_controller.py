@@ -1,4 +1,4 @@
-"""A translator that is wired to an emulator reaches that of its own run, or nobody."""
+"""A translator of an emulator connects to the emulator of its own run only."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ sys.stdin.read()
 
 
 class Vendor:
-    """What of a microscope is used."""
+    """The part of a driver that is used here."""
 
     def __init__(self, controller_at: str = "127.0.0.1:6501") -> None:
         self.controller_at = controller_at
@@ -61,14 +61,16 @@ def reach(file: Path, vendor: Vendor, run: str = RUN) -> EmulatedController:
     return found
 
 
-def test_it_goes_where_the_emulator_tells_and_not_where_the_settings_say(file: Path, notice: AddressNotice) -> None:
+def test_translator_connects_to_the_emulator_instead_of_the_address_in_the_settings(
+    file: Path, notice: AddressNotice
+) -> None:
     notice.tell("127.0.0.1:40001")
     vendor = Vendor()
     reach(file, vendor).prove()
     assert vendor.connected == ["127.0.0.1:40001"]
 
 
-def test_nothing_is_reached_before_the_emulator_listens(file: Path) -> None:
+def test_translator_connects_only_once_the_emulator_listens(file: Path) -> None:
     vendor = Vendor()
     with pytest.raises(ControllerLost, match="not started"):
         reach(file, vendor)
@@ -77,7 +79,7 @@ def test_nothing_is_reached_before_the_emulator_listens(file: Path) -> None:
     assert vendor.connected == []
 
 
-def test_the_address_of_an_emulator_that_was_killed_is_worth_nothing(file: Path) -> None:
+def test_address_of_a_killed_emulator_is_not_used(file: Path) -> None:
     command = [sys.executable, "-c", TELLS, str(file), RUN]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as emulator:
         assert emulator.stdout is not None
@@ -93,7 +95,7 @@ def test_the_address_of_an_emulator_that_was_killed_is_worth_nothing(file: Path)
     assert vendor.connected == ["127.0.0.1:1234"]
 
 
-def test_the_emulator_of_another_run_is_not_this_run_s(file: Path) -> None:
+def test_emulator_of_another_run_is_not_used(file: Path) -> None:
     vendor = Vendor()
     with closing(AddressNotice(file, "another")) as notice:
         notice.tell("127.0.0.1:40001")
@@ -102,9 +104,7 @@ def test_the_emulator_of_another_run_is_not_this_run_s(file: Path) -> None:
     assert vendor.connected == []
 
 
-def test_one_that_has_let_go_of_its_address_proves_nothing_until_it_is_reached_again(
-    file: Path, notice: AddressNotice
-) -> None:
+def test_emulator_that_closed_its_address_fails_the_proof_until_reconnected(file: Path, notice: AddressNotice) -> None:
     notice.tell("127.0.0.1:40001")
     reached = reach(file, Vendor())
     notice.tell("")
@@ -124,7 +124,7 @@ def test_a_connection_that_was_made_while_the_emulator_changed_is_closed(file: P
     assert vendor.connected == ["127.0.0.1:40001", "closed"]
 
 
-def test_what_is_called_simulated_commands_no_controller_that_proves_nothing() -> None:
+def test_simulated_experiment_commands_no_unproved_controller() -> None:
     with pytest.raises(ConfigError, match="nothing proves"):
         wired_to(Launch("microscope", simulated=True), Vendor())  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="has no controller_at"):

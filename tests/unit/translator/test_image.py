@@ -17,7 +17,7 @@ SIZE_M = (2e-6, 1.5e-6)
 
 
 def heights() -> np.ndarray:
-    """Smooth, and like itself neither mirrored nor turned, [y, x]."""
+    """A smooth surface without mirror or rotation symmetry, [y, x]."""
     y, x = np.mgrid[0:48, 0:64] / 64.0
     return np.asarray(40e-9 * (x**2 + 0.4 * np.sin(5 * y) + 0.2 * np.sin(9 * x * y)))
 
@@ -60,9 +60,7 @@ def settings(picture: Path) -> dict[str, Any]:
     return {"file": picture, "width": SIZE_M[0], "height": height}
 
 
-def test_the_whole_of_it_is_the_picture_neither_mirrored_nor_turned(
-    picture: Path, tmp_path: Path, fake_clock: Any
-) -> None:
+def test_whole_scan_is_the_picture_neither_mirrored_nor_turned(picture: Path, tmp_path: Path, fake_clock: Any) -> None:
     size_m = (SIZE_M[0], SIZE_M[0] * 47 / 63)
     whole = frame(-size_m[0] / 2, -size_m[1] / 2, size_m, (48, 64))
     scan = scanned(ImageMicroscope(**settings(picture), initial=whole), tmp_path, fake_clock)
@@ -70,7 +68,7 @@ def test_the_whole_of_it_is_the_picture_neither_mirrored_nor_turned(
     assert np.std(wrong) < 0.005 * np.ptp(heights())
 
 
-def test_a_detail_is_where_it_is_in_the_picture(picture: Path, tmp_path: Path, fake_clock: Any) -> None:
+def test_detail_is_at_its_place_in_the_picture(picture: Path, tmp_path: Path, fake_clock: Any) -> None:
     pixel_m = SIZE_M[0] / 63
     left_m, low_m = -SIZE_M[0] / 2 + 32 * pixel_m, -47 / 2 * pixel_m + 20 * pixel_m
     detail = frame(left_m, low_m, (15 * pixel_m, 11 * pixel_m), (12, 16))
@@ -80,7 +78,7 @@ def test_a_detail_is_where_it_is_in_the_picture(picture: Path, tmp_path: Path, f
     assert np.std(wrong) < 0.01 * np.ptp(expected)
 
 
-def test_what_it_is_asked_to_do_worse_it_does(picture: Path, tmp_path: Path, fake_clock: Any) -> None:
+def test_picture_may_be_degraded_by_settings(picture: Path, tmp_path: Path, fake_clock: Any) -> None:
     noisy = ImageMicroscope(
         **settings(picture), noise={"white_m": 5e-9}, initial=frame(-1e-6, 0, (2e-6, 1e-9), (8, 64))
     )
@@ -93,6 +91,6 @@ def test_a_picture_without_a_scale_is_refused(picture: Path) -> None:
         ImageMicroscope(picture)
 
 
-def test_a_file_that_is_none_is_refused_before_anything_runs(tmp_path: Path) -> None:
+def test_missing_file_is_refused_before_the_start(tmp_path: Path) -> None:
     with pytest.raises(FileError, match="no such file"):
         ImageMicroscope(tmp_path / "missing.sxm")

@@ -1,4 +1,4 @@
-"""Lines of a running scan, published while it goes on."""
+"""Lines of a running scan, published during the scan."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def published(bench: Any) -> list[ScanLines]:
     return [thing for name, thing, _ in packets if name == "ScanLines"]
 
 
-def test_new_lines_are_published_as_often_as_was_asked(live: Any) -> None:
+def test_new_lines_are_published_at_the_set_period(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
     live.there = 3
     live.look(0.5)
@@ -77,7 +77,7 @@ def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
     assert again.began_ns == began_ns + 3_000_000_000
 
 
-def test_they_are_not_kept_for_who_comes_later(live: Any) -> None:
+def test_lines_are_not_cached_for_late_joiners(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
     live.heard()
     live.there = 8
@@ -86,13 +86,13 @@ def test_they_are_not_kept_for_who_comes_later(live: Any) -> None:
     assert published(live)
 
 
-def test_a_line_is_looked_for_at_its_time(live: Any) -> None:
+def test_lines_are_read_when_due(live: Any) -> None:
     live.ask(ControlRequest.ACTION, names.START_SCAN)
     live.look(0.99)
     assert live.translator.wait_s() <= 0.0101
 
 
-def test_without_being_asked_for_a_controller_is_not_asked(make_bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lines_are_not_read_without_the_setting(make_bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = make_bench()
     monkeypatch.setattr(type(bench.microscope), "lines", lambda self, start: pytest.fail("it is asked"), raising=False)
     bench.ask(ControlRequest.ACTION, names.START_SCAN)
@@ -100,7 +100,7 @@ def test_without_being_asked_for_a_controller_is_not_asked(make_bench: Any, monk
         bench.look(1.0)
 
 
-def test_a_microscope_that_has_none_says_so(make_bench: Any) -> None:
+def test_driver_without_lines_refuses_the_setting(make_bench: Any) -> None:
     with pytest.raises(ConfigError, match="does not publish lines"):
         make_bench({"live_lines_s": 1.0})
 

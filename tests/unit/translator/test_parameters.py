@@ -29,13 +29,13 @@ TABLE = ParameterTable({}).extended(
 
 
 @given(st.floats(1.0, 10_000.0), st.sampled_from([("nm", 1.0), ("um", 1e-3), ("m", 1e-9), ("Å", 10.0)]))
-def test_a_value_comes_back_from_the_controller_as_it_was_asked_for(number: float, unit: tuple[str, float]) -> None:
+def test_value_is_read_back_as_it_was_set(number: float, unit: tuple[str, float]) -> None:
     spec = TABLE["scan-size-x"]
     given_number = min(max(number * unit[1], unit[1] * 1.0000001), unit[1] * 9999.999)
     value = spec.parse(repr(given_number), unit[0])
     back = spec.from_vendor(spec.to_vendor(value))
     assert spec.same(back, value)
-    assert float(spec.told(back, unit[0])[0]) == pytest.approx(given_number, rel=1e-14)
+    assert float(spec.for_peer(back, unit[0])[0]) == pytest.approx(given_number, rel=1e-14)
 
 
 @given(st.text(max_size=20), st.one_of(st.none(), st.text(max_size=10)))
@@ -57,18 +57,18 @@ def _parsed(spec: ParameterSpec, text: str, unit: str | None) -> tuple[Value | N
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e308])
-def test_numbers_that_are_none_are_refused(value: float) -> None:
+def test_malformed_numbers_are_refused(value: float) -> None:
     for name in ("scan-size-x", "scan-angle", "scan-resolution-x"):
         with pytest.raises(Refused):
             TABLE[name].checked(value)
 
 
-def test_angles_are_degrees_unless_said_otherwise_and_may_run_the_other_way() -> None:
+def test_angles_default_to_degrees_and_may_have_the_opposite_sign() -> None:
     spec = TABLE["scan-angle"]
     assert spec.parse("90") == pytest.approx(math.pi / 2)
     assert spec.parse("1.5", "rad") == 1.5
     assert spec.to_vendor(math.pi / 2) == pytest.approx(-90)
-    assert spec.told(math.pi / 2) == ("90", "deg")
+    assert spec.for_peer(math.pi / 2) == ("90", "deg")
 
 
 def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:
@@ -79,7 +79,7 @@ def test_an_experiment_file_changes_single_attributes_of_a_row() -> None:
 
 
 @pytest.mark.parametrize("microscope", [Asylum, Gxsm, Nanonis])
-def test_how_the_controller_has_what_code_translates_is_not_a_rows_to_say(microscope: type[Driver]) -> None:
+def test_row_can_not_change_a_parameter_translated_by_code(microscope: type[Driver]) -> None:
     narrow = microscope.parameter_table({"scan-angle": {"range": ["-90 deg", "90 deg"]}})
     assert narrow["scan-angle"].range[1] == pytest.approx(math.pi / 2)
     for row in ({"sign": -1}, {"vendor": "Rotation"}):
@@ -91,7 +91,7 @@ def test_how_the_controller_has_what_code_translates_is_not_a_rows_to_say(micros
     assert without_vendor <= set(microscope.translated)
 
 
-def test_a_file_that_is_no_table_is_said_with_its_name(tmp_path: Path) -> None:
+def test_malformed_table_is_reported_with_its_file(tmp_path: Path) -> None:
     (tmp_path / "parameters.toml").write_text("[parameters\n")
     with pytest.raises(ConfigError, match=r"parameters\.toml"):
         ParameterTable.from_toml(tmp_path / "parameters.toml")
@@ -103,14 +103,14 @@ def test_the_simulator_has_every_base_parameter_and_the_right_unit_for_its_mode(
     assert Simulator(surface="lattice").table[names.ZCTRL_SETPOINT].unit == "A"
 
 
-def test_the_setpoint_of_a_current_is_in_si_whatever_the_controller_has() -> None:
+def test_setpoint_of_a_current_is_in_si_for_any_unit_of_the_controller() -> None:
     row = ParameterTable.from_toml(Gxsm.parameters_file)[names.ZCTRL_SETPOINT]
     assert (row.unit, row.si_unit) == ("nA", "A")
     assert row.parse("500", "pA") == pytest.approx(5e-10)
     assert row.to_vendor(5e-10) == pytest.approx(0.5)
 
 
-def test_the_simulators_faults_are_those_that_can_be_demanded() -> None:
+def test_faults_of_the_simulator_equal_the_ones_that_can_be_demanded() -> None:
     assert Simulator(fault_action=True).table["x-fault-kind"].choices == tuple(FAULT_KINDS)
 
 
@@ -127,6 +127,6 @@ def test_the_simulators_faults_are_those_that_can_be_demanded() -> None:
         {"panel": [{"at_s": 1.0, "action": "x-dance"}]},
     ],
 )
-def test_settings_of_the_simulator_that_cannot_be_are_refused(settings: dict[str, object]) -> None:
+def test_impossible_settings_of_the_simulator_are_refused(settings: dict[str, object]) -> None:
     with pytest.raises((ConfigError, TypeError)):
         Simulator(**settings)  # type: ignore[arg-type]

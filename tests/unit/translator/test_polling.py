@@ -1,4 +1,4 @@
-"""How often a controller is looked at."""
+"""The time between two looks at a controller."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ IDLE_S = 0.25
 
 
 def looks(pace: AdaptivePolling, began_s: float, end_s: float) -> tuple[int, float]:
-    """How often the controller is looked at while it measures, and how late the end is noticed."""
+    """Return the number of looks during a measurement, and the delay in noticing its end."""
     now_s, count = began_s, 0
     while now_s < end_s:
         now_s += pace.wait_s(now_s)
@@ -20,12 +20,12 @@ def looks(pace: AdaptivePolling, began_s: float, end_s: float) -> tuple[int, flo
     return count, now_s - end_s
 
 
-def test_at_rest_it_is_looked_at_seldom() -> None:
+def test_polling_is_rare_at_rest() -> None:
     assert AdaptivePolling(IDLE_S).wait_s(5.0) == IDLE_S
 
 
 @pytest.mark.parametrize("error_s", [-0.3, -0.04, 0.0, 0.04, 0.3])
-def test_the_second_scan_of_a_kind_is_noticed_at_once_for_few_looks(error_s: float) -> None:
+def test_end_of_the_second_equal_scan_is_noticed_at_once_with_few_looks(error_s: float) -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.ended(100.0, as_expected=True)
@@ -35,7 +35,7 @@ def test_the_second_scan_of_a_kind_is_noticed_at_once_for_few_looks(error_s: flo
     assert count < 550  # at the eager rate all along it would be 10000
 
 
-def test_another_frame_is_expected_by_what_its_settings_say_and_by_how_wrong_that_was() -> None:
+def test_duration_of_another_frame_is_predicted_from_settings_and_earlier_errors() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0, guess_s=100.0)
     pace.ended(125.0, as_expected=True)  # this controller turns round slowly
@@ -46,20 +46,20 @@ def test_another_frame_is_expected_by_what_its_settings_say_and_by_how_wrong_tha
 
 
 @pytest.mark.parametrize("lasts_s", [70.0, 100.0, 130.0])
-def test_the_first_is_looked_at_eagerly_as_long_as_the_guess_may_be_wrong(lasts_s: float) -> None:
+def test_first_scan_is_polled_eagerly_within_the_uncertainty_of_the_guess(lasts_s: float) -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0, guess_s=100.0)
     assert pace.wait_s(1.0) == IDLE_S
     assert looks(pace, 0.0, lasts_s)[1] <= EAGER_S + 1e-9
 
 
-def test_what_nothing_is_known_of_is_looked_at_eagerly() -> None:
+def test_unknown_measurement_is_polled_eagerly() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     assert {pace.wait_s(t_s) for t_s in (0.0, 10.0, 1000.0)} == {EAGER_S}
 
 
-def test_what_takes_far_longer_than_expected_is_looked_at_less_and_less() -> None:
+def test_overdue_measurement_is_polled_ever_less() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.ended(10.0, as_expected=True)
@@ -69,7 +69,7 @@ def test_what_takes_far_longer_than_expected_is_looked_at_less_and_less() -> Non
     assert (waits[0], waits[-1]) == (EAGER_S, IDLE_S)
 
 
-def test_what_was_broken_off_teaches_nothing() -> None:
+def test_interrupted_measurement_is_not_learned_from() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.ended(1.0, as_expected=False)
@@ -77,7 +77,7 @@ def test_what_was_broken_off_teaches_nothing() -> None:
     assert pace.wait_s(11.0) == EAGER_S
 
 
-def test_a_file_that_comes_late_is_waited_for_eagerly_and_makes_no_scan_longer() -> None:
+def test_late_file_is_polled_eagerly_and_does_not_count_as_scan_time() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.began("a", 0.0)
     pace.over(100.0)
@@ -89,7 +89,7 @@ def test_a_file_that_comes_late_is_waited_for_eagerly_and_makes_no_scan_longer()
     assert pace.wait_s(304.0) == IDLE_S
 
 
-def test_a_move_is_looked_at_eagerly_at_first() -> None:
+def test_move_is_polled_eagerly_at_first() -> None:
     pace = AdaptivePolling(IDLE_S)
     pace.moved(10.0)
     assert [pace.wait_s(t_s) for t_s in (10.0, 11.0, 20.0)] == [EAGER_S, pytest.approx(0.1), IDLE_S]
@@ -98,7 +98,7 @@ def test_a_move_is_looked_at_eagerly_at_first() -> None:
 
 
 @pytest.mark.parametrize("change", [lambda pace: pace.began("a", 0.0), lambda pace: pace.moved(0.0)])
-def test_it_is_never_more_eager_than_the_period_that_was_set(change: Callable[[AdaptivePolling], None]) -> None:
+def test_polling_is_never_faster_than_the_period(change: Callable[[AdaptivePolling], None]) -> None:
     pace = AdaptivePolling(0.001)
     change(pace)
     assert pace.wait_s(0.0) == 0.001

@@ -1,4 +1,4 @@
-"""Whatever a controller does and however late it is looked at, peers hear whole stories."""
+"""Peers see complete sequences of states, at any time of looking and any behaviour of the controller."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def test_a_measurement_ends_with_its_results_or_as_interrupted_and_with_nothing_
                 said, delivered = step.status.state, False
             else:
                 assert isinstance(step, DiscardResults | LogError)
-        assert said is sequence.said.state
+        assert said is sequence.published.state
 
 
 @given(st.lists(LOOKS, max_size=20))
-def test_a_controller_that_comes_to_rest_is_told_as_free(looks: list[tuple[ScopeState, bool, float]]) -> None:
+def test_controller_at_rest_is_published_as_free(looks: list[tuple[ScopeState, bool, float]]) -> None:
     sequence = StatusSequence(ScopeStatus(ScopeState.UNDEFINED), result_timeout_s=10.0)
     now_s = 0.0
     for state, results, after_s in looks:
@@ -53,17 +53,17 @@ def test_a_controller_that_comes_to_rest_is_told_as_free(looks: list[tuple[Scope
     for _ in range(3):
         now_s += 11.0
         sequence.observe(ScopeStatus(ScopeState.FREE), False, now_s)
-    assert sequence.said.state is ScopeState.FREE
+    assert sequence.published.state is ScopeState.FREE
 
 
-def test_the_deadline_is_told_while_something_is_waited_for() -> None:
+def test_deadline_exists_while_a_result_is_awaited() -> None:
     sequence = StatusSequence(ScopeStatus(ScopeState.SCANNING), result_timeout_s=10.0)
     assert sequence.deadline_s() is None
     assert sequence.observe(ScopeStatus(ScopeState.FREE), False, 5.0) == []
     assert sequence.deadline_s() == 15.0
 
 
-def test_what_somebody_begins_after_something_was_broken_off_is_another_story() -> None:
+def test_measurement_begun_at_the_panel_after_an_interruption_is_published_separately() -> None:
     sequence = StatusSequence(ScopeStatus(ScopeState.SPEC), result_timeout_s=10.0)
     broken_off, scanning = ScopeStatus(ScopeState.INTERRUPTED), ScopeStatus(ScopeState.SCANNING)
     assert sequence.observe(broken_off, False, 1.0) == [PublishStatus(broken_off)]
@@ -71,7 +71,7 @@ def test_what_somebody_begins_after_something_was_broken_off_is_another_story() 
     assert sequence.observe(scanning, False, 3.0) == [DiscardResults(), PublishStatus(scanning)]
 
 
-def test_a_measurement_that_another_one_followed_is_a_story_of_its_own() -> None:
+def test_measurement_followed_at_once_by_another_is_published_separately() -> None:
     scanning, free = ScopeStatus(ScopeState.SCANNING), ScopeStatus(ScopeState.FREE)
     for is_whole, end in (
         (True, [PublishResults(), PublishStatus(free)]),

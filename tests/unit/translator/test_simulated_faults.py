@@ -1,4 +1,4 @@
-"""Faults of the simulated microscope that its driver has, without a process."""
+"""Faults of the simulated microscope, without a process."""
 
 from __future__ import annotations
 

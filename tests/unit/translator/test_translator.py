@@ -1,4 +1,4 @@
-"""What a translator says and publishes (wire format, "What a translator does, and in which order peers see it")."""
+"""The answers and packets of a translator (wire format, "What a translator does, and in which order peers see it")."""
 
 from __future__ import annotations
 
@@ -50,18 +50,18 @@ def test_at_the_start_everything_in_force_is_published(make_bench: Any) -> None:
     assert make_bench().heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
 
 
-def test_a_scheduler_that_comes_is_told_everything_again(bench: Any) -> None:
+def test_everything_is_published_again_for_a_new_scheduler(bench: Any) -> None:
     bench.translator.handle(SubscriberJoined())
     assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
 
 
-def test_nothing_new_is_not_published(bench: Any) -> None:
+def test_unchanged_values_are_not_published(bench: Any) -> None:
     for _ in range(5):
         bench.look()
     assert bench.heard() == []
 
 
-def test_a_scan_is_told_as_scanning_all_channels_free(bench: Any, scan: Any) -> None:
+def test_scan_is_published_as_scanning_all_channels_free(bench: Any, scan: Any) -> None:
     assert bench.ask(ACTION, names.START_SCAN).code == OK
     assert bench.heard() == ["SCANNING"]
     bench.look()
@@ -72,7 +72,7 @@ def test_a_scan_is_told_as_scanning_all_channels_free(bench: Any, scan: Any) -> 
     assert bench.heard() == ["Scan2d", "Scan2d", "FREE"]
 
 
-def test_a_scan_that_is_over_before_it_was_seen_is_told_as_a_whole(bench: Any, scan: Any) -> None:
+def test_scan_over_before_a_look_is_published_as_a_whole(bench: Any, scan: Any) -> None:
     def at_once() -> None:
         bench.microscope.files["a"] = [scan()]
 
@@ -133,7 +133,7 @@ def switched(bench: Any, to: str) -> None:
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retracted_when_the_run_is_stopped(
+def test_tip_is_retracted_at_a_stop_if_a_request_has_switched_the_feedback_off(
     bench: Any, caplog: pytest.LogCaptureFixture, killed: bool
 ) -> None:
     switched(bench, "false")
@@ -146,11 +146,11 @@ def test_without_the_feedback_that_a_request_has_switched_off_the_tip_is_retract
 
 
 class Killed(BaseException):
-    """The process, just here."""
+    """Ends the process right here."""
 
 
 @pytest.mark.parametrize("answered", [False, True])
-def test_one_that_is_killed_while_it_switches_the_feedback_off_does_not_leave_that_to_nobody(
+def test_translator_killed_while_switching_the_feedback_off_retracts_after_its_restart(
     bench: Any, monkeypatch: pytest.MonkeyPatch, answered: bool
 ) -> None:
     set_ = bench.microscope.set
@@ -176,7 +176,9 @@ def broken(*_: Any) -> Any:
 
 
 @pytest.mark.parametrize("what", ["status", "load"])
-def test_the_way_out_is_open_whatever_else_is_wrong(bench: Any, monkeypatch: pytest.MonkeyPatch, what: str) -> None:
+def test_retract_works_although_the_state_can_not_be_read(
+    bench: Any, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
     switched(bench, "false")
     bench.microscope.files["one.dat"] = []
     monkeypatch.setattr(bench.microscope, what, broken)
@@ -186,7 +188,7 @@ def test_the_way_out_is_open_whatever_else_is_wrong(bench: Any, monkeypatch: pyt
     assert bench.microscope.done == ["retract"]
 
 
-def test_what_has_connected_to_retract_the_tip_does_not_connect_twice(bench: Any) -> None:
+def test_retract_that_connects_does_not_connect_twice(bench: Any) -> None:
     microscope = bench.microscope
     microscope.lost = True
     bench.look()
@@ -197,9 +199,7 @@ def test_what_has_connected_to_retract_the_tip_does_not_connect_twice(bench: Any
     assert bench.heard()[-1] == "FREE"
 
 
-def test_the_way_out_is_tried_on_a_new_connection_after_one_that_was_lost_on_it(
-    bench: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_retract_is_retried_on_a_new_connection(bench: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     microscope = bench.microscope
     microscope.lost = True
     bench.look()
@@ -216,7 +216,7 @@ def unplugged(*_: Any) -> Any:
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_again(
+def test_retract_at_a_stop_is_retried_if_the_controller_is_lost_or_refuses(
     bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
 ) -> None:
     switched(bench, "false")
@@ -233,10 +233,10 @@ def test_a_controller_that_is_lost_or_refuses_when_the_run_is_stopped_is_asked_a
 
 
 @pytest.mark.parametrize("ends", [ScopeState.FREE, ScopeState.INTERRUPTED, ScopeState.COARSE_MOTOR])
-def test_a_run_that_is_stopped_ends_when_the_tip_is_seen_to_be_away(
+def test_stopped_run_ends_once_the_tip_is_observed_away(
     bench: Any, caplog: pytest.LogCaptureFixture, ends: ScopeState
 ) -> None:
-    """What a controller was told it may not have heard yet."""
+    """A controller may not have read the command yet."""
     bench.microscope.retracts_slowly = True
     switched(bench, "false")
 
@@ -251,7 +251,7 @@ def test_a_run_that_is_stopped_ends_when_the_tip_is_seen_to_be_away(
     assert ("it is not certain that the tip was retracted" in caplog.text) == (not is_away)
 
 
-def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(bench: Any) -> None:
+def test_tip_stays_if_the_feedback_is_on_or_was_switched_off_at_the_panel(bench: Any) -> None:
     def left() -> list[str]:
         assert bench.run_to_the_end(ParentGone()) == ExitCode.ORPHAN
         done, bench.microscope.done = bench.microscope.done, []
@@ -288,16 +288,14 @@ def test_the_tip_stays_where_the_feedback_is_on_or_was_switched_off_by_others(be
     assert left() == []
 
 
-def test_a_scheduler_that_has_ended_the_experiment_has_seen_to_the_tip(bench: Any) -> None:
+def test_tip_is_not_retracted_after_the_scheduler_ended_the_experiment(bench: Any) -> None:
     switched(bench, "false")
     assert bench.run_to_the_end(ParentGone(), RequestReceived([wire.CLOSE])) == ExitCode.ENDED
     assert bench.microscope.done == []
 
 
 @pytest.mark.parametrize("lost", [False, True])
-def test_that_a_tip_without_feedback_can_not_be_retracted_is_critical(
-    bench: Any, caplog: pytest.LogCaptureFixture, lost: bool
-) -> None:
+def test_failed_retract_without_feedback_is_critical(bench: Any, caplog: pytest.LogCaptureFixture, lost: bool) -> None:
     switched(bench, "false")
     bench.microscope.lost = lost
     bench.microscope.lacking = {names.RETRACT: "it has no coarse motor"}
@@ -337,13 +335,13 @@ def test_a_frame_is_set_as_moving_the_frame_once_free(bench: Any) -> None:
     assert (bench.microscope.values["NX"], bench.microscope.values["NY"]) == (32, 16)
 
 
-def test_the_frame_that_is_in_force_already_is_told_once(bench: Any) -> None:
+def test_frame_in_force_already_is_published_once(bench: Any) -> None:
     same = ScanParameters(Region.from_top_left((0.0, 0.0), (1e-6, 0.5e-6)), (4, 8))
     assert bench.ask(FRAME, same).code == OK
     assert bench.heard() == ["MOVING", "ScanParameters2d", "FREE"]
 
 
-def test_a_move_that_takes_time_ends_when_the_controller_says_so(bench: Any) -> None:
+def test_long_move_ends_when_the_controller_reports_it(bench: Any) -> None:
     bench.microscope.state = ScopeState.MOVING
     bench.look()
     assert bench.heard() == ["MOVING"]
@@ -353,7 +351,7 @@ def test_a_move_that_takes_time_ends_when_the_controller_says_so(bench: Any) -> 
     assert bench.heard() == ["FREE", "MOVING", "ProbePosition", "FREE"]
 
 
-def test_only_what_is_present_is_set(bench: Any) -> None:
+def test_only_fields_in_the_message_are_set(bench: Any) -> None:
     message = scan_pb2.ScanParameters2d()
     message.spatial.roi.size.y = 250.0
     message.spatial.length_units = "nm"
@@ -365,7 +363,7 @@ def test_only_what_is_present_is_set(bench: Any) -> None:
     assert (bench.microscope.values["Setpoint"], bench.microscope.values["Loop"]) == (1.0, True)
 
 
-def test_feedback_is_switched_off_and_told(bench: Any) -> None:
+def test_feedback_is_switched_off_and_published(bench: Any) -> None:
     assert bench.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(on=False)).code == OK
     assert bench.microscope.values["Loop"] is False
     assert bench.port.packets[-1][1].on is False
@@ -373,7 +371,7 @@ def test_feedback_is_switched_off_and_told(bench: Any) -> None:
     assert bench.microscope.values["Loop"] is True
 
 
-def test_feedback_goes_on_after_all_else_and_off_before(bench: Any, monkeypatch: Any) -> None:
+def test_feedback_is_switched_on_last_and_off_first(bench: Any, monkeypatch: Any) -> None:
     plain, order = bench.microscope.set, []
 
     def noted(given: Any) -> None:
@@ -400,7 +398,7 @@ def test_a_change_at_the_panel_is_published_once(bench: Any) -> None:
     assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters"]
 
 
-def test_parameters_are_told_in_the_unit_that_was_asked_in(bench: Any) -> None:
+def test_parameters_are_answered_in_the_unit_of_the_request(bench: Any) -> None:
     assert told(bench.ask(PARAM, Parameter("scan-speed"))) == ("1e-06", "m/s")
     assert told(bench.ask(PARAM, Parameter("scan-speed", "1500.0", "nm/s"))) == ("1500", "nm/s")
     assert bench.microscope.values["Speed"] == 1.5
@@ -432,7 +430,7 @@ def test_parameters_are_told_in_the_unit_that_was_asked_in(bench: Any) -> None:
         ("x-mode", "I" * 1000, None),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_with_a_reason_and_changes_nothing(
+def test_impossible_value_is_refused_with_a_reason_and_changes_nothing(
     bench: Any, name: str, value: str, unit: str | None
 ) -> None:
     before = dict(bench.microscope.values)
@@ -464,7 +462,7 @@ def test_the_reason_names_value_limit_and_where_it_was_set(bench: Any) -> None:
     assert reason == "scan-speed: 200 µm/s is outside 0.001 µm/s to 100 µm/s (set in parameters.toml)"
 
 
-def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(bench: Any) -> None:
+def test_value_changed_by_the_controller_is_refused_and_restored(bench: Any) -> None:
     bench.microscope.stuck = {"Speed": 3.0}
     response = bench.ask(PARAM, Parameter("scan-speed", "5", "um/s"))
     assert response.code == PARAM_ERROR
@@ -473,7 +471,7 @@ def test_what_the_controller_makes_something_else_of_is_refused_and_put_back(ben
     assert bench.ask(PARAM, Parameter("scan-speed", "5", "um/s")).code == OK
 
 
-def test_what_follows_in_the_rest_of_the_frame_is_refused_and_put_back(bench: Any, monkeypatch: Any) -> None:
+def test_change_in_the_rest_of_the_frame_is_refused_and_restored(bench: Any, monkeypatch: Any) -> None:
     plain, values = bench.microscope.set, bench.microscope.values
 
     def square(given: Any) -> None:
@@ -490,7 +488,7 @@ def test_what_follows_in_the_rest_of_the_frame_is_refused_and_put_back(bench: An
     assert (values["W"], values["H"]) == (1000.0, 500.0)
 
 
-def test_while_scanning_only_what_disturbs_is_refused(bench: Any) -> None:
+def test_only_disturbing_requests_are_refused_during_a_scan(bench: Any) -> None:
     bench.ask(ACTION, names.START_SCAN)
     assert bench.ask(ACTION, names.START_SCAN).code == NOT_FREE
     assert bench.ask(ACTION, names.START_SPEC).code == NOT_FREE
@@ -546,7 +544,7 @@ def test_errors_of_a_controller_become_responses_with_their_reason(bench: Any) -
     assert "E42" in bench.ask(PARAM, Parameter("scan-speed", "2", "um/s")).reason
 
 
-def test_a_controller_that_is_gone_is_said_and_found_again(bench: Any) -> None:
+def test_lost_controller_is_logged_and_reconnected(bench: Any) -> None:
     bench.microscope.lost = True
     bench.look()
     assert bench.heard() == ["UNDEFINED"]
@@ -557,7 +555,7 @@ def test_a_controller_that_is_gone_is_said_and_found_again(bench: Any) -> None:
     assert bench.heard() == ["ScanParameters2d", "ZCtrlParameters", "ProbePosition", "FREE"]
 
 
-def test_a_controller_that_was_never_there_is_said_once(make_bench: Any, tmp_path: Any) -> None:
+def test_missing_controller_is_logged_once(make_bench: Any, tmp_path: Any) -> None:
     bench = make_bench()
     bench.microscope.lost = True
     bench.start()
@@ -570,7 +568,7 @@ def test_a_controller_that_was_never_there_is_said_once(make_bench: Any, tmp_pat
 
 
 @pytest.mark.parametrize("error", [ValueError("0x1f"), KeyError("status"), WireError("a reply to another question")])
-def test_a_controller_that_says_what_cannot_be_is_not_trusted_until_it_makes_sense(bench: Any, error: Any) -> None:
+def test_controller_with_impossible_values_is_lost_until_they_are_valid(bench: Any, error: Any) -> None:
     bench.microscope.confused = error
     bench.look()
     assert bench.heard() == ["UNDEFINED"]
@@ -582,7 +580,7 @@ def test_a_controller_that_says_what_cannot_be_is_not_trusted_until_it_makes_sen
     assert bench.ask(ACTION, names.START_SCAN).code == OK
 
 
-def test_a_controller_found_confused_by_a_request_does_nothing_of_it(bench: Any) -> None:
+def test_request_to_a_controller_with_impossible_values_is_not_executed(bench: Any) -> None:
     bench.microscope.confused = ValueError("0x1f")
     response = bench.ask(ACTION, names.START_SCAN)
     assert (response.code, bench.microscope.done) == (ControlResponse.NO_RESPONSE, [])
@@ -636,13 +634,13 @@ def test_a_request_that_was_done_before_the_controller_was_lost_stays_a_success(
 
 
 @pytest.mark.parametrize(("vendor", "value"), [("X", math.nan), ("P", math.inf), ("Loop", math.nan), ("W", "wide")])
-def test_a_value_that_cannot_be_is_never_published(bench: Any, vendor: str, value: Any) -> None:
+def test_impossible_value_is_never_published(bench: Any, vendor: str, value: Any) -> None:
     bench.microscope.values[vendor] = value
     bench.look()
     assert bench.heard() == ["UNDEFINED"]
 
 
-def test_settings_with_which_it_can_never_be_connected_end_the_process(make_bench: Any) -> None:
+def test_settings_that_prevent_any_connection_end_the_process(make_bench: Any) -> None:
     bench = make_bench()
     bench.microscope.connect = lambda: (_ for _ in ()).throw(ConfigError("no such release"))
     with pytest.raises(ConfigError):
@@ -651,7 +649,7 @@ def test_settings_with_which_it_can_never_be_connected_end_the_process(make_benc
 
 def test_the_end_of_a_scan_is_looked_for_eagerly_by_its_state_alone(bench: Any, scan: Any) -> None:
     def measure(number: int) -> list[float]:
-        """Looks as the translator wants to; returns the pauses between them."""
+        # returns the pauses between the looks
         bench.ask(ACTION, names.START_SCAN)
         waits = []
         for _ in range(4000):
@@ -694,7 +692,7 @@ def test_actions_and_parameters_of_the_experiment_file(make_bench: Any) -> None:
     assert bench.microscope.done == ["BEEP 3"]
 
 
-def test_what_an_action_sets_is_published_before_it_is_answered(make_bench: Any) -> None:
+def test_settings_of_an_action_are_published_before_its_answer(make_bench: Any) -> None:
     bench = make_bench({"actions": {"x-soft": {"set": {"zctrl-setpoint": "2 nA"}}, "x-beep": {"command": "BEEP"}}})
     bench.heard()
     order: list[str] = []
@@ -710,7 +708,7 @@ def test_what_an_action_sets_is_published_before_it_is_answered(make_bench: Any)
 BEEP = {"set": {"tip-bias-voltage": "4 V", "x-mode": "force"}, "command": "BEEP 3", "for": "50 ms"}
 
 
-def test_an_action_may_put_values_in_force_for_a_while(make_bench: Any) -> None:
+def test_action_may_set_values_for_a_limited_time(make_bench: Any) -> None:
     bench = make_bench({"actions": {"x-pulse": BEEP}})
     microscope, before = bench.microscope, dict(bench.microscope.values)
     assert bench.ask(ACTION, "x-pulse").code == OK
@@ -729,7 +727,7 @@ def test_an_action_may_put_values_in_force_for_a_while(make_bench: Any) -> None:
 
 
 @pytest.mark.parametrize("how", ["killed", "lost", "ended", "orphaned"])
-def test_what_was_in_force_for_a_while_is_put_back_come_what_may(make_bench: Any, how: str) -> None:
+def test_temporary_values_are_restored_after_a_kill_a_loss_or_the_end(make_bench: Any, how: str) -> None:
     bench = make_bench({"actions": {"x-pulse": BEEP}})
     microscope, before = bench.microscope, dict(bench.microscope.values)
     assert bench.ask(ACTION, "x-pulse").code == OK
@@ -760,7 +758,7 @@ def test_an_action_that_can_not_be_set_changes_nothing_and_is_over(make_bench: A
 
 @pytest.mark.parametrize(("name", "value"), [("x-serial", "007"), ("zctrl-pgain", "1000"), ("x-mode", "of the panel")])
 def test_an_unchanged_value_that_can_not_be_set_is_no_change(bench: Any, name: str, value: str) -> None:
-    """Read only, or put there at the panel beyond what may be asked for."""
+    """The value is read-only, or was set at the panel beyond the limits for requests."""
     vendor = {"x-serial": "Serial", "zctrl-pgain": "P", "x-mode": "Mode"}[name]
     bench.microscope.values[vendor] = value if vendor != "P" else 1000.0
     calls = bench.microscope.set_calls
@@ -793,7 +791,7 @@ def test_a_whole_message_may_be_sent_back_with_one_field_changed(make_bench: Any
         {"parameters": {"scan-speed": {"type": "complex"}}},
     ],
 )
-def test_settings_that_cannot_be_are_found_at_the_start(make_bench: Any, settings: dict[str, Any]) -> None:
+def test_impossible_settings_are_found_at_the_start(make_bench: Any, settings: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         make_bench(settings)
 
@@ -832,16 +830,16 @@ def test_a_request_that_was_refused_may_be_asked_again(bench: Any) -> None:
     assert bench.microscope.done == ["scan"]
 
 
-def test_a_restarted_translator_does_not_repeat_what_was_done(bench: Any) -> None:
+def test_restarted_translator_does_not_repeat_requests(bench: Any) -> None:
     bench.ask(ACTION, names.START_SCAN, "me/1/1")
     bench.start()
     assert bench.ask(ACTION, names.START_SCAN, "me/1/1").code == OK
     assert bench.microscope.done == ["scan"]
 
 
-def test_what_a_kill_left_half_done_is_not_done_again(bench: Any) -> None:
+def test_request_interrupted_by_a_kill_is_not_repeated(bench: Any) -> None:
     request = wire.decode_request(wire.encode_request(_request("me/1/1")))
-    bench.translator.requests._about_to_act(request)  # killed right here
+    bench.translator.requests._record_begin(request)  # killed right here
     bench.start()
     response = bench.ask(ACTION, names.START_SCAN, "me/1/1")
     assert response.code == ControlResponse.NO_RESPONSE
@@ -886,7 +884,7 @@ POINTS_TO_DIE_AT = 4
 def test_finished_scan_is_complete_and_once_wherever_the_translator_is_killed(
     bench: Any, scan: Any, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
-    """Killed after each write to the disk, and before each packet, from the end of a scan to its publication."""
+    """The kill comes after each write to the disk and before each packet of the scan."""
     cycle, published = Cycle(ScopeState.SCANNING, lambda result: True), dict[int, str]()
     reached = itertools.count()
 
@@ -948,7 +946,7 @@ def test_scan_of_nothing_but_nan_is_published_and_logged(
     assert "a has no value in Phase: NaN alone" in caplog.text
 
 
-def test_a_scan_that_did_not_survive_is_told_as_interrupted(bench: Any) -> None:
+def test_scan_lost_in_a_kill_is_published_as_interrupted(bench: Any) -> None:
     bench.ask(ACTION, names.START_SCAN)
     bench.microscope.state = ScopeState.FREE
     bench.start()

@@ -28,7 +28,7 @@ def address(controller: zmq.Socket[bytes]) -> str:
     return controller.getsockopt_string(zmq.LAST_ENDPOINT).rstrip("\0")
 
 
-def test_a_connection_that_stands_before_anybody_looks_is_seen(
+def test_connection_made_before_connect_returns_is_noticed(
     controller: zmq.Socket[bytes], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On a busy computer the handshake is over before `connect` has returned."""
@@ -46,11 +46,11 @@ def test_a_connection_that_stands_before_anybody_looks_is_seen(
         ZmqConnection(address(controller), 0.2, time.monotonic, HINTS).close()
 
 
-def test_an_address_where_nobody_listens_is_said() -> None:
+def test_address_without_a_listener_is_reported() -> None:
     with pytest.raises(ControllerLost, match="nothing listens"):
         ZmqConnection("tcp://127.0.0.1:1", 5.0, time.monotonic, HINTS)
 
 
-def test_what_is_no_address_is_said() -> None:
+def test_invalid_address_is_reported() -> None:
     with pytest.raises(ConfigError, match="is not an address"):
         ZmqConnection("nonsense", 5.0, time.monotonic, HINTS)

@@ -150,7 +150,7 @@ class Gxsm(Driver):
         self._files = GxsmFiles(
             self.memory,
             self.log,
-            patience_s=self.patience_s(self.result_timeout_s / 2),
+            patience_s=self.patience_s(self.common.result_timeout_s / 2),
             soon_s=self.patience_s(SOON_S),
             late_s=self.patience_s(LATE_S),
         )
@@ -186,7 +186,7 @@ class Gxsm(Driver):
         if names.TIP_BIAS_VOLTAGE not in self.table:
             needed[names.PULSE] = [names.TIP_BIAS_VOLTAGE]
         needed[names.START_SPEC] = [execute(kind) for kind in self._whole_table[names.SPEC_KIND].choices]
-        for name, what in self.added_actions.items():
+        for name, what in self.common.actions.items():
             if "command" in what:
                 needed[name] = [str(what["command"])]
         return {

@@ -106,7 +106,7 @@ class Nanonis(Driver):
         if not hasattr(self, "_files"):
             self._kept.kept_in(self.memory)
             own_folder = (self.run_dir / "scans").resolve()
-            patience_s = self.patience_s(self.result_timeout_s / 2)
+            patience_s = self.patience_s(self.common.result_timeout_s / 2)
             self._files = NanonisFiles(self.memory, self._session_dir, own_folder, patience_s, self.log)
         self._activity = NanonisActivity(session, self._files, self._probe, self.memory, self.clock, self.log)
         folder = self._session_dir or Path(session.ask("Util.SessionPathGet")[0])

@@ -1,7 +1,7 @@
 """The arbitration table: who may control the microscope, as data, and the one function that applies it.
 
-`TABLE` is read from the top: the first row of an event whose condition holds applies, and each event's last row always
-does. Nothing but a row changes who is in control, the mode or the flagged problems.
+Each event has rows. The first row whose condition holds applies; the last row of an event always applies. Only a row
+changes the holder of control, the mode or the flagged problems.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
 class ArbitrationEvent(Enum):
-    """An event on which control depends: the requests, by kind, and two that time brings."""
+    """An event that control depends on: the kinds of requests, and two that come with time."""
 
     REQUEST_CONTROL = "asks for control"
     RELEASE_CONTROL = "gives control back"
@@ -39,9 +39,9 @@ class ControlChange(Enum):
     """A change that a row makes."""
 
     GRANT = auto()
-    """The asker gets control, to solve the problem it named (or none)."""
+    """The client gets control, to solve the problem it named (or none)."""
     TAKE = auto()
-    """Whoever is in control no longer is."""
+    """The holder loses control."""
     FLAG = auto()
     UNFLAG = auto()
     SET_MODE = auto()
@@ -64,11 +64,11 @@ class Cause(Enum):
 
 @dataclass(frozen=True)
 class ArbitrationState:
-    """The state that control is in.
+    """The state of control.
 
     Attributes:
         solving: the flagged problem that the holder is in control for; 0 for none.
-        problems: the flagged problems, each with who flagged it.
+        problems: the flagged problems, each with the name of the component that flagged it.
         ended: the experiment is over.
     """
 
@@ -80,13 +80,13 @@ class ArbitrationState:
 
     @property
     def sees_to_tip(self) -> bool:
-        """Somebody is there for a microscope that is not as it should be: a person, or who solves that."""
+        """Whether a person, or a component that solves device-malfunction, looks after a tip in danger."""
         return self.mode is ControlMode.MANUAL or (
             self.holder is not None and self.solving == Problem.DEVICE_MALFUNCTION
         )
 
     def published(self) -> ControlState:
-        """Return the state as all peers are told it."""
+        """Return the part of the state that is published to all peers."""
         return ControlState(self.mode, self.holder, tuple(sorted(self.problems)))
 
 
@@ -102,8 +102,8 @@ class RoleTable:
         set_mode: switch between MANUAL and AUTOMATED.
         clear_problems: clear problems that others flagged. A component may always clear a problem that it flagged
             itself, or is in control to solve.
-        operate: command the microscope in MANUAL mode, and set what is `adjustable`. Without the key: the dashboard,
-            and other components by which a person commands the microscope.
+        operate: command the microscope in MANUAL mode, and set an `adjustable` parameter. Without the key: the
+            dashboard, and other components through which a person commands the microscope.
         restart: restart a process.
     """
 
@@ -121,7 +121,7 @@ class Rules:
     """The part of the experiment file that the table needs.
 
     Attributes:
-        problems: those that are known.
+        problems: the problems that this experiment knows.
         adjustable: parameters that a person may set while a component is in control.
         end_on: problems that end the experiment.
     """
@@ -134,7 +134,7 @@ class Rules:
 
 @dataclass(frozen=True)
 class ControlInput:
-    """An event of `who`; `number` is the problem or mode that it is about."""
+    """An event caused by the component `who`; `number` is its problem or mode."""
 
     event: ArbitrationEvent
     who: str
@@ -143,7 +143,7 @@ class ControlInput:
 
 @dataclass(frozen=True)
 class Condition:
-    """Something that may hold of a state and an ask, with words for it."""
+    """A condition on a state and an input, with its words for the documentation."""
 
     text: str
     holds: Callable[[ArbitrationState, ControlInput, Rules], bool]
@@ -151,13 +151,13 @@ class Condition:
 
 @dataclass(frozen=True)
 class Transition:
-    """One line of the table.
+    """One row of the table.
 
     Attributes:
-        response: of a request; None where the translator answers, or nobody asked.
-        why: why it is so. Of a refusal it is the reason given, with {who}, {holder}, {number}, {problem} and {problems}
-            filled in.
-        cause: why control is taken, where it is.
+        response: the answer to a request; None where the translator answers, or the event is not a request.
+        why: the reason of the row. With a refusal it is sent to the client, with {who}, {holder}, {number}, {problem}
+            and {problems} filled in.
+        cause: why the holder loses control, if it does.
     """
 
     when: Condition
@@ -168,7 +168,7 @@ class Transition:
 
 
 def may(role: Collection[str] | None, who: str) -> bool:
-    """Return whether `who` has a role."""
+    """Return whether a component, or a person who acts through one, has a role; None: everyone has it."""
     return role is None or who in role or component_of(who) in role
 
 
@@ -239,8 +239,7 @@ def _accept(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cau
     return Transition(when, ControlResponse.SUCCESS, do, why, cause)
 
 
-def _happen(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
-    """A row without an answer of the scheduler's: the translator answers, or nobody asked."""
+def _without_answer(when: Condition, do: tuple[ControlChange, ...], why: str, cause: Cause | None = None) -> Transition:
     return Transition(when, None, do, why, cause)
 
 
@@ -260,7 +259,7 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         ),
         _refuse(OTHER_HOLDS, _R.ALREADY_UNDER_CONTROL, "{holder} is in control"),
         _accept(ASKER_HOLDS, (_D.GRANT,), "asked for again: it stays in control, for the problem it now names"),
-        _accept(OTHERWISE, (_D.GRANT,), "nobody is in control: the first to ask gets it"),
+        _accept(OTHERWISE, (_D.GRANT,), "no component is in control: the first to ask gets it"),
     ),
     ArbitrationEvent.RELEASE_CONTROL: (
         _accept(ASKER_HOLDS, (_D.TAKE,), "its own decision", Cause.RELEASED),
@@ -317,14 +316,14 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _accept(OTHERWISE, (_D.END,), "all receivers close"),
     ),
     ArbitrationEvent.COMMAND: (
-        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
-        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
+        _without_answer(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _without_answer(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
         _refuse(OTHERWISE, _R.NOT_IN_CONTROL, "{who} is not in control, {holder} is"),
     ),
     ArbitrationEvent.ADJUST: (
-        _happen(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
-        _happen(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
-        _happen(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
+        _without_answer(ASKER_HOLDS, (_D.FORWARD,), "the holder of control commands the microscope"),
+        _without_answer(IS_OPERATOR, (_D.FORWARD,), "in MANUAL mode a person may, through a component"),
+        _without_answer(IS_ADJUSTER, (_D.FORWARD,), "the experiment file lets a person adjust it beside the holder"),
         _refuse(
             OTHERWISE,
             _R.NOT_IN_CONTROL,
@@ -332,20 +331,22 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
             " and while no problem is flagged",
         ),
     ),
-    ArbitrationEvent.READ: (_happen(OTHERWISE, (_D.FORWARD,), "reading disturbs nothing, and is always allowed"),),
+    ArbitrationEvent.READ: (
+        _without_answer(OTHERWISE, (_D.FORWARD,), "reading disturbs nothing, and is always allowed"),
+    ),
     ArbitrationEvent.DEAD: (
-        _happen(ASKER_HOLDS, (_D.TAKE,), "a component that has died does not keep control", Cause.DEAD),
-        _happen(OTHERWISE, (), "it was not in control"),
+        _without_answer(ASKER_HOLDS, (_D.TAKE,), "a component that has died does not keep control", Cause.DEAD),
+        _without_answer(OTHERWISE, (), "it was not in control"),
     ),
     ArbitrationEvent.IDLE: (
-        _happen(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
-        _happen(OTHERWISE, (), "it was not in control"),
+        _without_answer(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
+        _without_answer(OTHERWISE, (), "it was not in control"),
     ),
 }
 
 
 def row_for(control: ArbitrationState, ask: ControlInput, rules: Rules) -> Transition:
-    """The row of the table that applies."""
+    """Return the first row of the table whose condition holds."""
     for row in TABLE[ask.event]:
         if row.when.holds(control, ask, rules):
             return row
@@ -353,19 +354,19 @@ def row_for(control: ArbitrationState, ask: ControlInput, rules: Rules) -> Trans
 
 
 def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> ArbitrationState:
-    """The state after a row."""
+    """Return the state after the changes of a row."""
     for do in row.do:
         control = _APPLY[do](control, ask)
     return control
 
 
 def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
-    """The reason given with a refusal; empty for a success."""
+    """Return the reason given with a refusal; empty for a success."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
     return row.why.format(
         who=ask.who,
-        holder=control.holder or "nobody",
+        holder=control.holder or "no component",
         number=ask.number,
         problem=rules.problems.name(ask.number),
         problems=", ".join(map(rules.problems.name, sorted(control.problems))) or "none",

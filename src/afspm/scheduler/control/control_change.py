@@ -1,4 +1,4 @@
-"""Decisions about control: the arbitration table is applied, and what follows from a change of it is done."""
+"""Applies the arbitration table, and carries out the consequences of a change of control."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from afspm.scheduler.control.arbitration import (
     reason,
     row_for,
 )
-from afspm.scheduler.control.descriptions import is_routine, said
+from afspm.scheduler.control.descriptions import change_text, is_routine
 from afspm.scheduler.events import RequestIn
 from afspm.scheduler.publishing.event_log import control_entries
 from afspm.scheduler.publishing.own_packets import publish_control
@@ -28,15 +28,15 @@ from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.state import StateDraft
 
 TRANSLATOR = "translator"
-"""Who flags a microscope that is lost: the translator asks for nothing, so it is done in its name."""
+"""The name under which the scheduler flags a lost microscope: a translator sends no requests itself."""
 
 
 @dataclass(frozen=True)
 class _Change:
-    """A change of control: by whom, and by which row of the table.
+    """A change of control, with the input and the row of the table that caused it.
 
     Attributes:
-        had_died: the ask is of a holder in another life than that in which it got control.
+        had_died: the request comes from a later process of the holder than the one that got control.
     """
 
     before: ArbitrationState
@@ -47,18 +47,18 @@ class _Change:
 
     @property
     def cause(self) -> Cause | None:
-        """Why the microscope may be left to itself: why control was taken, or that the experiment ends."""
-        # a person at the microscope sees to it also when the experiment ends
+        """Why the microscope may be unattended: the holder's loss of control, or the end of the experiment."""
+        # a person at the microscope attends to the tip, also at the end of the experiment
         if self.after.ended and self.before.mode is not ControlMode.MANUAL:
             return Cause.ENDED
         return self.row.cause
 
 
 def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None) -> bool:
-    """Apply the table. Returns whether the request is the translator's to answer.
+    """Apply the table. Return whether the translator answers the request.
 
     Args:
-        event: the request, if somebody asked.
+        event: the request; None: the event is not a request.
     """
     before, rules = draft.control, draft.env.settings.rules
     row = row_for(before, ask, rules)
@@ -71,7 +71,7 @@ def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None)
     if after != before:
         granted_to = draft.lease.token
         is_other_life = None not in (token, granted_to) and token != granted_to
-        _follow(draft, _Change(before, after, ask, row, is_other_life and ask.who == before.holder))
+        _carry_out(draft, _Change(before, after, ask, row, is_other_life and ask.who == before.holder))
     if after.ended and not before.ended:
         begin_end(draft)
     if event is not None and row.response is not None:
@@ -80,7 +80,7 @@ def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None)
 
 
 def begin_end(draft: StateDraft) -> None:
-    """Begin the end of the experiment, which waits for the tip."""
+    """Begin the end of the experiment, which waits until the tip is out of danger."""
     draft.watchdog = draft.watchdog.hurry(draft.now_s)
     settings = draft.env.settings
     draft.end = draft.end.begin(draft.now_s + settings.control.request_timeout_s + settings.waits.answer_s)
@@ -93,23 +93,23 @@ def answer_unless_ending(
     why: str,
     detail: ResponseDetail = ResponseDetail.NONE,
 ) -> None:
-    """Answer a request, now or when the tip is seen to."""
+    """Answer a request: now, or during the end of the experiment only once the tip is out of danger."""
     if (kept := draft.end.keep((event, code, why, detail))) is not None:
         draft.end = kept
-        # asked again meanwhile, it gets this answer, and not one more
+        # a retry meanwhile waits for this answer, and gets no second one
         draft.idempotency = draft.idempotency.noted(event.name, event.request, RequestStatus.PENDING)
     else:
         answers.answer(draft, event, code, why, detail=detail)
 
 
-def _follow(draft: StateDraft, change: _Change) -> None:
-    """Act and tell, before whoever asked is answered."""
+def _carry_out(draft: StateDraft, change: _Change) -> None:
+    # all of it precedes the answer to the request that caused the change
     before, after = change.before, change.after
     problems = draft.env.settings.rules.problems
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
-    _tell_people(draft, change, _have_watched(draft, change))
+    _log_change(draft, change, _alert_watchdog(draft, change))
     if after.ended:
         answers.call_back(draft, None, Cause.ENDED)
     elif before.holder is not None and after.holder is None:
@@ -121,18 +121,18 @@ def _follow(draft: StateDraft, change: _Change) -> None:
         publish_control(draft)
 
 
-def _have_watched(draft: StateDraft, change: _Change) -> list[str]:
-    """Have the watchdog see to a microscope that may be left to itself. Returns what it wants because of that."""
+def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
     cause, former, ask = change.cause, change.before.holder, change.ask
     malfunction = Problem.DEVICE_MALFUNCTION
     if malfunction in change.before.problems.keys() - change.after.problems.keys() and ask.who != TRANSLATOR:
-        # somebody says that the tip is well again: it may be at the surface, where it can be endangered anew
+        # a cleared malfunction means that the tip is well: it may be at the surface, where it can be in danger again
         draft.watchdog = draft.watchdog.seen_to()
         draft.microscope = draft.microscope.with_tip(away=False)
     if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED)):
         return []
     flight = draft.forwarder.flight
     feedback = None if flight is None else feedback_of(flight.request)
+    # a request in flight can't be called back: it may still switch the feedback off
     if feedback is not None and feedback.on is False:
         draft.microscope = draft.microscope.feedback_may_be_off()
     in_flight = None
@@ -150,10 +150,10 @@ def _have_watched(draft: StateDraft, change: _Change) -> list[str]:
     return draft.watchdog.newly_wanted(before)
 
 
-def _tell_people(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
+def _log_change(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
     before, after, ask, cause = change.before, change.after, change.ask, change.cause
     routine = is_routine(before, after, ask, draft.lease.announced)
-    draft.log("DEBUG" if routine else "INFO", said(before, after, ask, change.row, draft.env.settings.rules))
+    draft.log("DEBUG" if routine else "INFO", change_text(before, after, ask, change.row, draft.env.settings.rules))
     draft.lease = replace(draft.lease, announced=after.holder or draft.lease.announced)
     is_sent = "is sent to the microscope" if draft.forwarder.up else "will be sent when the translator is back"
     for action in wanted:

@@ -1,12 +1,14 @@
-"""Requests and changes of control in words, for people."""
+"""Requests, changes of control, and settings made in MANUAL mode, in words for people."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from afspm.basics.formatting import PREFIXABLE, area_text, lengths_text, position_text, quantity, unit_text
+from afspm.basics.frozen import replace
 from afspm.model import (
     LEASE_REQUEST,
     RESTART_REQUEST,
@@ -33,16 +35,20 @@ from afspm.scheduler.control.arbitration import (
     Transition,
 )
 
+_FEEDBACK_WORDS = {"on": "feedback", "proportional_gain": "P gain", "integral_gain": "I gain", "setpoint": "setpoint"}
 
-def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_told: str | None) -> bool:
-    """Return whether a change is routine: control is given back, or taken again by the holder logged last."""
+
+def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, holder_logged: str | None) -> bool:
+    """Return whether a change is routine: a release of control, or its return to the holder logged last."""
     if (after.problems, after.mode, after.ended) != (before.problems, before.mode, before.ended) or after.problems:
         return False
-    return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_told
+    return ask.event is ArbitrationEvent.RELEASE_CONTROL if after.holder is None else after.holder == holder_logged
 
 
-def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules) -> str:
-    """A change of control in words, for the log."""
+def change_text(
+    before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules
+) -> str:
+    """Return a change of control in words, for the log."""
     parts = []
     if after.holder != before.holder and after.holder is not None:
         parts.append(f"{after.holder} is in control")
@@ -61,7 +67,7 @@ def said(before: ArbitrationState, after: ArbitrationState, ask: ControlInput, r
 
 
 def _ended_control(holder: str, cause: Cause) -> str:
-    """Return how a holder lost control; what caused it stands before, unless it is its own end."""
+    # the text before this one names the cause, except where the holder itself is the cause
     match cause:
         case Cause.RELEASED:
             return f"{holder} gave control back"
@@ -71,8 +77,43 @@ def _ended_control(holder: str, cause: Cause) -> str:
             return f"{holder} lost control"
 
 
-def asked(request: Request, problems: ProblemNames) -> str:
-    """A request in words, with units; those that flag a problem begin with "flags", and name it."""
+@dataclass(frozen=True)
+class HandSettings:
+    """Settings changed in MANUAL mode: parameters set by requests, and the z feedback, also when changed at the panel.
+
+    Attributes:
+        parameters: value with its unit, by name.
+        before: the feedback in force when MANUAL began; None: not known.
+        now: the feedback in force; None: not known.
+    """
+
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    before: Feedback | None = None
+    now: Feedback | None = None
+
+    def requested(self, request: Request) -> HandSettings:
+        """Add a request that was carried out in MANUAL mode."""
+        parameter = request.subject
+        if not isinstance(parameter, Parameter) or parameter.value is None:
+            return self
+        value = f"{parameter.value} {parameter.unit or ''}".rstrip()
+        return replace(self, parameters={**self.parameters, parameter.name: value})
+
+    def published(self, feedback: Feedback, *, is_manual: bool) -> HandSettings:
+        return replace(self, now=feedback, before=self.before if is_manual and self.before else feedback)
+
+    def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:
+        """Return the settings that stay in force after MANUAL, in words, and start over."""
+        told = [f"{name} = {value}" for name, value in self.parameters.items()]
+        for name, word in _FEEDBACK_WORDS.items():
+            value = getattr(self.now, name, None)
+            if value is not None and value != getattr(self.before, name, None):
+                told.append(f"{word} = {value:g}" if name != "on" else f"{word} {'on' if value else 'off'}")
+        return HandSettings(before=self.now, now=self.now), tuple(told)
+
+
+def request_text(request: Request, problems: ProblemNames) -> str:
+    """Return a request in words, with units."""
     words = _WORDS.get(request.kind)
     return request_name(request.kind) if words is None else words(request.subject, problems)
 
@@ -90,7 +131,7 @@ def _parameter(subject: object, problems: ProblemNames) -> str:
 
 
 def _value(text: str, unit: str) -> str:
-    """Return a value with a prefix that reads well where its unit is SI, else in the unit that was sent."""
+    # a prefix is chosen where the unit is SI; any other unit stays as it was sent
     try:
         return quantity(float(text), unit, 6) if unit in PREFIXABLE else f"{text} {unit_text(unit)}".strip()
     except ValueError:

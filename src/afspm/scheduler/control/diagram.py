@@ -1,4 +1,4 @@
-"""The state diagram of control, found by trying the table on every kind of state: it can't differ from the table."""
+"""The state diagram of control, computed from the arbitration table, so that both always agree."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ _MODES = (ControlMode.AUTOMATED, ControlMode.MANUAL)
 
 
 def kind(control: ArbitrationState) -> str:
-    """The node of the diagram that a state belongs to."""
+    """Return the node of the diagram for a state."""
     if control.ended:
         return "ended"
     if control.mode is ControlMode.MANUAL:
         return "manual"
     if control.problems:
-        return "solver in control" if control.holder else "flagged, nobody in control"
+        return "solver in control" if control.holder else "flagged, no component in control"
     return "in control" if control.holder else "free"
 
 
 def edges() -> list[tuple[str, str, str]]:
-    """All (from, label, to) between different nodes, in the order of the table."""
+    """Return all (from, label, to) between different nodes, in the order of the table."""
     found: dict[tuple[str, str, str], None] = {}
     for event in ArbitrationEvent:
         for control in _states():
@@ -36,8 +36,8 @@ def edges() -> list[tuple[str, str, str]]:
 
 
 def mermaid() -> str:
-    """The diagram as text for mermaid, as the documentation shows it."""
-    names = {"free": "Free", "in control": "Held", "flagged, nobody in control": "Flagged"}
+    """Return the diagram as text for mermaid, as the documentation shows it."""
+    names = {"free": "Free", "in control": "Held", "flagged, no component in control": "Flagged"}
     names |= {"solver in control": "Solving", "manual": "Manual", "ended": "Ended"}
     lines = ["stateDiagram-v2", "    [*] --> Free"]
     lines += [f'    state "{text}" as {name}' for text, name in names.items()]
@@ -63,7 +63,7 @@ def _label(ask: ControlInput, before: ArbitrationState, after: ArbitrationState)
 
 
 def _states() -> list[ArbitrationState]:
-    """One of each kind of state that can be reached, with up to two problems and two components."""
+    # two problems and two components suffice to reach each kind of state
     states = []
     for mode in _MODES:
         for flagged in ({}, {1: "b"}, {1: "b", 2: "b"}):

@@ -1,4 +1,4 @@
-"""When the holder loses control for doing nothing (its lease) or for being gone (its grace period)."""
+"""When the holder loses control: after its lease if it is idle, after its grace period if disconnected."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from afspm.model.sessions import SessionTable
 
 @dataclass(frozen=True)
 class Lease:
-    """The idle time of the holder.
+    """The idle time after which the holder loses control.
 
-    That of the experiment file counts while the microscope is free, in experiment time: a simulated night decides
-    alike. That which a holder asks for itself, as it speaks for somebody who may vanish without a connection to lose,
-    counts in real time and whatever the microscope does.
+    The lease of the experiment file counts in experiment time while the microscope is free, so that a simulated night
+    gives the same decisions. A lease that the holder requested counts in real time, also while the microscope is busy:
+    such a holder acts for a client that may vanish without losing a connection.
 
     Attributes:
         lease_ns: longest idle time by the experiment file; None: no limit.
-        asked_s: longest idle time that the holder asked for; None: it did not.
-        token: of the life of the holder that was granted control.
-        announced: the last holder that was logged.
+        asked_s: longest idle time that the holder requested; None: no such request.
+        token: of the process that was granted control.
+        announced: the last holder in the log.
     """
 
     lease_ns: int | None = None
@@ -33,11 +33,11 @@ class Lease:
     idle_since_s: float = 0.0
 
     def held_by(self, holder: str | None, now_ns: int) -> Lease:
-        """Restart the idle time for another holder, or for nobody."""
+        """Restart the idle time if the holder changed; None: no component is in control."""
         return self if holder == self.holder else replace(self, holder=holder, idle_since_ns=now_ns, asked_s=None)
 
     def used(self, now_ns: int) -> Lease:
-        """Restart the idle time while the microscope is free: it began or ended something."""
+        """Restart the idle time: the microscope began or ended an activity."""
         return replace(self, idle_since_ns=now_ns)
 
     def commanded(self, now_ns: int, now_s: float) -> Lease:
@@ -45,15 +45,15 @@ class Lease:
         return replace(self, idle_since_ns=now_ns, idle_since_s=now_s)
 
     def asked(self, lease_s: float | None, now_s: float) -> Lease:
-        """Begin the lease that the holder asks for, or begin it anew."""
+        """Begin or renew the lease that the holder requests."""
         return replace(self, asked_s=lease_s, idle_since_s=now_s)
 
     def asked_until_s(self) -> float | None:
-        """Return when (real) the lease that the holder asked for runs out; None: it asked for none."""
+        """Return when (real) the lease that the holder requested runs out; None: no such lease."""
         return None if self.asked_s is None or self.holder is None else self.idle_since_s + self.asked_s
 
     def deadline_ns(self, *, is_free: bool) -> int | None:
-        """Return when the lease runs out; None while the microscope is busy, or nobody is in control."""
+        """Return when the lease of the experiment file runs out; None: not while the microscope is busy."""
         if self.lease_ns is None or self.holder is None or not is_free:
             return None
         return self.idle_since_ns + self.lease_ns
@@ -61,35 +61,36 @@ class Lease:
 
 @dataclass(frozen=True)
 class HolderTimeout:
-    """The grace period of a holder that is gone: it may only have lost its connection, or be started again.
+    """The grace period of a disconnected holder, which may reconnect or be restarted.
 
     Attributes:
         grace_s: real time before control is revoked.
-        restart_grace_s: the same for a holder that has not been heard of since the scheduler itself was restarted.
+        restart_grace_s: the same for a holder without a connection since the scheduler itself was restarted.
+        next_loss_log_s: no further loss is logged before this time, real.
     """
 
     grace_s: float
     restart_grace_s: float
     started_s: float = 0.0
-    told_again_s: float = -math.inf
+    next_loss_log_s: float = -math.inf
 
     def dead_at_s(self, holder: str | None, sessions: SessionTable, over_since_s: float | None) -> float | None:
         """Return when control is revoked unless the holder comes back; None while it is connected.
 
         Args:
-            over_since_s: since when its process is known to be over and not started again; None if it is not.
+            over_since_s: since when its process has ended without a restart; None: it has not ended, as far as known.
         """
         if holder is None or sessions.connection_of(holder) is not None:
             return None
         lost_s = sessions.lost_since_s(holder)
-        # -inf: known before our restart: whoever was in control then may be another, by hand
+        # -inf: ended before the scheduler's restart. The present holder may be another process, started by hand
         if over_since_s is not None and over_since_s > -math.inf:
-            # exit and lost connection come by different ways, so either may be known a little earlier
+            # the exit is reported by the supervisor, the loss by the socket: either may arrive first
             is_this_life = sessions.since_s(holder) <= over_since_s
             if is_this_life and (lost_s is None or lost_s <= over_since_s + self.grace_s):
                 return over_since_s
         return self.started_s + self.restart_grace_s if lost_s is None else lost_s + self.grace_s
 
-    def told(self, now_s: float) -> HolderTimeout:
+    def loss_logged(self, now_s: float) -> HolderTimeout:
         """Log no other loss within the grace period: a connection may come and go."""
-        return replace(self, told_again_s=now_s + self.grace_s)
+        return replace(self, next_loss_log_s=now_s + self.grace_s)

@@ -1,4 +1,4 @@
-"""The beginning and the end: the startup barrier, the end of the experiment, and the grace period after it."""
+"""The start and the end of an experiment: the startup barrier, the end, and the grace period after it."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from afspm.scheduler.control.supervisor_registry import OVER
 from afspm.scheduler.events import RequestIn
 
 SHUTDOWN_GRACE_S = 3.0
-"""How long (real) after the end late and restarting components still get the last scans and the end itself; and after a
-component was last heard to be still at work."""
+"""How long (real) the scheduler stays after the end: late and restarting components still get the last scans and the
+end itself. Counted again from each report of a component that still runs."""
 LONGEST_GRACE_S = 20.0
-"""How long (real) after the end at most: to find that a component is silent, to kill it and to start it again takes as
-long as the supervisor allows it at the end."""
+"""How long (real) the scheduler stays at most: a supervisor takes this time at the end to find a silent component, kill
+it and restart it."""
+# bounded, since requests come from peers
 _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")
 
 
 @dataclass(frozen=True)
 class StartupBarrier:
-    """Holds back who is in control, and requests that may change it, until old packets have been caught up with.
+    """Delays the first control state, and requests that may change it, until missed packets are published.
 
-    After a restart, what the translator published before may still come again: it would get a time after the change,
-    and be taken for something new.
+    Without it, a packet that the translator repeats would get a time after the change, and pass for a new one.
 
     Attributes:
-        patience_s: how long (real) is waited.
-        until_s: when it opens at the latest, in real monotonic time; None: it is open.
-        is_restart: the scheduler was there before.
-        opened_s: when it opened.
+        patience_s: the longest wait, real.
+        until_s: when the barrier opens at the latest, in real monotonic time; None: it is open.
+        is_restart: this scheduler continues a run.
+        opened_s: when the barrier opened, in real monotonic time.
         kept: requests that came too early.
     """
 
@@ -46,26 +46,26 @@ class StartupBarrier:
         return replace(self, until_s=now_s + self.patience_s, is_restart=is_restart)
 
     def put_off(self, until_s: float) -> StartupBarrier:
-        """Stay closed until then: more is to come."""
+        """Stay closed until then at least: more packets are to come."""
         return self if self.until_s is None else replace(self, until_s=max(self.until_s, until_s))
 
     def opened(self, now_s: float) -> StartupBarrier:
         return self if self.until_s is None else replace(self, until_s=None, opened_s=now_s)
 
     def keep(self, event: RequestIn) -> StartupBarrier | None:
-        """Keep a request that comes too early; None: it does not."""
+        """Keep a request that comes too early; None: it may be decided now."""
         if self.until_s is None or not self.is_restart or len(self.kept) >= _MOST_KEPT:
             return None
         return replace(self, kept=(*self.kept, event))
 
     def let_in(self) -> tuple[StartupBarrier, RequestIn | None]:
-        """Return the first request that came too early, once the barrier is open."""
+        """Return the first kept request, once the barrier is open."""
         if not self.kept or self.until_s is not None:
             return self, None
         return replace(self, kept=self.kept[1:]), self.kept[0]
 
     def due_s(self) -> float | None:
-        """Return when there is something to be done."""
+        """Return when the barrier must open, or the next kept request must be decided."""
         if self.until_s is not None:
             return self.until_s
         return self.opened_s if self.kept else None
@@ -76,15 +76,16 @@ KeptAnswer = tuple[RequestIn, ControlResponse, str, ResponseDetail]
 
 @dataclass(frozen=True)
 class ExperimentEnd:
-    """The end of the experiment, which waits for the tip to be out of danger.
+    """The end of the experiment, which waits until the tip is out of danger.
 
-    The answers by which others learn that it is over are kept back until then: they may leave, and the supervisor with
-    them. The scheduler itself stays for a grace period.
+    Answers that report the end are kept back until then: such an answer makes components leave, and the supervisor too.
+    The scheduler itself stays for a grace period.
 
     Attributes:
-        by_s: when, in real monotonic time, it ends at the latest; None: it does not end, or has ended.
+        by_s: when the experiment ends at the latest, in real monotonic time; None: it does not end, or has ended.
         kept: answers that are kept back.
         leave_at_s: when the scheduler leaves; inf: the experiment has not ended.
+        latest_s: when the scheduler leaves at the latest.
     """
 
     by_s: float | None = None
@@ -96,19 +97,18 @@ class ExperimentEnd:
         return replace(self, by_s=by_s)
 
     def keep(self, answer: KeptAnswer) -> ExperimentEnd | None:
-        """Keep an answer back; None: it may be given at once."""
+        """Keep an answer back; None: it may be sent at once."""
         return None if self.by_s is None else replace(self, kept=(*self.kept, answer))
 
     def is_due(self, now_s: float, *, owes_retract: bool) -> bool:
-        """Return whether all may leave now."""
         return self.by_s is not None and not (owes_retract and now_s < self.by_s)
 
     def ended(self, now_s: float) -> ExperimentEnd:
         """Begin the grace period."""
         return ExperimentEnd(None, (), now_s + SHUTDOWN_GRACE_S, now_s + LONGEST_GRACE_S)
 
-    def processes_told(self, states: Iterable[ProcessState], now_s: float) -> ExperimentEnd:
-        """Stay longer while a supervisor says that one of its processes is still at work."""
+    def processes_reported(self, states: Iterable[ProcessState], now_s: float) -> ExperimentEnd:
+        """Stay longer while a supervisor reports that one of its processes still runs."""
         if self.leave_at_s == math.inf or not any(map(_is_at_work, states)):
             return self
         leave_at_s = max(self.leave_at_s, min(now_s + SHUTDOWN_GRACE_S, self.latest_s))
@@ -116,5 +116,5 @@ class ExperimentEnd:
 
 
 def _is_at_work(state: ProcessState) -> bool:
-    # a translator subscribes to nobody, and the scheduler is not to wait for itself
+    # a translator subscribes to nothing, and the scheduler must not wait for itself
     return state.role not in _OTHERS and state.condition not in OVER

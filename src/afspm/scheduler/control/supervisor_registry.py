@@ -1,4 +1,4 @@
-"""The registry of supervisors: which has which processes, and what each is still to be ordered."""
+"""The registry of supervisors: their processes, and the restarts still to be ordered from each."""
 
 from __future__ import annotations
 
@@ -24,24 +24,25 @@ from afspm.scheduler.events import Codec, RequestIn
 from afspm.scheduler.saved_state import SavedSupervisor
 
 SILENT_S = 10.0
-"""A supervisor that has not been heard of for so long, real time, is given no more orders."""
-_MOST = 64  # supervisors
+"""A supervisor without a report for this time, real, gets no more orders: they would be lost."""
+_MOST = 64  # supervisors: names come from peers, and memory must stay bounded
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
-"""Conditions of a process that does not run and is not started again."""
+"""Conditions of a process that has ended for good."""
 
 
 @dataclass(frozen=True)
 class KnownSupervisor:
-    """A supervisor; `told_s` is None for one that was known before a restart of ours.
+    """A supervisor.
 
     Attributes:
-        orders: processes that it is to start anew.
-        over: of its processes those that are over, with how often each was started before and since when that is known.
-        states: as it told them last.
+        reported_s: time of its last report, real; None: known from before a restart of the scheduler.
+        orders: processes that it has to restart.
+        over: its processes that have ended for good: the number of starts before, and since when (real) that is known.
+        states: of its processes, by its last report.
     """
 
     processes: tuple[str, ...] = ()
-    told_s: float | None = None
+    reported_s: float | None = None
     orders: tuple[str, ...] = ()
     over: Mapping[str, tuple[int, float]] = field(default_factory=dict)
     states: tuple[ProcessState, ...] = ()
@@ -49,7 +50,7 @@ class KnownSupervisor:
 
 @dataclass(frozen=True)
 class SupervisorRegistry:
-    """The supervisors by the names they ask under; the one heard of last is last."""
+    """The supervisors by name; the one with the newest report is last."""
 
     supervisors: Mapping[str, KnownSupervisor] = field(default_factory=dict)
 
@@ -63,7 +64,7 @@ class SupervisorRegistry:
 
     @classmethod
     def restored(cls, saved: Mapping[str, SavedSupervisor]) -> SupervisorRegistry:
-        """Take up what `saved` gave: since when a process is over is not known any more."""
+        """Return the registry from `saved`; the times at which processes ended are lost (-inf)."""
         return cls(
             {
                 name: KnownSupervisor(
@@ -77,50 +78,54 @@ class SupervisorRegistry:
         )
 
     def states_of(self, supervisor: str) -> tuple[ProcessState, ...]:
-        """Return the states of a supervisor's processes, as it told them last."""
+        """Return the states of a supervisor's processes by its last report."""
         known = self.supervisors.get(supervisor)
         return known.states if known is not None else ()
 
     def over_since_s(self, process: str) -> float | None:
-        """Return since when, real time, a process is known to have ended or be given up, and not started again.
+        """Return since when, in real time, a process has ended for good.
 
-        -inf: that was known before a restart of ours. None: it is not so, or a supervisor that was heard of lately has
-        a process of this name that is not over.
+        Returns:
+            -inf if it ended before a restart of the scheduler. None if it has not ended, or if another supervisor with
+            a recent report has a process of this name that has not.
         """
         having = [one for one in self.supervisors.values() if process in one.processes]
         since_s = max((one.over[process][1] for one in having if process in one.over), default=None)
         if since_s is None:
             return None
         others = [one for one in having if process not in one.over]
-        goes_on = any(one.told_s is None or one.told_s > since_s - SILENT_S for one in others)
+        goes_on = any(one.reported_s is None or one.reported_s > since_s - SILENT_S for one in others)
         return None if goes_on else since_s
 
     def orders_for(self, supervisor: str) -> tuple[SupervisorRegistry, tuple[str, ...]]:
-        """Return the processes that a supervisor is to start anew, and forget that order: it is given now."""
+        """Return the processes that a supervisor has to restart, and remove the order: it is given now."""
         known = self.supervisors.get(supervisor)
         if known is None or not known.orders:
             return self, ()
         return replace(self, supervisors={**self.supervisors, supervisor: replace(known, orders=())}), known.orders
 
     def order(self, process: str, now_s: float) -> tuple[SupervisorRegistry, str]:
-        """Have a process started anew. Returns also why that can't be, or ""."""
+        """Order the restart of a process. Return also the reason why that is impossible, or ""."""
         having = {name: one for name, one in self.supervisors.items() if process in one.processes}
         if not having:
             known = sorted({process for one in self.supervisors.values() for process in one.processes})
             return self, f"there is no process {process!r}; known: {', '.join(known) or 'none'}"
-        name, newest = max(having.items(), key=lambda item: now_s if item[1].told_s is None else item[1].told_s)
-        if newest.told_s is not None and now_s - newest.told_s > SILENT_S:
-            return self, f"the supervisor of {process} has not been heard of for {duration_text(now_s - newest.told_s)}"
+        name, newest = max(having.items(), key=lambda item: now_s if item[1].reported_s is None else item[1].reported_s)
+        if newest.reported_s is not None and now_s - newest.reported_s > SILENT_S:
+            return (
+                self,
+                f"the supervisor of {process} has sent no report for {duration_text(now_s - newest.reported_s)}",
+            )
         if process in newest.orders:
             return self, ""
         ordered = replace(newest, orders=(*newest.orders, process))
         return replace(self, supervisors={**self.supervisors, name: ordered}), ""
 
-    def told(self, name: str, states: tuple[ProcessState, ...], now_s: float) -> SupervisorRegistry:
-        """Take the states of its processes from a supervisor."""
+    def reported(self, name: str, states: tuple[ProcessState, ...], now_s: float) -> SupervisorRegistry:
+        """Store a supervisor's report on its processes."""
         known = self.supervisors.get(name, KnownSupervisor())
         over: dict[str, tuple[int, float]] = {}
-        # without keys anybody may tell, for all to see; that changes control only if it comes from a supervisor
+        # without keys any peer may report, and all see it; only a supervisor's report may end the holder's control
         for state in states if component_of(name) == SUPERVISOR else ():
             if state.condition in OVER:
                 starts, since_s = known.over.get(state.name, (-1, now_s))
@@ -132,12 +137,12 @@ class SupervisorRegistry:
 
 @dataclass(frozen=True)
 class Announcement:
-    """Something that a process wants to be published.
+    """A message that a process asks the scheduler to publish.
 
     Attributes:
-        envelope: empty: it is not published.
-        why: the reason then.
-        states: of a supervisor's processes, where it tells them.
+        envelope: empty: the message is refused.
+        why: the reason of the refusal.
+        states: of a supervisor's processes, if the message reports them.
     """
 
     envelope: str
@@ -146,7 +151,7 @@ class Announcement:
 
 
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
-    """Check something that is to be published for a process: who may speak of what."""
+    """Check a message that a process asks the scheduler to publish: each sender may only publish about itself."""
     told = event.request.subject
     if not isinstance(told, RelayedMessage):
         return Announcement("", "an empty announcement")

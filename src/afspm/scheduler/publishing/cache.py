@@ -1,4 +1,4 @@
-"""The packets published lately, for late joiners: ordered, bounded, without duplicates."""
+"""The packets published last, for late joiners: ordered, bounded, without duplicates."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from afspm.model import LoggedPacket, Packet, PacketHeader
 from afspm.scheduler.publishing.envelopes import Envelopes
 
 TIME_STEP_NS = 1_000
-"""The least time between two packets: peers that reckon in microseconds must see them in order."""
+"""The least time between two packets: peers that count in microseconds must see them in order."""
 
-_OVERHEAD_BYTES = 300  # of a kept packet beside its payload, so that a flood of empty ones is bounded too
+_OVERHEAD_BYTES = 300  # of a cached packet beside its payload: a flood of empty packets must be bounded, too
 _TIMES_REMEMBERED = 4096
-_RECENT = 64
+_RECENT = 64  # part of each saved state, so few
 _NEVER_NS = 0
-"""The time, among those that a restart remembers, of what was passed over: it is not published then either."""
+"""Stands for the published time of a packet that was passed over: it is not published after a restart either."""
 _NEWEST = 16
-_FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead of ours than that is not believed
+_FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead is wrong: its times would put off all later packets
 
 
 @dataclass(slots=True)
@@ -57,36 +57,38 @@ class PacketCache:
 
     @property
     def last_ns(self) -> int:
-        """The time of the newest packet."""
         return self._last_ns
 
     @property
     def newest_source_ns(self) -> int:
-        """The translator's time of the packet that it published last, as far as we have it; -1: none yet."""
+        """The translator's time of its newest packet in the cache; -1: none yet."""
         return self._newest_source_ns
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """Size of all packets, in bytes."""
         return self._bytes
 
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
-        """A packet of the translator's as it is to be published, and how many of its envelope are kept (0: not this).
+        """Return the packet to publish, and how many packets of its envelope are kept (0: this one is not).
 
-        Its time is the translator's, or later where that would not be after what was published before (a clock that
-        was set back or is far ahead, a peer that says no time). None: we have had it.
+        Its time is the translator's. It is later if that would not come after the newest published time: a clock was
+        set back or is far ahead, or the peer sent no time.
+
+        Returns:
+            None if the packet is a duplicate.
         """
         source_ns = packet.time_ns
         if source_ns is not None:
             if source_ns in self._sources:
                 return None
-            self._saw(source_ns)
+            self._note_source(source_ns)
         envelope, history = self._envelopes.of(header)
         first_ns = None if source_ns is None else self._first_times.pop(source_ns, None)
         if first_ns == _NEVER_NS:
             return None
         if source_ns is not None and first_ns is not None:
-            return self._again(Packet(envelope, packet.payload, first_ns), source_ns, history)
+            return self._keep_again(Packet(envelope, packet.payload, first_ns), source_ns, history)
         said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
         out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
         kept = self._keep(out, source_ns, history)
@@ -95,31 +97,34 @@ class PacketCache:
         return out, kept
 
     def pass_over(self, packet: Packet) -> bool:
-        """Take note of a packet of the translator's that is not published; False: we have had it."""
+        """Remember a packet of the translator that is not published; False: it is a duplicate."""
         if packet.time_ns is None:
             return True
         is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS
-        self._saw(packet.time_ns)
+        self._note_source(packet.time_ns)
         self._recent.append((packet.time_ns, _NEVER_NS))
         return is_new
 
     def recent(self) -> list[tuple[int, int]]:
-        """(translator's time, ours) of the packets published last, for a restarted scheduler's `remember`."""
+        """Return (translator's time, published time) of the last packets, for `remember` after a restart."""
         return [*self._first_times.items(), *self._recent]
 
     def remember(self, recent: Iterable[tuple[int, int]]) -> None:
-        """These have been published already, before we were killed. Should they come again since they could not be
-        written down any more, they keep their first times, by which subscribers know that they have had them."""
+        """Store the times of packets that were published before a restart.
+
+        A packet that comes again, because it was not in the log yet, keeps its first time. Subscribers recognise a
+        duplicate by this time.
+        """
         self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
-        """A packet of the scheduler's own, kept under its envelope."""
+        """Return a packet of the scheduler itself with its time, kept under its envelope."""
         out = Packet(envelope, payload, self._next_ns(now_ns))
         message = envelope.partition("_")[0]  # no message of the scheduler has an underscore in its name
         return out, self._keep(out, None, self._envelopes.history(message))
 
     def restore(self, packets: Iterable[LoggedPacket]) -> None:
-        """Take up what was kept before a restart, oldest first."""
+        """Take packets of before a restart, oldest first."""
         newest_ns = next(reversed(self._kept), 0)
         for packet, source_ns, history in packets:
             if packet.time_ns is None or packet.time_ns <= newest_ns:
@@ -127,16 +132,16 @@ class PacketCache:
             newest_ns = packet.time_ns
             self.not_before(newest_ns)
             if source_ns is not None:
-                self._saw(source_ns)
+                self._note_source(source_ns)
             self._keep(packet, source_ns, history)
 
     def holds(self, envelope: str, payload: bytes) -> bool:
-        """Return whether one of the newest packets of an envelope is just this."""
+        """Return whether one of the newest packets of an envelope has this payload."""
         newest = islice(reversed(self._times.get(envelope, ())), _NEWEST)
         return any(self._kept[time_ns].packet.payload == payload for time_ns in newest)
 
     def not_before(self, time_ns: int) -> None:
-        """Publish nothing from here on with a time before this."""
+        """Publish every further packet with a time after this."""
         self._last_ns = max(self._last_ns, time_ns)
 
     def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:
@@ -148,10 +153,11 @@ class PacketCache:
             if time_ns > since_ns and kept.packet.envelope.startswith(starts)
         )
 
-    def _again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, int]:
+    def _keep_again(self, packet: Packet, source_ns: int, history: int) -> tuple[Packet, int]:
         assert packet.time_ns is not None
         self._recent.append((source_ns, packet.time_ns))
         kept = self._keep(packet, source_ns, history)
+        # its first time may lie before packets cached since
         self._kept = dict(sorted(self._kept.items()))
         for envelope, times in self._times.items():
             self._times[envelope] = deque(sorted(times))
@@ -167,7 +173,7 @@ class PacketCache:
         self._last_ns = max(time_ns, self._last_ns + TIME_STEP_NS)
         return self._last_ns
 
-    def _saw(self, source_ns: int) -> None:
+    def _note_source(self, source_ns: int) -> None:
         self._newest_source_ns = source_ns
         self._sources[source_ns] = None
         if len(self._sources) > _TIMES_REMEMBERED:
@@ -187,11 +193,11 @@ class PacketCache:
         while len(times) > history:
             self._drop(times[0])
         while self._bytes > self._max_bytes:
-            self._drop(self._least_needed())
+            self._drop(self._next_to_evict())
         return history
 
-    def _least_needed(self) -> int:
-        """The oldest packet that its envelope has a newer one of; else the oldest."""
+    def _next_to_evict(self) -> int:
+        # the oldest packet with a newer one under its envelope, so that a late joiner gets the newest of each envelope
         if self._several:
             return next(t for t, kept in self._kept.items() if len(self._times[kept.packet.envelope]) > 1)
         return next(iter(self._kept))

@@ -1,4 +1,4 @@
-"""Under which envelope the scheduler publishes and caches a packet, and how many of them it keeps."""
+"""The envelope under which the scheduler publishes and caches a packet, and the number of packets kept under it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ EnvelopeMapping = Callable[[PacketHeader], str]
 
 
 def default_envelope(header: PacketHeader) -> str:
-    """The wire format's: "Scan2d_2000.0_Height", "Spec1d_IV", or else the name of the message."""
+    """Return the envelope of the wire format: "Scan2d_2000.0_Height", "Spec1d_IV", or else the name of the message."""
     if header.message == SCAN.name and header.size_m is not None:
         return f"{SCAN.name}_{size_text(header.size_m[0])}_{header.channel or ''}"
     if header.message == SPECTRUM.name and header.kind:
@@ -28,12 +28,12 @@ def default_envelope(header: PacketHeader) -> str:
 
 
 def tells(envelope: str, message: str) -> bool:
-    """Return whether an envelope begins with the name of its message, as subscribers must know it."""
+    """Return whether an envelope begins with the name of its message: subscribers find its type by it."""
     return envelope == message or envelope.startswith(f"{message}_")
 
 
 def size_text(size_m: float) -> str:
-    """A length in nm, rounded, as a decimal number; below 1 nm with its digits, since all of them would be 0.0 or 1.0.
+    """Return a length in nm as a decimal number: rounded, but with its digits below 1 nm.
 
     >>> size_text(2e-6), size_text(2.5e-10)
     ('2000.0', '0.25')
@@ -82,7 +82,8 @@ class CacheRule:
             message = self.message or "AnyMessage"
             if not tells(self.name(PacketHeader(message, "", (0.0, 0.0), "")), message):
                 raise InvalidValue(
-                    f"the envelope {self.envelope!r} does not begin with the name of its message: nobody could read it",
+                    f"the envelope {self.envelope!r} does not begin with the name of its message:"
+                    " no subscriber could decode it",
                     where="[cache]",
                     hint=f"e.g. {self.message or '{message}'}_{self.envelope}",
                 )
@@ -102,7 +103,11 @@ class CacheRule:
         )
 
     def name(self, header: PacketHeader) -> str:
-        """The envelope of a packet that fits."""
+        """Return the envelope of a packet that fits.
+
+        Raises:
+            InvalidValue: the text has another field than {message}, {channel}, {kind} and {size}.
+        """
         if self.envelope is None:
             return default_envelope(header)
         size = "" if header.size_m is None else size_text(header.size_m[0])
@@ -137,7 +142,7 @@ class CacheSettings:
 
     @property
     def envelopes(self) -> tuple[str, ...]:
-        """The beginnings of the rules' envelopes, as far as they are fixed."""
+        """The fixed beginnings of the rules' envelopes."""
         return tuple(re.split(r"[{}]", rule.envelope)[0] for rule in self.rules if rule.envelope)
 
 
@@ -146,7 +151,7 @@ class Envelopes:
 
     Args:
         rules: tried in their order; then the defaults.
-        mapping: a function of the user's own that names the envelope instead of rules and defaults.
+        mapping: a function of the user that names the envelope instead of rules and defaults.
         history: how many packets to keep, by message, instead of the number in the declaration.
     """
 
@@ -161,7 +166,11 @@ class Envelopes:
         self._history = history or {}
 
     def of(self, header: PacketHeader) -> tuple[str, int]:
-        """The envelope of a packet, and how many of that envelope are kept."""
+        """Return the envelope of a packet, and how many packets of this envelope are kept.
+
+        Raises:
+            ConfigError: the user's function fails, or its envelope does not begin with the name of the message.
+        """
         rule = next((rule for rule in self._rules if rule.fits(header)), None)
         history = self.history(header.message)
         if rule is not None and rule.history is not None:
@@ -170,7 +179,7 @@ class Envelopes:
             envelope = self._mapped(self._mapping, header)
             if not isinstance(envelope, str) or "\0" in envelope or not tells(envelope, header.message):
                 raise ConfigError(
-                    f"the mapping of envelopes gave {envelope!r} for {header.message}: nobody could read it",
+                    f"the mapping of envelopes gave {envelope!r} for {header.message}: no subscriber could decode it",
                     where="[cache]",
                     hint=f"a text without NUL: {header.message}, or what begins with {header.message}_",
                 )
@@ -178,7 +187,7 @@ class Envelopes:
         return (default_envelope(header) if rule is None else rule.name(header)), history
 
     def history(self, message: str) -> int:
-        """Return how many packets of a message are kept where no rule says otherwise."""
+        """Return how many packets of a message are kept where no rule decides."""
         if (own := self._history.get(message)) is not None:
             return own
         try:
@@ -190,5 +199,5 @@ class Envelopes:
     def _mapped(mapping: EnvelopeMapping, header: PacketHeader) -> object:
         try:
             return mapping(header)
-        except Exception as error:  # it is the user's own
+        except Exception as error:  # the user's function may raise anything, and must not end the scheduler
             raise ConfigError(f"the mapping of envelopes fails: {error!r}", where="[cache]") from error

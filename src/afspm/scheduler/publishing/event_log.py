@@ -1,7 +1,6 @@
-"""The event log: what was asked and answered, who is in control, orders; published some at a time.
+"""The event log: requests with their answers, changes of control, and orders; published in batches.
 
-To add an entry costs next to nothing, since nobody waits longer for an answer because of it: words are found when it
-is published.
+Adding an entry must not delay an answer, so entries are put into words only when they are published.
 """
 
 from __future__ import annotations
@@ -28,24 +27,24 @@ from afspm.model import (
 )
 from afspm.model.sessions import key_of
 from afspm.scheduler.control.arbitration import ArbitrationState, ControlInput, Transition
-from afspm.scheduler.control.descriptions import asked
+from afspm.scheduler.control.descriptions import request_text
 
 PERIOD_S = 0.1
 """Real time between two publications, at least."""
 MOST = 1000
-"""Requests written down within that time; of more it is only said how many there were."""
+"""Requests logged within that time; further ones are only counted."""
 LONGEST = 1000
-"""Characters of what was asked, and of the reason."""
+"""Characters of a request in words, and of a reason."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
-LATE = "late: the client had been told that there was no answer"
-"""Of an answer of the translator that came after all."""
+LATE = "late: the client had got no answer in time"
+"""The reason of an answer that came after the client had given up."""
 SCHEDULER = "scheduler"
-"""Who asks for what nobody else did."""
-_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})
+"""The author of requests of the scheduler itself."""
+_UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
 _STARTS = frozenset({names.START_SCAN, names.START_SPEC})
 _STARTS_KEPT = 16
-"""Starts kept over a restart: many more than can be passed on while one entry waits to be published."""
+"""Starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
 _CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
@@ -53,9 +52,9 @@ class AnsweredRequest(NamedTuple):
     """A request with its answer, not in words yet.
 
     Attributes:
-        took_s: real time from the question to the answer.
-        late: the answer came after the client had been told that there was none.
-        sent_ns: when it was passed on to the translator; None: it was not.
+        took_s: real time from the request to its answer.
+        late: the answer came after the client had got "no response".
+        sent_ns: when it was forwarded to the translator; None: it was not.
     """
 
     time_ns: int
@@ -68,7 +67,7 @@ class AnsweredRequest(NamedTuple):
 
     def entry(self, problems: ProblemNames) -> JournalEntry:
         kind = ORDER if self.request.kind == RESTART_REQUEST else REQUEST
-        what = asked(self.request, problems)[:LONGEST]
+        what = request_text(self.request, problems)[:LONGEST]
         reason = "; ".join(filter(None, (LATE if self.late else "", self.response.reason[:LONGEST])))
         flags = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
         return JournalEntry(
@@ -89,10 +88,10 @@ class AnsweredRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class SentStart:
-    """The start of a measurement, saved before it is passed on: the measurement has its key from the entry of it.
+    """The start of a measurement, saved before it is forwarded: its entry gives the measurement its key.
 
     Attributes:
-        sent_ns: when it was passed on for the first time.
+        sent_ns: when it was first forwarded.
     """
 
     who: str
@@ -101,7 +100,7 @@ class SentStart:
     sent_ns: int
 
     def entry(self, now_ns: int) -> JournalEntry:
-        """Return the entry of a start whose answer was lost with the scheduler's process."""
+        """Return the entry of a start whose answer was lost when the scheduler was killed."""
         return JournalEntry(
             now_ns,
             REQUEST,
@@ -117,12 +116,12 @@ class SentStart:
 
 @dataclass(frozen=True)
 class EventLog:
-    """The entries that are still to be published.
+    """The entries that are not published yet.
 
     Attributes:
-        due_s: when, in real monotonic time, they are to be published; None: there are none.
-        left_out: requests beyond `most`.
-        starts: the last that were passed on, saved before they are: a kill loses the entries that were gathered.
+        due_s: when they are due, in real monotonic time; None: there are none.
+        left_out: the number of requests beyond `most`.
+        starts: the last starts, each saved before it was forwarded: a kill loses the gathered entries.
     """
 
     most: int = MOST
@@ -138,7 +137,7 @@ class EventLog:
         return replace(self, due_s=due_s, gathered=(*self.gathered, *entries))
 
     def add_request(self, now_s: float, entry: AnsweredRequest | JournalEntry) -> EventLog:
-        """Add one of those of which there may be any number."""
+        """Add an entry of a kind without a bound on its number: beyond `most` it is only counted."""
         if isinstance(entry, AnsweredRequest) and entry.request.kind in _UNWRITTEN:
             return self
         if len(self.gathered) >= self.most:
@@ -146,12 +145,12 @@ class EventLog:
         return self.add(now_s, entry)
 
     def sent_ns(self, who: str, request: Request, now_ns: int) -> int:
-        """Return when a request was passed on for the first time: now, unless it is a start that is repeated."""
+        """Return when a request was first forwarded: now, unless it repeats a start."""
         known = (one.sent_ns for one in self.starts if (one.who, one.request_id) == (who, request.id) and request.id)
         return next(known, now_ns)
 
     def sending(self, who: str, request: Request, sent_ns: int) -> EventLog:
-        """Remember a request that is passed on, if it starts a measurement."""
+        """Remember a request that is forwarded, if it starts a measurement."""
         if request.kind != ControlRequest.ACTION or request.subject not in _STARTS:
             return self
         start = SentStart(who, str(request.subject), request.id, sent_ns)
@@ -160,17 +159,17 @@ class EventLog:
     def restored(
         self, starts: Sequence[SentStart], published: Iterable[JournalEntry], now_s: float, now_ns: int
     ) -> EventLog:
-        """Take up the starts of the life before; those without a published entry get one.
+        """Restore the starts of before a restart; a start without a published entry gets one.
 
         Args:
-            published: entries that outlived the restart.
+            published: the entries in the restored cache.
         """
         known = {(entry.who, entry.sent_ns) for entry in published}
         lost = [one.entry(now_ns) for one in starts if (one.who, one.sent_ns) not in known]
         return replace(self, starts=tuple(starts)).add(now_s, *lost)
 
     def take(self, problems: ProblemNames, now_ns: int) -> tuple[EventLog, JournalEntries]:
-        """Return the entries in words, oldest first: they are the caller's to publish."""
+        """Return the log without its entries, and the entries in words, oldest first, to be published."""
         entries = [one if isinstance(one, JournalEntry) else one.entry(problems) for one in self.gathered]
         if self.left_out:
             entries.append(JournalEntry(now_ns, REQUEST, SCHEDULER, f"{self.left_out} more requests are left out"))
@@ -178,15 +177,13 @@ class EventLog:
 
 
 def unreadable_entry(now_ns: int, who: str, response: Response) -> JournalEntry:
-    """Return the entry of a request that could not be read."""
     return JournalEntry(now_ns, REQUEST, who, "an unreadable request", response.code, response.reason[:LONGEST], 0.0)
 
 
 def start_entry(now_ns: int, control: ArbitrationState, *, is_restart: bool) -> JournalEntry:
-    """Return the entry of the scheduler's start."""
     if not is_restart:
         return JournalEntry(now_ns, CONTROL, SCHEDULER, "started", event=ControlEvent.STARTED)
-    what = f"started again; {control.holder or 'nobody'} is in control"
+    what = f"started again; {control.holder or 'no component'} is in control"
     return JournalEntry(now_ns, CONTROL, SCHEDULER, what, event=ControlEvent.RESTARTED)
 
 
@@ -198,7 +195,7 @@ def control_entries(
     row: Transition,
     problems: ProblemNames,
 ) -> list[JournalEntry]:
-    """Return an entry for each change of control, mode and problems: in whose name it was, and why."""
+    """Return an entry for each change of the holder, the mode and the problems: its author, and its reason."""
     name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
     entries = []
     if before.holder is not None and after.holder != before.holder:

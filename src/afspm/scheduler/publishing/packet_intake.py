@@ -1,4 +1,4 @@
-"""Packets of the translator: each gets its envelope, its time and its coordinates, and tells of the microscope."""
+"""Packets of the translator: each gets an envelope, a time and its coordinates, and updates the microscope's state."""
 
 from __future__ import annotations
 
@@ -24,25 +24,26 @@ from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.state import StateDraft
 from afspm.wire.messages import CONTROL_STATE
 
+# bounded, since the texts contain names that come from a peer
 _MOST_LOGGED = 1000
 _STATE, _TRANSLATOR = wire.MessageKind.STATE, Role.TRANSLATOR
 
 
 def take_packet(draft: StateDraft, event: PacketIn) -> None:
-    """Publish a packet, and learn from it what the microscope does."""
+    """Publish a packet, and update the state of the microscope from it."""
     message, codec, move = event.header.message, draft.env.codec, draft.pending.move
-    # all other messages pass unread: they change nothing that the scheduler decides by
+    # only states are decoded: no decision depends on other messages, and scans are large
     told = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
     if move is not None and move.hides(told):
         if draft.env.cache.pass_over(event.packet):
-            _learn(draft, told)
+            _update_state(draft, told)
         return
     published = _published(draft, event.packet, event.header)
     if published is None:
         return
     draft.effects.append(published)
     if told is not None:
-        _learn(draft, told)
+        _update_state(draft, told)
 
 
 def _is_state(message: str) -> bool:
@@ -70,9 +71,9 @@ def _log_once(draft: StateDraft, level: str, text: str) -> None:
         draft.log(level, text)
 
 
-def _learn(draft: StateDraft, told: object) -> None:
+def _update_state(draft: StateDraft, told: object) -> None:
     if isinstance(told, ScopeStatus):
-        _take_state(draft, told.state)
+        _update_scope_state(draft, told.state)
     elif isinstance(told, Feedback):
         before, draft.microscope = draft.microscope, draft.microscope.with_feedback(told)
         is_manual = draft.control.mode is ControlMode.MANUAL
@@ -83,13 +84,14 @@ def _learn(draft: StateDraft, told: object) -> None:
         draft.limits = draft.limits.published(told, draft.now_ns)
 
 
-def _take_state(draft: StateDraft, state: ScopeState) -> None:
+def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     was_free = draft.microscope.is_free
     draft.microscope = draft.microscope.with_state(state, draft.now_s)
-    draft.watchdog = draft.watchdog.state_told(draft.microscope)
+    draft.watchdog = draft.watchdog.state_reported(draft.microscope)
     if draft.microscope.is_free != was_free:
         draft.lease = draft.lease.used(draft.now_ns)
     flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)
+    # only the flag raised for the translator: that of a component waits for a person (decision 0016)
     if draft.microscope.lost_since_s is None and flagged_by == TRANSLATOR:
         control_change.decide(draft, ControlInput(ArbitrationEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
     safety_commands.send(draft)

@@ -21,20 +21,20 @@ def answer(
     payload: bytes = b"",
     detail: ResponseDetail = ResponseDetail.NONE,
 ) -> None:
-    """Answer a request by ourselves, once and for all."""
+    """Send the scheduler's own answer to a request, and remember it under the request's id."""
     response = Response(int(code), payload, reason, event.request.id, detail)
     draft.idempotency = draft.idempotency.noted(event.name, event.request, response)
     reply(draft, event, response)
 
 
 def reply(draft: StateDraft, event: RequestIn, response: Response) -> None:
-    """Answer a request this time; asked again, it is decided anew."""
+    """Send an answer without remembering it: a repeated request is decided again."""
     draft.effects.append(Reply(event.connection, event.name, response, event.request.kind))
     write_down(draft, event.name, event.request, response, event.heard_s)
 
 
 def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = ControlResponse.FAILURE) -> None:
-    """Refuse a peer that may not speak for its name; that is logged once for each connection."""
+    """Refuse a peer that may not use its name; logged once for each connection."""
     draft.pending, was_refused = refused_again(draft.pending, event.connection)
     if not was_refused:
         draft.log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
@@ -42,7 +42,7 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
 
 
 def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Answer a request that is not sent. Of a repeated one it stays unknown whether it was carried out before."""
+    """Answer a request that is not sent; of a repeated one it stays unknown whether it was carried out before."""
     unknown = ResponseDetail.OUTCOME_UNKNOWN
     if job.is_repeated:
         reason = f"outcome unknown: it was sent once, and is not sent again ({response.reason})"
@@ -56,29 +56,30 @@ def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) 
 
 
 def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status: RequestStatus | None = None) -> None:
-    """Remember the answer to a request, or that its outcome is unknown, and give it."""
+    """Remember the answer to a request, or that its outcome is unknown, and send it."""
     draft.idempotency = draft.idempotency.noted(job.client, job.request, response if status is None else status)
     if job.sent_s is not None and status is None and not response.ok:
-        take_back(draft, job)  # what was refused does not count as used; what nobody knows of does
+        take_back(draft, job)  # a refused request does not count as a use; one of unknown outcome does
     answer_job(draft, job, response)
 
 
 def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Take back what a request has used of its limits."""
+    """Return what a request has used of its limits."""
     mapped = job.mapped
     draft.limits = draft.limits.not_done(job.client, job.outgoing, None if mapped is None else mapped.names)
 
 
 def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Answer over the newest connection of the client; without an id only over the one that it asked by."""
+    """Answer over the client's newest connection; without a request id only over the connection of the request."""
     write_down(draft, job.client, job.request, response, job.heard_s, sent_ns=job.sent_ns)
     connection = draft.peers.sessions.connection_of(job.client)
+    # without an id a restarted client would take it for the answer to its own request
     if connection is not None and (job.request.id or connection == job.connection):
         draft.effects.append(Reply(connection, job.client, response, job.request.kind))
 
 
 def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> None:
-    """Answer the commands of a former holder (None: of anybody) that have not been sent: they are not sent any more."""
+    """Remove unsent commands of a former holder (None: of all clients) from the queue, and answer them."""
     reason = f"control was taken before this was sent: {cause.value if cause else 'the mode was changed'}"
     draft.forwarder, jobs = draft.forwarder.called_back(lambda job: job.command and former in (None, job.client))
     for job in jobs:

@@ -1,9 +1,8 @@
-"""The line to the translator: one request in flight, the others wait, each has a deadline, and every one is answered.
+"""The line to the translator: one request is in flight, the others wait, and each has a deadline.
 
-A translator serves one request after the other and says nothing while it does. So one is in flight; the
-others wait here, where they can still be called back, and a request that waited too long is answered unsent. The line
-keeps the order and the times; whether a request is sent, and as what, is decided as its turn comes
-(`request_pipeline.send_next`).
+A translator serves one request after the other and is silent meanwhile. So one is in flight. The others wait here,
+where they can still be removed; a request that has waited too long is answered unsent. The line keeps the order and
+the times. Whether a request is sent, and in which form, is decided when its turn comes (`request_pipeline.send_next`).
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from afspm.scheduler.events import Forward, RequestIn
 
 @dataclass(frozen=True, slots=True)
 class ReadForTurn:
-    """The value of `name` is read before the request `number` is decided."""
+    """Read the value of `name` before the request `number` is decided."""
 
     number: int
     name: str
@@ -29,21 +28,21 @@ class ReadForTurn:
 
 @dataclass(frozen=True, slots=True)
 class MoveForTurn:
-    """The microscope is moved before the action `number`."""
+    """Move the microscope before the action `number`."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
 class ReadAhead:
-    """The value of `name` is read when a translator comes."""
+    """Read the value of `name` when a translator connects."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class AskForFrame:
-    """The coordinate frame asked, for a purpose that it knows."""
+    """Send a request of the coordinate frame; only the frame reads `purpose`."""
 
     purpose: object
 
@@ -55,18 +54,18 @@ class ForwardedRequest(NamedTuple):
     """A request for the translator.
 
     Attributes:
-        client: who asked; empty for the scheduler's own.
-        command: whether it is a command, which only who is in control may give.
-        deadline_s: when (real) it must be answered at the latest; 0: none yet.
-        sent_s: when it was sent; None while it waits.
-        answered: the client has been told that there was no response in time.
-        connection: the one it was asked by.
-        states_seen: how many states the microscope had told when it was sent.
-        mapped: what is sent in place of `request`, where the microscope has other coordinates.
-        heard_s: when it was asked, real.
+        client: the name of the client; empty for a request of the scheduler itself.
+        command: whether only the holder of control may give it.
+        deadline_s: when it must be answered at the latest, real; 0: none yet.
+        sent_s: when it was sent, real; None while it waits.
+        answered: the client has got "no response in time".
+        connection: the connection that it arrived by.
+        states_seen: how many states the microscope had reported when it was sent.
+        mapped: the request in the coordinates of the microscope, if they differ.
+        heard_s: when it arrived, real.
         sent_ns: when it was sent, experiment time; None: it was not.
         is_repeated: it was sent before under its id, with an unknown outcome.
-        purpose: of one of the scheduler's own; None: it is for the tip's safety.
+        purpose: of a request of the scheduler itself; None: it is for the tip's safety.
     """
 
     client: str
@@ -93,18 +92,18 @@ class ForwardedRequest(NamedTuple):
 
     @property
     def outgoing(self) -> Request:
-        """The request as the microscope gets it."""
+        """The request in the coordinates of the microscope."""
         return self.request if self.mapped is None else self.mapped.request
 
 
 class ForwardOutcome(Enum):
-    """The end of a forwarded request."""
+    """The outcome of a forwarded request."""
 
     ANSWERED = auto()
     NOT_SENT = auto()
     UNKNOWN = auto()
     LATE = auto()
-    """The true answer, after the client was told that none had come."""
+    """The true answer, after the client had got "no response"."""
 
 
 class SettledRequest(NamedTuple):
@@ -118,17 +117,18 @@ Settled = tuple[SettledRequest, ...]
 
 @dataclass(frozen=True)
 class Forwarder:
-    """The one line to the translator.
+    """The line to the translator.
 
     Attributes:
         timeout_s: how long (real) a client waits for an answer.
-        patience_s: how much longer the line is kept for an answer that is overdue, before the next is sent.
-        longest_queue: how many may wait.
+        patience_s: how much longer the line waits for an overdue answer before it sends the next request.
+        longest_queue: how many requests may wait.
         up: the translator is connected.
-        flight: the request that is with the translator.
-        own, queue: waiting requests in their order: of the scheduler, which go first, and of clients.
-        overdue: those whose answer may still come, by number.
-        outbox: to be sent now; the caller empties it.
+        flight: the request that the translator is serving.
+        own: waiting requests of the scheduler itself, in order; they go first.
+        queue: waiting requests of clients, in order.
+        overdue: requests whose answer may still come, by number.
+        outbox: requests to send now; the caller empties it.
     """
 
     timeout_s: float = 5.0
@@ -143,12 +143,12 @@ class Forwarder:
     outbox: tuple[Forward, ...] = ()
 
     def connected(self) -> tuple[Forwarder, Settled]:
-        """Open the line. A reconnection is a loss before it."""
+        """Open the line. A reconnection settles the requests of the lost connection first."""
         forwarder, settled = self.lost() if self.up else (self, ())
         return replace(forwarder, up=True), settled
 
     def lost(self) -> tuple[Forwarder, Settled]:
-        """Answer all at once: the translator is gone."""
+        """Close the line, and settle all requests: the translator is disconnected."""
         waiting = tuple(_not_sent(job, "the translator is not connected") for job in (*self.own, *self.queue))
         if self.flight is not None and not self.flight.answered:
             why = "the connection to the translator was lost before it answered"
@@ -157,11 +157,11 @@ class Forwarder:
 
     @property
     def is_free(self) -> bool:
-        """True while a request can be sent."""
+        """Whether a request can be sent."""
         return self.up and self.flight is None
 
     def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
-        """Have a client's request wait for its turn. Returns also its refusal, if it was refused."""
+        """Queue a client's request. Return also its refusal, or None."""
         if not self.up:
             return self, _not_sent(job, "the translator is not connected")
         if len(self.queue) >= self.longest_queue:
@@ -172,7 +172,7 @@ class Forwarder:
     def ask_own(
         self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
     ) -> tuple[Forwarder, ForwardedRequest | None]:
-        """Have a request of the scheduler's own sent before all that wait. None: the translator is not connected."""
+        """Queue a request of the scheduler before those of clients. Return None if no translator is connected."""
         if not self.up:
             return self, None
         number, deadline_s = self.number + 1, now_s + self.timeout_s
@@ -183,7 +183,7 @@ class Forwarder:
         return replace(self, number=number, own=(*self.own, job)), job
 
     def sent(self, job: ForwardedRequest, now_s: float) -> Forwarder:
-        """Send a request that waited."""
+        """Send a waiting request."""
         assert self.is_free
         rest = self.without(job.number)
         return replace(
@@ -196,11 +196,11 @@ class Forwarder:
         return replace(self, own=own, queue=queue)
 
     def waiting(self, number: int) -> ForwardedRequest | None:
-        """Return a client's request that waits, by its number; None: it was sent, answered or called back."""
+        """Return a client's waiting request by its number; None: it was sent, answered or removed."""
         return next((job for job in self.queue if job.number == number), None)
 
     def answered(self, number: int, response: Response) -> tuple[Forwarder, SettledRequest | None]:
-        """Take an answer of the translator. None: it belongs to no request that is open."""
+        """Take an answer of the translator. Return None if its request is not open any more."""
         job = self.flight
         if job is not None and job.number == number:
             outcome = ForwardOutcome.LATE if job.answered else ForwardOutcome.ANSWERED
@@ -212,7 +212,7 @@ class Forwarder:
         return replace(self, overdue=rest), SettledRequest(late, ForwardOutcome.LATE, response)
 
     def expired(self, now_s: float) -> tuple[Forwarder, Settled]:
-        """Answer those that have waited too long."""
+        """Settle the requests whose deadline has passed."""
         settled, flight = list[SettledRequest](), self.flight
         if flight is not None and not flight.answered and now_s >= flight.deadline_s:
             flight = flight._replace(answered=True)
@@ -222,30 +222,32 @@ class Forwarder:
         own, queue = (tuple(job for job in jobs if now_s < job.deadline_s) for jobs in (self.own, self.queue))
         forwarder = replace(self, flight=flight, own=own, queue=queue)
         if flight is not None and flight.answered and now_s >= self._patience_ends_s(flight):
+            # bounded: a translator that never answers must not fill the memory
             overdue = [*self.overdue.items(), (flight.number, flight)][-self.longest_queue :]
             forwarder = replace(forwarder, overdue=dict(overdue), flight=None)
         return forwarder, tuple(settled)
 
     def asked_again(self, client: str, request_id: str, now_s: float) -> Forwarder | None:
-        """Wait once more for an overdue request that its client repeats; None: it is not at the translator."""
+        """Extend the deadline of an overdue request that its client repeats; None: it is not with the translator."""
         job = self.flight
         if job is None or job.client != client or job.request.id != request_id:
             return None
         return replace(self, flight=job._replace(answered=False, deadline_s=now_s + self.timeout_s))
 
     def called_back(self, which: Callable[[ForwardedRequest], bool]) -> tuple[Forwarder, list[ForwardedRequest]]:
-        """Take back requests that wait and have not been sent; the caller answers them."""
+        """Remove clients' requests that were not sent; the caller answers them."""
         called = [job for job in self.queue if which(job)]
         return replace(self, queue=tuple(job for job in self.queue if job not in called)), called
 
     def deadline_s(self) -> float | None:
-        """Return when `expired` has something to do."""
+        """Return when `expired` is due, real; None: no request is open."""
         times = [jobs[0].deadline_s for jobs in (self.own, self.queue) if jobs]
         if self.flight is not None:
             times.append(self._patience_ends_s(self.flight) if self.flight.answered else self.flight.deadline_s)
         return min(times, default=None)
 
     def _patience_ends_s(self, job: ForwardedRequest) -> float:
+        # not at once: the next request would only wait in the translator's queue, where it can't be called back
         assert job.sent_s is not None
         return job.sent_s + self.timeout_s + self.patience_s
 

@@ -1,4 +1,4 @@
-"""The request whose turn it is, while reads or a move come before it; and requests of unclear connections."""
+"""The request whose turn it is, during its reads and moves; and requests of an unclear sender."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from afspm.scheduler.events import RequestIn
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 
 SETTLED_WITHIN_S = 2.0
-"""Real time for which a microscope that tells nothing of a move is waited for after it."""
+"""The longest wait, real, after a move: a microscope may not report that it moves."""
 _UNCLEAR_S = 0.5  # real; the closing of a connection is seen within milliseconds
 
 
@@ -22,8 +22,8 @@ class PrePositioner:
 
     Attributes:
         move: the request that moves the microscope.
-        states_seen: states told before the move.
-        settled_at_s: until when (real) the microscope is waited for after the move; None: it has not moved yet.
+        states_seen: number of states reported before the move.
+        settled_at_s: until when (real) to wait for the microscope after the move; None: it has not moved yet.
     """
 
     move: ForwardedRequest
@@ -31,9 +31,9 @@ class PrePositioner:
     settled_at_s: float | None = None
 
     def hides(self, told: object) -> bool:
-        """Return whether a state is only that of the move, and not published.
+        """Return whether a state belongs to the move only, and is not published.
 
-        The action, which its client knows to be under way, would seem to be over before it began.
+        To the client the action is under way, and would seem to be over before it began.
         """
         return isinstance(told, ScopeStatus) and told.state in (ScopeState.MOVING, ScopeState.FREE)
 
@@ -42,7 +42,7 @@ class PrePositioner:
         return replace(self, settled_at_s=min(now_s + SETTLED_WITHIN_S, self.move.deadline_s))
 
     def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
-        """Return whether the action may be sent: while the microscope moves it would refuse."""
+        """Return whether the action may be sent: a moving microscope would refuse it."""
         if self.settled_at_s is None:
             return False
         is_free = microscope.state is ScopeState.FREE and microscope.states_seen > self.states_seen
@@ -55,8 +55,8 @@ class Turn:
 
     Attributes:
         number: of the request, in the forwarder's queue.
-        awaited: parameters that are being read; None: the reading has not begun.
-        values: by parameter; None where the microscope answered no value.
+        awaited: parameters being read; None: reading has not begun.
+        values: by parameter; None where the microscope answered without a value.
         move: the move before an action; None: there was none.
     """
 
@@ -69,15 +69,15 @@ class Turn:
         return replace(self, awaited=names, values={})
 
     def was_read(self, name: str, told: Parameter | None) -> Turn:
-        """Take the value of a parameter; None: the microscope answered none."""
+        """Store the value of a parameter; None: the microscope answered without a value."""
         return replace(self.lacks(name), values={**self.values, name: told})
 
     def lacks(self, name: str) -> Turn:
-        """Go on without a parameter, which the microscope does not have."""
+        """Continue without a parameter that the microscope does not have."""
         return replace(self, awaited=(self.awaited or frozenset()) - {name})
 
     def moving(self, move: PrePositioner) -> Turn:
-        """Wait for a move, after which values are read again."""
+        """Wait for a move, then read the values again."""
         return Turn(self.number, move=move)
 
     def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
@@ -87,12 +87,12 @@ class Turn:
 
 @dataclass(frozen=True)
 class PendingRequests:
-    """All that waits.
+    """The requests that wait for a read, a move, or the closing of another connection.
 
     Attributes:
         turn: of the request that waits for reads or a move.
-        unclear: requests from a second connection under a name, by that name, and until when they are not answered.
-        refused: connections that were refused, which is logged once for each.
+        unclear: requests of a second connection under a name, by name, with the end (real) of the wait for the first.
+        refused: connections that were refused: logged once for each.
     """
 
     turn: Turn | None = None
@@ -107,18 +107,18 @@ class PendingRequests:
         return replace(self, unclear={**self.unclear, event.name: (event, now_s + _UNCLEAR_S)})
 
     def clear_up(self, name: str) -> tuple[PendingRequests, RequestIn | None]:
-        """Return the request parked while an older connection with this name was closing."""
+        """Return the request of a second connection with this name, which waited for the first to close."""
         if name not in self.unclear:
             return self, None
         rest = {other: one for other, one in self.unclear.items() if other != name}
         return replace(self, unclear=rest), self.unclear[name][0]
 
     def still_unclear(self, now_s: float) -> list[str]:
-        """Return the names for which both connections go on: they are two."""
+        """Return the names for which both connections stay open: they belong to two processes."""
         return [name for name, (_, until_s) in self.unclear.items() if now_s >= until_s]
 
     def due_s(self, *, line_is_free: bool) -> float | None:
-        """Return when, in real time, there is something to do; before that the forwarder watches over the move."""
+        """Return when the next wait ends, in real time. While the move is in flight, the forwarder has its deadline."""
         dues = [until_s for _, until_s in self.unclear.values()]
         if line_is_free and self.move is not None and self.move.settled_at_s is not None:
             dues.append(self.move.settled_at_s)
@@ -126,7 +126,7 @@ class PendingRequests:
 
 
 def refused_again(pending: PendingRequests, connection: int) -> tuple[PendingRequests, bool]:
-    """Return whether a connection was refused before; from now on it was."""
+    """Return whether a connection was refused before, and mark it as refused."""
     if connection in pending.refused:
         return pending, True
     return replace(pending, refused=pending.refused | {connection}), False

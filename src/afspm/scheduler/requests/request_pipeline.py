@@ -5,19 +5,19 @@
 | 1. admitted | at arrival | session, idempotency |
 | 2. authorised | at arrival, and again when it is sent | the arbitration table |
 | 3. queued | at arrival | the forwarder: one line to the translator, in order |
-| 4. within limits | as its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
+| 4. within limits | when its turn comes, right before it is sent | limits, coordinate frame, the microscope itself |
 | 5. settled | at the answer, or when it is overdue | |
 
-Nothing is done twice, and every request gets an answer.
+No request is executed twice, and every request gets an answer.
 
-**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and requests before it
-in the queue change these. So a request is decided as its turn comes: no other command is on its way, all earlier ones
+**Why limits are decided at the fourth stage.** Limits compare a request with values in force, and earlier requests in
+the queue change these. So a request is decided when its turn comes: no other command is on its way, all earlier ones
 have settled, and the scheduler first reads the values from the microscope. A request of unknown outcome needs no
-special case: the values that it may have changed are read before the next request that depends on them, or that one is
-refused. An overdue request may still be carried out; since the translator serves one request after the other, a value
-that it answers later is newer. A turn takes up to three steps: values are read, the microscope is moved to where the
-place is in its coordinates, values are read again. Meanwhile requests that only read pass, and the scheduler's own
-(`safety_commands`) always go first.
+special case: the values that it may have changed are read before the next request that depends on them; if a value
+can't be read, that request is refused. An overdue request may still be carried out. Since the translator serves one
+request after the other, a value that it answers later is newer. A turn takes up to three steps: values are read, the
+microscope is moved to the mapped place, values are read again. Meanwhile requests that only read pass, and the
+scheduler's own (`safety_commands`) always go first.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ _ACTION, _PARAM = int(ControlRequest.ACTION), int(ControlRequest.PARAM)
 _ANOTHER_RUN = "this is the scheduler of another run: two experiments have the same address"
 _TWO_OF_A_NAME = "another component is connected as {name}; each needs a name of its own"
 _LACKING = (ControlResponse.PARAM_NOT_SUPPORTED, ControlResponse.CMD_NOT_SUPPORTED)
-"""The answers of a translator that has no such parameter, or none at all."""
+"""The answers of a translator without this parameter, or without parameters."""
 _CONTROL_EVENTS = {
     int(ControlRequest.REQUEST_CTRL): ArbitrationEvent.REQUEST_CONTROL,
     int(ControlRequest.RELEASE_CTRL): ArbitrationEvent.RELEASE_CONTROL,
@@ -92,21 +92,21 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
         enqueue(draft, event)
 
 
-# --- 1. admitted: the peer may speak for its name, and the request is new -------------------------------------------
+# --- 1. admitted: the name belongs to the peer, and the request is new -----------------------------------------------
 
 
 def admit(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is new and to be decided; if not, it was answered, or waits."""
+    """Return whether a request is new; if not, it was answered, or waits."""
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False
-    if not _may_speak(draft, event):
+    if not _owns_its_name(draft, event):
         return False
     outcome = draft.idempotency.look_up(event.name, event.request)
-    return outcome is None or not _repeated(draft, event, outcome)
+    return outcome is None or not _answers_repeated(draft, event, outcome)
 
 
-def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
+def _owns_its_name(draft: StateDraft, event: RequestIn) -> bool:
     name, request_id, run = event.name, event.request.id, draft.env.settings.run.name
     if not name:
         answers.refuse_peer(draft, event, "a client without a name: set the socket's identity to the component's name")
@@ -114,6 +114,7 @@ def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
     if event.user is not None and event.user != component_of(name):
         answers.refuse_peer(draft, event, f"the key is that of {event.user}, not of {name}")
         return False
+    # a component of another run at the same address must not act here
     if run and run_of(name, request_id) not in ("", run):
         answers.refuse_peer(draft, event, _ANOTHER_RUN, OTHER_RUN_RESPONSE)
         return False
@@ -129,12 +130,11 @@ def _may_speak(draft: StateDraft, event: RequestIn) -> bool:
 
 
 def refuse_second(draft: StateDraft, event: RequestIn) -> None:
-    """Refuse a second process under one name."""
+    """Refuse a second process with the same name."""
     answers.refuse_peer(draft, event, _TWO_OF_A_NAME.format(name=event.name))
 
 
-def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Response) -> bool:
-    """Answer a request that comes again with its id, without doing it again. False: it may be done."""
+def _answers_repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Response) -> bool:
     name, request = event.name, event.request
     if isinstance(outcome, Response):
         draft.effects.append(Reply(event.connection, name, outcome, request.kind))
@@ -148,7 +148,7 @@ def _repeated(draft: StateDraft, event: RequestIn, outcome: RequestStatus | Resp
     if outcome is RequestStatus.FORGOTTEN:
         answers.reply(draft, event, _unknown(request, TOO_OLD))
         return True
-    # the translator, which knows its id, answers what became of it
+    # sent again with its id: the translator knows the outcome, and does not execute it twice
     if draft.control.holder == name or reads(request):
         return False
     answers.reply(draft, event, _unknown(request, "it was sent once, and is not sent again"))
@@ -160,24 +160,24 @@ def _unknown(request: Request, why: str) -> Response:
     return Response(int(ControlResponse.NO_RESPONSE), b"", f"outcome unknown: {why}", request.id, detail)
 
 
-# --- 2. authorised: the scheduler answers by itself, or who asks may command the microscope -------------------------
+# --- 2. authorised: the scheduler answers itself, or the client may command the microscope --------------------------
 
 
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is for the translator, and its client may ask for it; if not, it was answered."""
+    """Return whether to forward a request to the translator; if not, it was answered."""
     kind, subject = event.request.kind, event.request.subject
-    if kind == RELAY_REQUEST:  # a supervisor's last words come after the end
+    if kind == RELAY_REQUEST:  # also after the end: final process states belong in the record
         publishing.publish_for_process(draft, event)
     elif draft.control.ended:
         control_change.answer_unless_ending(
             draft, event, ControlResponse.FAILURE, HAS_ENDED, ResponseDetail.EXPERIMENT_ENDED
         )
-        if kind == ControlRequest.ADD_EXP_PRBLM:  # seen too late to be flagged: the record is to show it
+        if kind == ControlRequest.ADD_EXP_PRBLM:  # too late to be flagged, but the record must show it
             publishing.publish_entries(draft)
     elif kind == RESTART_REQUEST:
         publishing.order_restart(draft, event)
     elif kind == CLOCK_REQUEST:
-        _tell_time(draft, event)
+        _answer_clock_request(draft, event)
     elif kind == LEASE_REQUEST:
         _renew_lease(draft, event)
     elif kind <= 0:
@@ -199,10 +199,10 @@ def _microscope_event(request: Request, rules: Rules) -> ArbitrationEvent:
 
 
 def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
-    """Begin the lease of the holder anew; that is not written down, as it is done again and again."""
+    # successes are not in the event log: a client of the gateway renews its lease again and again
     name, holder = event.name, draft.control.holder
     if name != holder:
-        why = f"{name} is not in control, {holder or 'nobody'} is"
+        why = f"{name} is not in control, {holder or 'no component'} is"
         answers.answer(draft, event, ControlResponse.NOT_IN_CONTROL, why)
         return
     draft.lease = draft.lease.asked(event.request.subject, draft.now_s)
@@ -210,29 +210,28 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
     draft.effects.append(Reply(event.connection, name, response, LEASE_REQUEST))
 
 
-def _tell_time(draft: StateDraft, event: RequestIn) -> None:
-    """Tell what all parts of an experiment have in common: the run, what time it is, and how it passes."""
+def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
     run = draft.env.settings.run
-    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _in_use(draft)}
+    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _reason_to_stay(draft)}
     told = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
 
-def _in_use(draft: StateDraft) -> str:
-    """Return why an experiment without a plan is not to end now; empty: nothing keeps it."""
+def _reason_to_stay(draft: StateDraft) -> str:
+    # why a supervisor with nothing left to run may not end the experiment now; empty: it may
     if draft.control.mode is ControlMode.MANUAL:
         return "the mode is MANUAL"
     return f"{draft.control.holder} is in control" if draft.control.holder else ""
 
 
-# --- 3. queued: it waits for its turn -------------------------------------------------------------------------------
+# --- 3. queued: the request waits -----------------------------------------------------------------------------------
 
 
 def enqueue(draft: StateDraft, event: RequestIn) -> None:
     """Queue a request, or refuse it if nothing can be sent now."""
     name, request, is_command = event.name, event.request, not reads(event.request)
-    if is_command and (why := _tip_comes_first(draft)) is not None:
+    if is_command and (why := _refusal_for_tip(draft)) is not None:
         answers.answer(draft, event, ControlResponse.NOT_FREE, why)
         return
     is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
@@ -244,14 +243,14 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
         answers.answer_unsent(draft, job, refused.response)
 
 
-# --- 4. within limits: as its turn comes, nothing forbids it, and the microscope is where it has to be ---------------
+# --- 4. within limits: decided when its turn comes, with the microscope at its place --------------------------------
 
 
 def send_next(draft: StateDraft) -> None:
     """Decide and send waiting requests in their order, until one is in flight."""
     turn = draft.pending.turn
     if turn is not None and draft.forwarder.waiting(turn.number) is None:
-        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its time was up
+        draft.pending = replace(draft.pending, turn=None)  # it was called back, or its deadline has passed
     send_own(draft)
     while draft.forwarder.is_free and (job := _next_job(draft)) is not None:
         _decide(draft, job)
@@ -259,7 +258,7 @@ def send_next(draft: StateDraft) -> None:
 
 
 def send_own(draft: StateDraft) -> None:
-    """Send the first of the scheduler's own requests, which are decided already."""
+    """Send the first of the scheduler's own requests, which need no decision."""
     forwarder = draft.forwarder
     if forwarder.is_free and forwarder.own:
         draft.forwarder = forwarder.sent(forwarder.own[0], draft.now_s)
@@ -271,6 +270,7 @@ def _next_job(draft: StateDraft) -> ForwardedRequest | None:
         return queue[0] if queue else None
     if turn.is_ready(draft.microscope, draft.now_s):
         return draft.forwarder.waiting(turn.number)
+    # reads change nothing, so they need not wait for the turn of a command
     return next((job for job in queue if not job.command), None)
 
 
@@ -279,18 +279,19 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
         if not isinstance(mapped := _mapped(draft, job), Response):
             _send(draft, job, mapped)
         return
+    # authorised again: control may have changed while the command waited
     if (refusal := _not_allowed_now(draft, job)) is not None:
         _answer_unsent(draft, job, refusal)
         return
     turn = draft.pending.turn or Turn(job.number)
-    if turn.awaited is None and _reads_first(draft, job, turn):
+    if turn.awaited is None and _starts_reads(draft, job, turn):
         return
-    _take_values(draft, turn)
+    _apply_read_values(draft, turn)
     mapped = _mapped(draft, job)
     if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
         return
     if job.request.kind == _ACTION:
-        if turn.move is None and _moves_first(draft, job, turn):
+        if turn.move is None and _starts_move(draft, job, turn):
             return
         if (refusal := draft.limits.check_place(job.request)) is not None:
             _refuse(draft, job, refusal)
@@ -306,15 +307,17 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     if job.command:
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
         draft.pending = replace(draft.pending, turn=None)
-        _use_lease(draft, name)
+        _restart_lease(draft, name)
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
     if not request.id:
         return
+    # known after a restart: before an action that was done already the microscope must not be moved, and a repeated use
+    # must not count twice
     is_kept = request.kind == _ACTION and draft.frame.is_moving
     if is_kept or (job.command and draft.limits.counts(job.outgoing)):
         draft.idempotency = draft.idempotency.sent(name, request)
     elif mapped is not None:
-        draft.save()  # with what it was mapped to: asked again, it is sent the same
+        draft.save()  # the frame with this mapping: a retry after a kill must send the same bytes
 
 
 def _refuse(draft: StateDraft, job: ForwardedRequest, refusal: Response) -> None:
@@ -329,8 +332,8 @@ def _answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response)
     answers.answer_unsent(draft, job, response)
 
 
-def _use_lease(draft: StateDraft, client: str) -> None:
-    """Begin the lease anew; what a person adjusts beside the holder is no sign of life of the holder."""
+def _restart_lease(draft: StateDraft, client: str) -> None:
+    # an adjustment by a person beside the holder is no sign of life of the holder
     if client == draft.control.holder:
         draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
 
@@ -342,13 +345,13 @@ def _not_allowed_now(draft: StateDraft, job: ForwardedRequest) -> Response | Non
     if ControlChange.FORWARD not in row.do:
         code = ControlResponse.NOT_IN_CONTROL if row.response is None else row.response
         return Response(int(code), b"", reason(row, draft.control, ask, rules), job.request.id)
-    if (why := _tip_comes_first(draft)) is not None:
+    if (why := _refusal_for_tip(draft)) is not None:
         return Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id)
     return None
 
 
-def _tip_comes_first(draft: StateDraft) -> str | None:
-    """Return why nobody commands, since the tip was left in danger; None: whoever is in control may."""
+def _refusal_for_tip(draft: StateDraft) -> str | None:
+    # a component that does not know of the danger must not move, pulse or scan with such a tip (decision 0001)
     dog, sees_to_tip = draft.watchdog, draft.control.sees_to_tip
     if dog.tip.may_come and draft.forwarder.up:
         return "a retract of before the scheduler's restart may still be carried out, until the translator answers"
@@ -379,13 +382,13 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
     else:
         refusal = check(job.client, mapped.request, now_ns, mapped.names, is_repeated=job.is_repeated)
         if refusal is not None:
-            refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.said}")
+            refusal = replace(refusal, reason=f"{refusal.reason}; {mapped.places_text}")
     if refusal is not None:
         _refuse(draft, job, refusal)
     return refusal is None
 
 
-def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+def _starts_reads(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     needed = draft.limits.depends_on(job.request, is_mapped=draft.frame.maps(draft.now_ns))
     if not needed:
         return False
@@ -395,7 +398,7 @@ def _reads_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     return True
 
 
-def _was_read(draft: StateDraft, number: int, name: str, response: Response) -> None:
+def _take_read_value(draft: StateDraft, number: int, name: str, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or job is None or turn.number != number:
         return  # it was called back
@@ -410,8 +413,8 @@ def _was_read(draft: StateDraft, number: int, name: str, response: Response) -> 
         draft.pending = replace(draft.pending, turn=turn.was_read(name, told))
 
 
-def _take_values(draft: StateDraft, turn: Turn) -> None:
-    # only now: packets that arrived while the values were read may be older than these
+def _apply_read_values(draft: StateDraft, turn: Turn) -> None:
+    # only now: packets that arrived during the reads may be older than the values read
     if not turn.values:
         return
     draft.limits = draft.limits.was_read(turn.values, draft.now_ns)
@@ -423,11 +426,11 @@ def _take_values(draft: StateDraft, turn: Turn) -> None:
 
 
 def _failed_before(response: Response) -> Response:
-    return replace(response, reason=f"not sent: what had to come before it failed ({response.reason})")
+    return replace(response, reason=f"not sent: the read or move before it failed ({response.reason})")
 
 
 def read_ahead(draft: StateDraft) -> None:
-    """Ask for the values of which it counts for how long they hold."""
+    """Read the parameters with a limited rate: a rate is checked from the time since which a value is known."""
     for name in draft.limits.to_be_known():
         _read(draft, name, ReadAhead(name))
 
@@ -438,7 +441,7 @@ def _read(draft: StateDraft, name: str, purpose: OwnPurpose) -> None:
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s, purpose)
 
 
-def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
+def _starts_move(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     if draft.idempotency.was_sent(job.client, job.request):
         return False
     draft.frame, move = draft.frame.move_before(str(job.request.subject), draft.now_ns)
@@ -451,11 +454,11 @@ def _moves_first(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     assert own is not None  # the line is free
     own = own._replace(deadline_s=job.deadline_s)
     draft.pending = replace(draft.pending, turn=turn.moving(PrePositioner(own, draft.microscope.states_seen)))
-    draft.save()  # with where it is sent: what is told of it is then known after a restart
+    draft.save()  # the frame with this move: packets about it can then be mapped after a restart
     return True
 
 
-def _moved(draft: StateDraft, number: int, response: Response) -> None:
+def _take_move_result(draft: StateDraft, number: int, response: Response) -> None:
     turn, job = draft.pending.turn, draft.forwarder.waiting(number)
     if turn is None or turn.move is None or job is None or turn.number != number:
         return  # the action was called back
@@ -471,12 +474,13 @@ def _moved(draft: StateDraft, number: int, response: Response) -> None:
 
 
 def settle(draft: StateDraft, settled: SettledRequest) -> None:
-    """Take the end of a request: tell, and remember, its outcome."""
+    """Process the end of a request: remember its outcome, and answer the client."""
     job, end, response = settled.job, settled.end, settled.response
     if end in (ForwardOutcome.ANSWERED, ForwardOutcome.LATE):
         response = answers.with_id(response, job.request)
         if response.ok and (job.command or job.request.kind == _PARAM):
-            response = _learn(draft, job, response)
+            response = _apply_success(draft, job, response)
+    # it may have been carried out: its values are read before the next request that depends on them
     if job.command and end is not ForwardOutcome.NOT_SENT and _is_unknown(response):
         draft.limits = draft.limits.unknown(job.outgoing)
     if not job.client:
@@ -492,7 +496,7 @@ def settle(draft: StateDraft, settled: SettledRequest) -> None:
     else:
         if end is ForwardOutcome.UNKNOWN and job.request.kind == _ACTION:
             _action_started(draft, job, is_certain=False)
-        _see_feedback(draft, job, response)
+        _track_feedback(draft, job, response)
         answers.finish(draft, job, response, _unknown_status(response))
 
 
@@ -501,16 +505,16 @@ def _settle_own(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, r
         answers.write_down(draft, SCHEDULER, job.request, response, job.heard_s)
     if job.purpose is None:
         safety_commands.settle(draft, job, end, response)
-    elif end is not ForwardOutcome.LATE:  # its purpose had the answer before that none had come
+    elif end is not ForwardOutcome.LATE:  # after its timeout the purpose has ended already
         _serve_purpose(draft, job.purpose, response)
 
 
 def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -> None:
     match purpose:
         case ReadForTurn():
-            _was_read(draft, purpose.number, purpose.name, response)
+            _take_read_value(draft, purpose.number, purpose.name, response)
         case MoveForTurn():
-            _moved(draft, purpose.number, response)
+            _take_move_result(draft, purpose.number, response)
         case AskForFrame():
             draft.raised.append(FrameAnswered(purpose.purpose, response))
         case ReadAhead() if not response.ok:
@@ -518,8 +522,8 @@ def _serve_purpose(draft: StateDraft, purpose: OwnPurpose, response: Response) -
 
 
 def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Take an answer after its client was told that none had come: asked again, it gets that answer."""
-    _see_feedback(draft, job, response)
+    # the client has got "no response" already: only a retry under the same id gets this answer
+    _track_feedback(draft, job, response)
     status = _unknown_status(response)
     draft.idempotency = draft.idempotency.noted(job.client, job.request, status or response)
     if status is None and not response.ok:
@@ -528,7 +532,7 @@ def _settle_late(draft: StateDraft, job: ForwardedRequest, response: Response) -
     draft.log("WARNING", f"the translator answered {job.client} late; the answer is kept for its retry")
 
 
-def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
+def _track_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
     feedback = feedback_of(job.request)
     if feedback is None or feedback.on is not False or response.ok:
         return
@@ -538,15 +542,15 @@ def _see_feedback(draft: StateDraft, job: ForwardedRequest, response: Response) 
         draft.microscope = draft.microscope.feedback_was_left()
 
 
-def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
-    """Take what a success changed, or told. Returns the answer, in the coordinates of its client."""
+def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
     request, now_ns = job.request, draft.now_ns
     told = None
     if request.kind == _PARAM and response.payload:
         told = draft.env.codec.decode_parameter(response.payload)
     draft.limits = draft.limits.carried_out(job.outgoing, now_ns, told, _names_meant(job), job.client)
     draft.frame = draft.frame.carried_out(job.outgoing, told, now_ns)
-    is_asked = request.kind == _PARAM and bool(job.client)  # the scheduler itself needs the microscope's values
+    # not for the scheduler's own reads: limits are in the coordinates of the microscope
+    is_asked = request.kind == _PARAM and bool(job.client)
     if is_asked and (mapped := draft.frame.answer(request, told, now_ns)) is not None:
         response = replace(response, payload=draft.env.codec.encode(mapped))
     if request.kind == _ACTION:
@@ -554,7 +558,7 @@ def _learn(draft: StateDraft, job: ForwardedRequest, response: Response) -> Resp
     elif (feedback := feedback_of(request)) is not None:
         draft.microscope = draft.microscope.with_feedback(feedback)
     if job.command:
-        _use_lease(draft, job.client)
+        _restart_lease(draft, job.client)
         if draft.control.mode is ControlMode.MANUAL:
             draft.by_hand = draft.by_hand.requested(request)
     return response
@@ -568,7 +572,7 @@ def _action_started(draft: StateDraft, job: ForwardedRequest, *, is_certain: boo
 
 
 def _names_meant(job: ForwardedRequest) -> tuple[str, ...] | None:
-    """Return the parameters that the asker means to set; None: all that are sent."""
+    # None: all parameters of the request
     return None if job.mapped is None else tuple(job.mapped.names)
 
 
@@ -581,10 +585,10 @@ def _was_not_sent(response: Response) -> bool:
 
 
 def _unknown_status(response: Response) -> RequestStatus | None:
-    """Return UNKNOWN where the controller did not answer its translator: that one can say more when asked again."""
+    # a request of unknown outcome is forwarded again: the translator knows its id, and may know the outcome by then
     return RequestStatus.UNKNOWN if response.code == ControlResponse.NO_RESPONSE else None
 
 
 def reads(request: Request) -> bool:
-    """Return whether a request disturbs nothing."""
+    """Return whether a request is read-only."""
     return request.kind == ControlRequest.ACTION_SUPPORT or (request.kind == _PARAM and is_get(request))

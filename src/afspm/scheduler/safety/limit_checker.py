@@ -1,10 +1,10 @@
 """Checks requests against the limits of an experiment.
 
-Nothing is clamped. A refusal names the parameter, the value, the limit and where the limit was set.
+Nothing is clamped. A refusal names the parameter, the value, the limit and the place in the file where it was set.
 
-A check is right only for the moment at which it is made: steps, rates and places are measured from the values in
-force. So a request is checked right before it is sent, after everything before it has settled, and `depends_on` names
-the values that are read from the microscope for that check.
+A check is valid only at the moment when it is made: steps, rates and places are measured from the values in force. So a
+request is checked right before it is sent, after all earlier ones have settled. `depends_on` names the values to read
+from the microscope for that check.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from afspm.scheduler.safety.limit_state import LastUse, LimitState, Usage
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 from afspm.scheduler.safety.parameter_values import ParameterValue, ParameterValueError, numbers, values_of
 
-_REACH = 1e-9  # relative: what lies on the border, to the precision of the arithmetic, is inside
-_TOLD_REACH = 1e-3  # the same of a place that the controller tells: in steps of its own, and in single precision
+_REACH = 1e-9  # relative: a value on the border, to the precision of the arithmetic, is inside
+_TOLD_REACH = 1e-3  # the same for a place read from a controller, which rounds to its steps and to single precision
 _PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozenset(PROBE_CHANGES), names.AT_PROBE))
 """The parameters of each place, with the actions that happen there."""
 
 
 class _Breach(Exception):
-    """A limit is broken. Never leaves this module."""
+    """A limit is broken. Does not leave this module."""
 
     def __init__(self, code: ControlResponse, reason: str) -> None:
         super().__init__(reason)
@@ -71,7 +71,7 @@ class _Use(NamedTuple):
 
 @dataclass(frozen=True)
 class LimitChecker:
-    """Checks requests against the limits, and keeps in mind what steps and rates are measured from."""
+    """Checks requests against the limits, and stores the values that steps and rates are measured from."""
 
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     state: LimitState = field(default_factory=LimitState)
@@ -85,11 +85,11 @@ class LimitChecker:
         *,
         is_repeated: bool = False,
     ) -> Response | None:
-        """Return the refusal of a request that breaks a limit or has no meaning; None: it may be sent.
+        """Return the refusal of a request that breaks a limit or is malformed; None: it may be sent.
 
         Args:
-            used: the parameters that `who` means to set; the others of the request only change with them. None: all.
-            is_repeated: this very request was sent before, and its outcome is unknown: it is no second use.
+            used: the parameters that `who` sets; the others of the request only change with them. None: all.
+            is_repeated: this request was sent before with an unknown outcome: it is not a second use.
         """
         try:
             self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
@@ -100,7 +100,7 @@ class LimitChecker:
         return None
 
     def check_place(self, request: Request) -> Response | None:
-        """Return the refusal of an action where the scan, or the probe, is now: a person may have moved it."""
+        """Return the refusal of an action at its present place, which a person may have changed."""
         try:
             self._check_place(str(request.subject))
         except _Breach as breach:
@@ -109,13 +109,13 @@ class LimitChecker:
         return None
 
     def depends_on(self, request: Request, *, is_mapped: bool = False) -> list[str]:
-        """Return the parameters to be read before a request is checked: it is measured from their values.
+        """Return the parameters to read before a request is checked.
 
-        The value set or published last is not enough: a request of unknown outcome or a person at the panel may have
+        The value set or published last is not enough. A request of unknown outcome or a person at the panel may have
         changed it, and an old packet may arrive after the answer to a newer request.
 
         Args:
-            is_mapped: a place is mapped and sent as a whole, whichever part of it was asked for.
+            is_mapped: a mapped place is sent as a whole, even if the client set only a part of it.
         """
         given = self._names_set_by(request)
         needed = [name for name in given if name in self.limits.bounded]
@@ -129,14 +129,14 @@ class LimitChecker:
         return list(dict.fromkeys(needed))
 
     def to_be_known(self) -> list[str]:
-        """Return the parameters to be read before the first request sets them: a rate takes two looks."""
+        """Return the parameters with a limited rate, to read once before a request sets them."""
         return list(self.limits.rated)
 
     def was_read(self, values: Mapping[str, Parameter | None], now_ns: int) -> LimitChecker:
-        """Take values that were read for a check.
+        """Store values that were read for a check.
 
         Args:
-            values: None where the microscope answered no value. A parameter that it does not have is not among them.
+            values: None where the microscope answered without a value. A parameter that it does not have is left out.
         """
         numbers_read = {name: None if told is None else self._number(told) for name, told in values.items()}
         usage = self.state.usage
@@ -156,87 +156,94 @@ class LimitChecker:
         return replace(self, state=LimitState(usage, self.state.position.without(given)))
 
     def forget(self, name: str) -> LimitChecker:
-        """Drop the value of a parameter that could not be read."""
-        return self._using(self.state.usage.forget(name))
+        """Forget the value of a parameter that could not be read."""
+        return self._with_usage(self.state.usage.forget(name))
 
     def sending(self, who: str, request: Request, now_ns: int, used: Collection[str] | None = None) -> LimitChecker:
-        """Count what a request uses: it was checked, and is about to be sent.
+        """Count the uses of a checked request that is about to be sent.
 
         The time of a change is unknown until the request has settled, so a limited rate is not measured from it.
         """
         usage = self.state.usage
-        for name in self._uses(request, used):
+        for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
         for name in self.limits.rated.intersection(self._names_set_by(request)) if self.limits.rated else ():
             usage = usage.changing(name)
-        return self._using(usage)
+        return self._with_usage(usage)
 
     def counts(self, request: Request) -> bool:
         """Return whether the interval between two such requests is limited."""
-        return bool(self._uses(request, None))
+        return bool(self._counted_uses(request, None))
 
     def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
-        """Take back what a request used: it was not carried out, for sure."""
+        """Undo the uses of a request that was certainly not carried out."""
         usage = self.state.usage
-        for name in self._uses(request, used):
+        for name in self._counted_uses(request, used):
             usage = usage.use_undone(name, who, request.id)
         for name in self._names_set_by(request):
             usage = usage.unchanged(name)
-        return self._using(usage)
+        return self._with_usage(usage)
 
     def carried_out(
         self,
         request: Request,
         now_ns: int,
-        told: Parameter | None = None,
+        answered: Parameter | None = None,
         used: Collection[str] | None = None,
         who: str = "",
     ) -> LimitChecker:
-        """Take a request that succeeded; `told` is the parameter as the translator answered it."""
+        """Store the values set or read by a successful request.
+
+        Args:
+            answered: the parameter in the translator's answer.
+        """
         if is_get(request):
-            if told is None or not _tells_of(told, request.subject):
+            if answered is None or not _has_value_of(answered, request.subject):
                 return self.forget(request.subject.name)
-            return self.in_force(told, now_ns, was_read=True)
+            return self.in_force(answered, now_ns, was_read=True)
         usage = self.state.usage
-        for name in self._uses(request, used):
+        for name in self._counted_uses(request, used):
             usage = usage.use_done(name, LastUse(now_ns, who, request.id))
-        checker = self._using(usage)
+        checker = self._with_usage(usage)
         for subject in self._set_by(request):
-            # what was set is what the microscope says it is now
-            said = told if isinstance(subject, Parameter) and told is not None and _tells_of(told, subject) else subject
-            checker = checker.in_force(said, now_ns)
+            # the value in the microscope's answer, rather than the one that was sent
+            in_force = (
+                answered
+                if isinstance(subject, Parameter) and answered is not None and _has_value_of(answered, subject)
+                else subject
+            )
+            checker = checker.in_force(in_force, now_ns)
         return checker
 
     def published(self, subject: object, now_ns: int) -> LimitChecker:
-        """Learn places, and the times at which values with a limited rate change, from a published message."""
+        """Store places, and the times at which values with a limited rate change, from a published message."""
         usage = self.state.usage
-        for name, value in numbers(self._sensible(subject)):
+        for name, value in numbers(self._valid_values(subject)):
             if name in self.limits.rated:
                 usage = usage.learn(name, value, now_ns)
-        return self._with(usage, self.state.position.learn(subject))
+        return self._with_state(usage, self.state.position.learn(subject))
 
     def in_force(self, subject: object, now_ns: int, *, was_read: bool = False) -> LimitChecker:
-        """Learn values that were set or read: a ScanParameters, Feedback, Parameter …"""
-        values, usage, position = numbers(self._sensible(subject)), self.state.usage, self.state.position
+        """Store values that were set or read: a ScanParameters, Feedback, Parameter …"""
+        values, usage, position = numbers(self._valid_values(subject)), self.state.usage, self.state.position
         if isinstance(subject, Parameter):
-            if not values:  # what a microscope tells is not ours to judge
+            if not values:  # a malformed value of a microscope is no reason to refuse a request: it counts as unknown
                 usage = usage.forget(subject.name)
             position = position.learn_values(values)
         for name, value in values:
             if name in self.limits.bounded:
                 usage = usage.learn(name, value, now_ns, was_read=was_read)
-        return self._with(usage, position.learn(subject))
+        return self._with_state(usage, position.learn(subject))
 
-    def _with(self, usage: Usage, position: KnownPosition) -> LimitChecker:
+    def _with_state(self, usage: Usage, position: KnownPosition) -> LimitChecker:
         if usage is self.state.usage and position is self.state.position:
             return self
         return replace(self, state=LimitState(usage, position))
 
-    def _using(self, usage: Usage) -> LimitChecker:
+    def _with_usage(self, usage: Usage) -> LimitChecker:
         return self if usage is self.state.usage else replace(self, state=replace(self.state, usage=usage))
 
-    def _uses(self, request: Request, used: Collection[str] | None) -> list[str]:
-        """Return what a request uses of that which may be used every so often only."""
+    def _counted_uses(self, request: Request, used: Collection[str] | None) -> list[str]:
         counted = self.limits.counted
         if not counted:
             return []
@@ -246,18 +253,18 @@ class LimitChecker:
         return [name for name in uses if name in counted]
 
     def _names_set_by(self, request: Request) -> list[str]:
-        """Return the parameters that a request sets, each once; none if it makes no sense."""
-        values = [value for subject in self._set_by(request) for value in self._sensible(subject)]
+        # malformed values have no name: `check` refuses such a request
+        values = [value for subject in self._set_by(request) for value in self._valid_values(subject)]
         return list(dict.fromkeys(value.name for value in values))
 
-    def _sensible(self, subject: object) -> list[ParameterValue]:
+    def _valid_values(self, subject: object) -> list[ParameterValue]:
         try:
             return values_of(subject, self.limits.parameters)
         except ParameterValueError:
             return []
 
     def _number(self, told: Parameter) -> float | None:
-        return next((value.number for value in self._sensible(told)), None)
+        return next((value.number for value in self._valid_values(told)), None)
 
     # --- checks ---
 
@@ -275,7 +282,7 @@ class LimitChecker:
     def _check_settings(self, use: _Use, request: Request, used: Collection[str] | None) -> None:
         subjects = self._set_by(request)
         values = [value for subject in subjects for value in values_of(subject, self.limits.parameters)]
-        # parameters may move or turn the scan, or make it too many pixels, as well; several do so together
+        # several parameters together may also move or turn the scan, or give it too many pixels
         are_parameters = all(isinstance(subject, Parameter) for subject in subjects)
         for place in changes_by(numbers(values)) if are_parameters else subjects:
             if isinstance(place, ScanParameters):
@@ -292,7 +299,7 @@ class LimitChecker:
                 self._check_value(name, value, limit, use.now_ns)
 
     def _set_by(self, request: Request) -> Collection[object]:
-        """Return what a request sets: its subject, or for an action what the microscope does as that."""
+        # an action of the experiment file sets parameters at the microscope
         if request.kind == ControlRequest.ACTION:
             return self.limits.sets.get(str(request.subject), ())
         return () if is_get(request) else (request.subject,)
@@ -327,7 +334,7 @@ class LimitChecker:
         known = self.state.usage.known.get(name)
         if known is None:
             raise _param_error(
-                f"{said}: the microscope does not tell the value now, so the step can't be checked ({limit.source})"
+                f"{said}: the microscope reports no value now, so the step can't be checked ({limit.source})"
             )
         change = abs(value - known.value)
         if limit.step is not None and change > limit.step * (1 + _REACH):
@@ -419,9 +426,9 @@ def _inside(allowed: Region, xy_m: XY, reach: float) -> bool:
 
 
 def is_get(request: Request) -> bool:
-    """Return whether a parameter is asked for, not set."""
+    """Return whether a request reads a parameter."""
     return isinstance(request.subject, Parameter) and request.subject.value is None
 
 
-def _tells_of(told: Parameter, asked: Parameter) -> bool:
+def _has_value_of(told: Parameter, asked: Parameter) -> bool:
     return told.value is not None and told.name == asked.name

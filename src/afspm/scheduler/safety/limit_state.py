@@ -1,4 +1,4 @@
-"""The values in force and the latest uses, from which steps, rates and intervals are measured."""
+"""The values in force and the latest uses: steps, rates and intervals are measured from them."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ class KnownValue:
     """A value in force.
 
     Attributes:
-        since_ns: when it was set last, in experiment time, or first heard of.
-        origin: the value then. What was only read since may differ: controllers round, and people are at the panel.
+        since_ns: when it was last set, or first known, in experiment time.
+        origin: the value at that time. A value only read since then may differ: controllers round, and a person may
+            turn a knob.
     """
 
     value: float
@@ -28,7 +29,7 @@ class KnownValue:
 
 @dataclass(frozen=True)
 class LastUse:
-    """A use of a parameter or action, and the id of the request; empty: it had none."""
+    """A use of a parameter or action, with the id of the request; empty: the request had none."""
 
     at_ns: int
     who: str
@@ -41,11 +42,11 @@ class LastUse:
 
 @dataclass(frozen=True)
 class Usage:
-    """Values and uses, by name. Kept over a restart: a scheduler that was killed must not allow anything sooner.
+    """Values and uses, by name. Kept over a restart: a scheduler that was killed must not allow a use any sooner.
 
     Attributes:
         sent: uses of unknown outcome, which count.
-        before: the values from which a rate was measured, before a request that has not settled.
+        before: the values that a rate is measured from, set aside during a request that has not settled.
     """
 
     known: Mapping[str, KnownValue] = field(default_factory=dict)
@@ -54,10 +55,10 @@ class Usage:
     sent: Mapping[str, LastUse] = field(default_factory=dict)
 
     def learn(self, name: str, value: float, now_ns: int, *, was_read: bool = False) -> Usage:
-        """Take a value in force.
+        """Store a value in force.
 
         Args:
-            was_read: it was asked for, and may have been in force for long.
+            was_read: it was read, and may have been in force for long.
         """
         known = self.known.get(name)
         if known is not None and known.value == value:
@@ -66,25 +67,25 @@ class Usage:
         return replace(self, known={**self.known, name: new}, before=_without(self.before, name))
 
     def forget(self, name: str) -> Usage:
-        """Drop a value that is not known any more."""
+        """Remove a value that is not known any more."""
         if name not in self.known and name not in self.before:
             return self
         return replace(self, known=_without(self.known, name), before=_without(self.before, name))
 
     def changing(self, name: str) -> Usage:
-        """Set a value aside until it is known whether, and when, it was changed."""
+        """Set a value aside until the outcome of its change, and the time of it, are known."""
         if name not in self.known:
             return self
         return replace(self, known=_without(self.known, name), before={**self.before, name: self.known[name]})
 
     def unchanged(self, name: str) -> Usage:
-        """Take up a value again: it was not changed."""
+        """Restore a value that was set aside: it was not changed."""
         if name not in self.before:
             return self
         return replace(self, known={**self.known, name: self.before[name]}, before=_without(self.before, name))
 
     def last_ns(self, name: str, repeated: tuple[str, str] | None = None) -> int | None:
-        """Return when it was used last.
+        """Return the time of the last use.
 
         Args:
             repeated: client and id of a repeated request, whose own use does not count.
@@ -99,7 +100,7 @@ class Usage:
         return replace(self, done={**self.done, name: use}, sent=_without(self.sent, name))
 
     def use_undone(self, name: str, who: str, request_id: str) -> Usage:
-        """Take back a use that was sent, or was to be, and was not carried out."""
+        """Remove a use that was not carried out."""
         use = self.sent.get(name)
         is_it = use is not None and (use.who, use.request_id) == (who, request_id)
         return replace(self, sent=_without(self.sent, name)) if is_it else self
@@ -107,7 +108,7 @@ class Usage:
 
 @dataclass(frozen=True)
 class LimitState:
-    """All that requests are checked against beside the limits themselves."""
+    """The state that requests are checked against, beside the limits themselves."""
 
     usage: Usage = field(default_factory=Usage)
     position: KnownPosition = field(default_factory=KnownPosition)

@@ -1,4 +1,4 @@
-"""Limits of an experiment: which parameters may be set, how far, how fast, where and by which component."""
+"""Limits of an experiment: which parameters may be set, how far, how fast, where, and from which component."""
 
 from __future__ import annotations
 
@@ -46,12 +46,12 @@ class Limit:
 
     @property
     def bounds_changes(self) -> bool:
-        """True where the value in force matters."""
+        """True where a check needs the value in force."""
         return self.step is not None or self.rate_per_s is not None
 
     @property
     def is_of_a_number(self) -> bool:
-        """True where the parameter can't be a text."""
+        """True where the parameter must be a number."""
         return self.bounds_changes or self.low is not None or self.high is not None
 
 
@@ -62,9 +62,9 @@ class ExperimentLimits:
     Attributes:
         parameters: by name of the parameter.
         actions: by name of the action.
-        region: what scans (with their corners) and the probe must stay in, in m, in tip coordinates. Nothing is done
-            outside, whoever set the place.
-        region_source: where that was set.
+        region: the area allowed for scans (all corners) and the probe, in m, in tip coordinates. An action at a place
+            outside is refused even if the place was set at the panel.
+        region_source: where the region was set.
         most_pixels: of a scan.
         sets: by name of an action, the parameters that the microscope sets at once as that action.
     """
@@ -78,7 +78,7 @@ class ExperimentLimits:
 
     @cached_property
     def bounded(self) -> frozenset[str]:
-        """The parameters of which the values in force matter."""
+        """The parameters whose checks need the value in force."""
         return frozenset(name for name, limit in self.parameters.items() if limit.bounds_changes)
 
     @cached_property
@@ -88,6 +88,6 @@ class ExperimentLimits:
 
     @cached_property
     def counted(self) -> frozenset[str]:
-        """The parameters and actions of which it matters when they were used last."""
+        """The parameters and actions with a shortest interval between two uses."""
         both = {**self.parameters, **self.actions}
         return frozenset(name for name, limit in both.items() if limit.interval_s is not None)

@@ -1,4 +1,4 @@
-"""The parameters that a request sets, or that the microscope tells, each in one unit."""
+"""The parameters in a request or a packet, each in one unit."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from afspm.scheduler.safety.limits import Limit
 
 
 class ParameterValue(NamedTuple):
-    """A value to set: a number in SI, or in the unit of its limit; None: a text or a switch."""
+    """A number to set, in SI or in the unit of its limit; None: a text or a switch."""
 
     name: str
     number: float | None
 
 
 class ParameterValueError(Exception):
-    """A value that its parameter can't have, and why. Never leaves `logic`."""
+    """A value that its parameter can't have, and why. Does not leave this package."""
 
 
 def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterValue]:
-    """All that a subject sets, by the names of the parameters.
+    """Return all parameters that a subject sets, by name.
 
     Raises:
-        ParameterValueError: a text where there must be a number, one that is not finite, a unit of another dimension.
+        ParameterValueError: a text where there must be a number, a number that is not finite, a unit of another
+            dimension.
     """
     if isinstance(subject, Parameter):
         if subject.value is None:
@@ -56,12 +57,11 @@ def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterVal
 
 
 def numbers(values: list[ParameterValue]) -> list[tuple[str, float]]:
-    """Those that are numbers."""
     return [(name, number) for name, number in values if number is not None]
 
 
 def number_of(parameter: Parameter) -> float | None:
-    """Return the value of a single parameter in SI; None if it is not a finite number of the right kind."""
+    """Return the value of a parameter in SI; None if it is no finite number or of another dimension."""
     try:
         return _number(parameter, parameter.value or "", None)
     except ParameterValueError:
@@ -69,7 +69,7 @@ def number_of(parameter: Parameter) -> float | None:
 
 
 def _number(parameter: Parameter, text: str, limit: Limit | None) -> float | None:
-    """None if it may be a text, and is one."""
+    # None for a text where a text is allowed
     name = parameter.name
     try:
         value = float(text)

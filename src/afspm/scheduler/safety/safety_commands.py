@@ -1,4 +1,4 @@
-"""The scheduler's own requests, which go first: what the watchdog wants, and whether the translator can do it."""
+"""The scheduler's own requests, which go first: the watchdog's actions, and whether the translator has them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ _ID = "scheduler/does-it-retract"
 
 
 def begin(draft: StateDraft) -> None:
-    """Ask a new translator whether it retracts."""
+    """Ask a new translator whether it can retract the tip."""
     action = draft.watchdog.question
+    # any answer also shows that a retract sent before a restart is done or lost (decision 0088)
     request = Request(int(ControlRequest.ACTION_SUPPORT), action, id=_ID)
     draft.forwarder, _ = draft.forwarder.ask_own(request, draft.now_s)
     draft.watchdog = draft.watchdog.translator_is_there(draft.now_s)
@@ -33,7 +34,7 @@ def send(draft: StateDraft) -> None:
 
 
 def settle(draft: StateDraft, job: ForwardedRequest, end: ForwardOutcome, response: Response) -> None:
-    """Take the end of one of these."""
+    """Process the end of a safety command."""
     subject, now_s = str(job.request.subject), draft.now_s
     if end is ForwardOutcome.LATE:
         if response.ok and job.request.kind == ControlRequest.ACTION:

@@ -1,7 +1,7 @@
-"""The watchdog: what the scheduler itself tells the microscope to do when control is taken from a holder.
+"""The watchdog: actions that the scheduler itself sends to the microscope when a holder loses control.
 
-It stops the scan or spectrum that is running, and retracts the tip where its holder did not itself give control back
-and left it in a dangerous state: it can't put that right any more, and nobody else knows of it.
+It stops the running scan or spectrum. It retracts the tip if the holder lost control, rather than gave it back, and
+left the tip in a dangerous state: the holder can't mend that any more, and no other component knows of it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _SOON_S = 1.0
 
 
 class TipDuty(Enum):
-    """The duty of the scheduler towards a tip that its holder left in danger."""
+    """The duty of the scheduler towards a tip that its holder left in danger. Its values stand in saved states."""
 
     NONE = "nothing"
     OWED = "it is to be retracted"
@@ -32,11 +32,11 @@ class TipEvent(Enum):
     """An event that changes the duty."""
 
     ENDANGERED = "its holder lost control and left it in danger"
-    SEEN_TO = "somebody sees to it, or it is out of danger"
+    SEEN_TO = "a person or a solver attends to it, or it is out of danger"
     SENT = "the microscope is asked to retract it"
     NOT_YET = "the microscope could not be asked, was not free, or did not answer"
     RETRACTED = "the microscope has retracted it"
-    RETRACTED_LATE = "it has, when nobody waited for the answer any more"
+    RETRACTED_LATE = "the microscope has retracted it after the deadline"
     IMPOSSIBLE = "the microscope has no such action"
     FAILED = "the microscope refuses, or was waited for in vain"
     DUE = "it is time to try again"
@@ -44,9 +44,9 @@ class TipEvent(Enum):
 
 
 _NONE, _OWED, _ASKED, _PUT_OFF = TipDuty
-_CALLS = True  # a person is to decide how to go on
+_CALLS = True  # a person decides how to go on
 
-# after an event, by what was owed before it: NONE, OWED, ASKED, PUT_OFF; and whether people are called
+# the duty after an event, for each duty before it: NONE, OWED, ASKED, PUT_OFF; and whether a person is called
 _TABLE: dict[TipEvent, tuple[TipDuty, TipDuty, TipDuty, TipDuty, bool]] = {
     TipEvent.ENDANGERED: (_OWED, _OWED, _ASKED, _OWED, False),
     TipEvent.SEEN_TO: (_NONE, _NONE, _ASKED, _NONE, False),
@@ -66,14 +66,14 @@ class WatchdogSettings:
     """When the scheduler acts by itself.
 
     Attributes:
-        stop_when: for which causes of losing control what is running is stopped.
+        stop_when: the causes of losing control after which the running measurement is stopped.
         dangerous: the states in which the tip is retracted when its holder loses control: names of ScopeState, and
             "feedback-off".
-        retract: the action that does it; None: never.
-        attempts: how often an action that gets no response is tried.
-        again_s: how long (real) something that should happen is waited for: that the microscope is free, has stopped,
-            is there. After that time, too, a tip that was not retracted is tried to be again; twice as long each time.
-        longest_s: but never longer than this.
+        retract: the action that retracts the tip; None: never.
+        attempts: how often an action without a response is tried.
+        again_s: how long (real) to wait for the microscope to be free, to have stopped, or to be connected. A tip that
+            could not be retracted is tried again after this time, then after twice as long each time.
+        longest_s: the longest time (real) between two such attempts.
     """
 
     stop_when: Collection[Cause] = _DEFAULT_STOPS
@@ -97,11 +97,12 @@ class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
-        calls_people: it has retracted the tip, or could not, and nobody was called yet: to go on is for a person.
-        stops: actions wanted before the tip is retracted.
-        for_feedback: why the tip is to be retracted.
-        may_come: the scheduler was killed after it asked for a retract: the translator may still have that in its
-            queue, and its answer goes to the life that asked.
+        calls_people: the tip was retracted, or could not be, and no person was called yet: a person decides how to go
+            on.
+        stops: actions to send before the tip is retracted.
+        for_feedback: the tip is in danger because the feedback is off.
+        may_come: the scheduler was killed after it sent a retract: the translator may still have it in its queue, and
+            its answer goes to the killed process.
     """
 
     duty: TipDuty = TipDuty.NONE
@@ -115,17 +116,19 @@ class RetractState:
 class Watchdog:
     """The actions that the scheduler itself wants of the microscope.
 
-    The caller sends `next_action()` before anything else, reports by `answered` or `unsent`, and calls `look_again`
-    when it is `due_s`. While it `owes_retract` nobody commands; but when that is `put_off`, since the microscope does
-    not do it, whoever is there to see to the tip may. The duty towards the tip follows from a table.
+    The caller sends `next_action()` before anything else, reports by `answered` or `unsent`, and calls `look_again` at
+    `due_s`. While the watchdog `owes_retract`, no component commands the microscope. When the retract is `put_off`,
+    since the microscope does not do it, a person or a solver of device-malfunction may. The duty towards the tip
+    follows from a table.
 
     Attributes:
-        starting: the action that stops what was just started.
+        starting: the action that stops the measurement just started.
         sent: the action that was sent and is not answered.
-        can_retract: as far as we know.
-        refused_at: states seen when the microscope last was not free.
-        told_to_stop, unstoppable: what runs.
-        due_s: when, real, `look_again` is to be called.
+        can_retract: the microscope has the action, as far as known.
+        refused_at: number of states seen at the last answer NOT_FREE.
+        told_to_stop: a stop was sent for the running measurement.
+        unstoppable: the running measurement did not stop.
+        due_s: when `look_again` is due, real.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
@@ -142,39 +145,39 @@ class Watchdog:
     in_haste: bool = False
 
     def restored(self, tip: RetractState) -> Watchdog:
-        """Take up the duty of before a restart: what the microscope was being asked is not known any more."""
+        """Restore the duty of before a restart: an unanswered retract is owed again."""
         was_asked = tip.duty is TipDuty.ASKED
         duty = TipDuty.OWED if was_asked else tip.duty
         return replace(self, tip=replace(tip, duty=duty, may_come=was_asked or tip.may_come))
 
     def translator_answered(self) -> Watchdog:
-        """Take an answer to this life of the scheduler: everything that an earlier life asked for is done, or lost.
+        """Note the first answer since the restart: everything that the killed scheduler sent is done, or lost.
 
-        A tip that is still to be retracted is retracted again, which does no harm. Where a person has seen to it
-        meanwhile, it may have been withdrawn after that: a person looks again.
+        A tip that is still owed a retract is retracted again, which does no harm. If a person has attended to it
+        meanwhile, it may have been withdrawn after that: the person is called again.
         """
         if not self.tip.may_come:
             return self
         dog = replace(self, tip=replace(self.tip, may_come=False))
-        return dog if dog.owes_retract else dog._see(TipEvent.RETRACTED_LATE)
+        return dog if dog.owes_retract else dog._after(TipEvent.RETRACTED_LATE)
 
     def begun(self, now_s: float) -> Watchdog:
-        """Wait: what has happened meanwhile is heard of first, and the translator may not be there."""
+        """Wait after a restart: missed packets come first, and the translator may not be connected yet."""
         return replace(self, due_s=now_s + self.settings.again_s) if self.owes_retract else self
 
     @property
     def owes_retract(self) -> bool:
-        """True while the tip is to be retracted, now or later."""
+        """True while the tip has to be retracted, now or later."""
         return self.tip.duty is not TipDuty.NONE
 
     @property
     def put_off(self) -> bool:
-        """True while the tip is to be retracted, but only later."""
+        """True while the retract has failed, and is tried again later."""
         return self.tip.duty is TipDuty.PUT_OFF
 
     @property
     def left_to_people(self) -> bool:
-        """True until people are called: how to go on is for a person to decide."""
+        """True until a person is called, who decides how to go on."""
         return self.tip.calls_people
 
     @property
@@ -185,35 +188,38 @@ class Watchdog:
 
     @property
     def question(self) -> str:
-        """The action of which the translator is asked first whether the microscope has it."""
+        """The action whose support by the translator is checked when it connects."""
         return self.settings.retract or names.STOP_SCAN
 
     def without_retract(self) -> Watchdog:
-        """Take it that the microscope has no action to retract."""
+        """Note that the microscope has no action to retract."""
         return replace(self, can_retract=False)
 
     def people_called(self) -> Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Leave a tip in danger: the run is stopped, and the translator sees to it as it leaves."""
-        return self._see(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
+        """Keep the duty towards a tip in danger: the run is stopped, and the leaving translator retracts the tip."""
+        return (
+            self._after(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
+        )
 
     # --- events of the microscope ---
 
-    def state_told(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Take a new state of the microscope."""
+    def state_reported(self, microscope: MicroscopeStatus) -> Watchdog:
+        """Process a new state of the microscope."""
         dog = replace(self, starting=None)
         if microscope.state not in STOPS:
             dog = replace(dog, told_to_stop=False, unstoppable=False)
-        # it ended while the translator could not be told to stop it
+        # the measurement ended before a stop could be sent
         return dog._with_stops(()) if microscope.state is ScopeState.FREE and self.sent is None else dog
 
     def started(self, action: str, states_seen: int, microscope: MicroscopeStatus) -> Watchdog:
-        """Take an action that succeeded, or may have; it was sent when `states_seen` states were known.
+        """Note an action that succeeded, or may have. `states_seen` states were known when it was sent.
 
-        The answer may overtake the state that the microscope is in by it, or be overtaken.
+        The answer may arrive before or after the state that the action leads to.
         """
+        # otherwise a state has overtaken this answer, and shows what is running
         is_new = states_seen == microscope.states_seen
         return replace(self, starting=STARTS.get(action, self.starting)) if is_new else self
 
@@ -229,14 +235,14 @@ class Watchdog:
         by_holder: bool = False,
         was_seen_to: bool = False,
     ) -> Watchdog:
-        """Take the loss of control for `cause` while the action `in_flight` was with the translator.
+        """Process the loss of control for `cause` while the action `in_flight` was with the translator.
 
         Args:
-            had_died: the process that got control has died; who gives it back is the one started in its place.
-            by_holder: it is the holder's own doing.
-            was_seen_to: the holder was there to see to a tip that was not retracted.
+            had_died: the process that got control has died; its restarted successor gives control back.
+            by_holder: the holder itself caused it.
+            was_seen_to: the holder was attending to a tip that was not retracted.
         """
-        # whoever gives control back knows what it leaves, and so does a person who takes it
+        # a holder that gives control back knows the state it leaves, and so does a person who takes control
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
         dog = self
         if cause is Cause.MANUAL or (was_seen_to and knows and not had_died):
@@ -250,7 +256,7 @@ class Watchdog:
         return dog._with_stops((stop, *dog.tip.stops)) if is_to_stop else dog
 
     def newly_wanted(self, before: Watchdog) -> list[str]:
-        """Return the actions wanted now that were not before."""
+        """Return the actions wanted now and not before."""
         known = () if before.put_off else before.wanted
         return [] if self.put_off else [action for action in self.wanted if action not in known]
 
@@ -258,23 +264,23 @@ class Watchdog:
         if self.settings.retract is None:
             return self
         tip = replace(self.tip, for_feedback=microscope.endangered_by_feedback)
-        # whoever was there to see to a tip that was put off is gone
+        # the solver that attended to the tip has lost control: retry at once
         due_s = None if self.put_off else self.due_s
-        return replace(self, tip=tip, due_s=due_s)._see(TipEvent.ENDANGERED)
+        return replace(self, tip=tip, due_s=due_s)._after(TipEvent.ENDANGERED)
 
     def seen_to(self) -> Watchdog:
-        """Leave the tip to whoever sees to it: it is not retracted any more, unless it is just being."""
-        return self._see(TipEvent.SEEN_TO)
+        """Drop the duty to retract: a person or a solver attends to the tip. A retract in flight goes on."""
+        return self._after(TipEvent.SEEN_TO)
 
     def hurry(self, now_s: float) -> Watchdog:
-        """Wait for nothing longer than a moment: the experiment ends."""
+        """Shorten all waits to a moment: the experiment ends."""
         due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
         return replace(self, in_haste=True, due_s=due_s)
 
     # --- what is sent ---
 
     def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
-        """Return the action to send now, if one is; it counts as sent."""
+        """Return the action to send now, or None; it counts as sent."""
         dog = self
         if dog.tip.for_feedback and microscope.risk.feedback_on is True:
             dog = dog.seen_to()
@@ -287,44 +293,44 @@ class Watchdog:
             return dog, None
         action = dog.wanted[0]
         dog = replace(dog, sent=action, due_s=None, told_to_stop=dog.told_to_stop or action == runs)
-        return (dog if dog.tip.stops else dog._see(TipEvent.SENT)), action
+        return (dog if dog.tip.stops else dog._after(TipEvent.SENT)), action
 
     def _waits_for_stop(self, microscope: MicroscopeStatus) -> bool:
-        """True while what was told to stop still runs: the tip is retracted when it has stopped."""
+        # a retract is sent only once the scan has stopped
         return not self.tip.stops and microscope.state in STOPS and not self.unstoppable
 
     def answered(self, code: int, microscope: MicroscopeStatus, now_s: float) -> tuple[Watchdog, SafetyResult]:
-        """Take the translator's answer to what was sent (or NO_RESPONSE)."""
+        """Process the translator's answer to the action that was sent (or NO_RESPONSE)."""
         action, dog, is_retract = self.sent or "", replace(self, sent=None), self.tip.duty is TipDuty.ASKED
         if code == ControlResponse.SUCCESS:
             dog = replace(dog, starting=None)
             if is_retract:
-                return dog._see(TipEvent.RETRACTED), SafetyResult.DONE
+                return dog._after(TipEvent.RETRACTED), SafetyResult.DONE
             due_s = now_s + dog._wait_s if dog.owes_retract else None
             return replace(dog._without_stop(action), due_s=due_s), SafetyResult.DONE
         if code == ControlResponse.NOT_FREE:
             dog = replace(dog, refused_at=microscope.states_seen, due_s=now_s + dog._wait_s)
-            return dog._see(TipEvent.NOT_YET), SafetyResult.AGAIN
+            return dog._after(TipEvent.NOT_YET), SafetyResult.AGAIN
         dog = replace(dog, attempts=dog.attempts + 1)
         if code == ControlResponse.NO_RESPONSE and dog.attempts < dog.settings.attempts:
-            return dog._see(TipEvent.NOT_YET), SafetyResult.AGAIN
+            return dog._after(TipEvent.NOT_YET), SafetyResult.AGAIN
         if not is_retract:
             return replace(dog, unstoppable=True)._without_stop(action), SafetyResult.FAILED
         if code == ControlResponse.ACTION_NOT_SUPPORTED:
-            return dog._see(TipEvent.IMPOSSIBLE), SafetyResult.FAILED
+            return dog._after(TipEvent.IMPOSSIBLE), SafetyResult.FAILED
         return dog._retract_later(now_s), SafetyResult.FAILED
 
     def done_late(self, action: str) -> Watchdog:
-        """Take what the translator did when nobody waited any more: a tip withdrawn late is left to people, too."""
-        return self._see(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
+        """Process a success after its deadline: a tip withdrawn late is left to a person, too."""
+        return self._after(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
 
     def unsent(self, now_s: float) -> Watchdog:
-        """Take back what `next_action` gave: the translator is not connected. It is sent when that is."""
-        dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._see(TipEvent.NOT_YET)
+        """Undo `next_action`: the translator is not connected. The action is sent once it is."""
+        dog = replace(self, sent=None, attempts=0, refused_at=-1, told_to_stop=False)._after(TipEvent.NOT_YET)
         return replace(dog, due_s=now_s + dog._wait_s) if dog.owes_retract and dog.due_s is None else dog
 
     def translator_is_there(self, now_s: float) -> Watchdog:
-        """Try what was put off, once another translator has told how it is with the microscope."""
+        """Retry a retract that was put off, soon after a translator connects: its first packets come before."""
         return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
     # --- what does not come about ---
@@ -332,17 +338,17 @@ class Watchdog:
     def look_again(
         self, microscope: MicroscopeStatus, now_s: float, *, is_seen_to: bool
     ) -> tuple[Watchdog, str | None]:
-        """Go on where something was waited for in vain, or what was put off is due.
+        """Go on after a wait in vain, or when a put off retract is due.
 
         Args:
-            is_seen_to: somebody is there to see to the tip, if it was not retracted.
+            is_seen_to: a person or a solver attends to the tip.
 
         Returns:
-            also what people are to be told, if that is new.
+            The watchdog, and a new message for people or None.
         """
         dog = replace(self, due_s=None)
         if dog.put_off:
-            return replace(dog, refused_at=-1)._see(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE), None
+            return replace(dog, refused_at=-1)._after(TipEvent.SEEN_TO if is_seen_to else TipEvent.DUE), None
         if not dog.wanted or dog.sent is not None:
             return dog, None
         if dog.tip.stops:
@@ -351,7 +357,7 @@ class Watchdog:
             return dog, f"the microscope is never free to {action}"
         is_refused = dog.refused_at == microscope.states_seen
         if not is_refused and dog._waits_for_stop(microscope):
-            return replace(dog, unstoppable=True), "the microscope was told to stop, and does not"
+            return replace(dog, unstoppable=True), "the microscope does not stop, although a stop was sent"
         why = "the microscope is never free for that" if is_refused else "its translator is not there"
         told = None if dog.retries else f"the tip was left in danger and can't be retracted: {why}"
         return dog._retract_later(now_s), told
@@ -363,7 +369,7 @@ class Watchdog:
     def _retract_later(self, now_s: float) -> Watchdog:
         wait_s = min(self._wait_s * 2**self.retries, self.settings.longest_s)
         due_s = now_s + (_SOON_S if self.in_haste else wait_s)
-        dog = self._see(TipEvent.FAILED)
+        dog = self._after(TipEvent.FAILED)
         return replace(dog, due_s=due_s, retries=min(self.retries + 1, 32), attempts=0)
 
     def _with_stops(self, stops: tuple[str, ...]) -> Watchdog:
@@ -373,8 +379,7 @@ class Watchdog:
         stops = tuple(other for other in self.tip.stops if other != action)
         return replace(self, attempts=0)._with_stops(stops)
 
-    def _see(self, event: TipEvent) -> Watchdog:
-        """Go on by the table; what was waited for is forgotten where nothing is owed any more."""
+    def _after(self, event: TipEvent) -> Watchdog:
         *after, calls = _TABLE[event]
         duty = after[list(TipDuty).index(self.tip.duty)]
         tip = replace(self.tip, duty=duty, calls_people=self.tip.calls_people or calls)
