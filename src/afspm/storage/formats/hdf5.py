@@ -39,7 +39,7 @@ def opened(path: Path) -> h5py.File:
     file = h5py.File(path, "r")
     try:
         _check_links(file, path)
-    except BaseException:  # whatever the check raises, the caller gets no file to close
+    except BaseException:  # after any error, Ctrl-C too, the caller has no file to close
         file.close()
         raise
     return file
