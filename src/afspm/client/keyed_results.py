@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import zlib
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.plain_data import Plain
-from afspm.model import LoggedPacket, Packet, ScanSet, Spectrum
+from afspm.model import LoggedPacket, Packet, Parameter, ScanSet, Spectrum
+from afspm.model.snapshot import to_plain
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
 from afspm.storage.memory import Memory
@@ -68,6 +70,20 @@ class KeyedResults:
     def intend(self, intent: Plain) -> None:
         """Write down what is going to be asked for, before it is."""
         self._memory["pending"] = intent
+        self._memory.save()
+
+    def before_sweep(self, key: str) -> list[Parameter] | None:
+        """Return the parameters as they were before a sweep that has not been ended; None: no value of it was set."""
+        kept = self._memory.get("before_sweep", {}).get(key)
+        return None if kept is None else [Parameter(**one) for one in kept]
+
+    def keep_before_sweep(self, key: str, before: Sequence[Parameter] | None) -> None:
+        """Write down the parameters as they are before a sweep sets the first; None: they are in force again."""
+        kept = self._memory.setdefault("before_sweep", {})
+        if before is None:
+            kept.pop(key, None)
+        else:
+            kept[key] = [to_plain(one) for one in before]
         self._memory.save()
 
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:

@@ -9,7 +9,7 @@ from enum import Enum, IntEnum
 from typing import Protocol
 
 from afspm.basics.errors import InvalidValue
-from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse
+from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse, Parameter
 from afspm.model.state import ControlMode
 
 SUPERVISOR = "supervisor"
@@ -234,8 +234,25 @@ class Note:
 
 
 @dataclass(frozen=True, slots=True)
+class MeasurementSettings:
+    """The parameters that a component has set for its next scan or spectrum, as the microscope reports them.
+
+    Attributes:
+        who: the component.
+        parameters: none: its next measurements are not part of a sweep.
+        key: of the measurement, if it is taken exactly once.
+    """
+
+    time_ns: int
+    who: str
+    parameters: tuple[Parameter, ...] = ()
+    key: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class RelayedMessage:
-    """A message that the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress, Note.
+    """A message that the scheduler publishes for others: ProcessStates and LogLines of a supervisor, Progress,
+    MeasurementSettings, Note.
 
     Its envelope is the message's name, for ProcessStates and Progress followed by "_" and whose it is.
     """

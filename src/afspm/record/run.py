@@ -112,7 +112,13 @@ class Run:
         """Return what is known beside the values: drift, feedback, the controller's header, notes … See `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
-        return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
+        settings = {one.column: one.value for one in row.settings}
+        return (
+            header
+            | ({"notes": notes} if notes else {})
+            | ({"key": row.key} if row.key else {})
+            | ({"settings": settings} if settings else {})
+        )
 
     def scan_at(self, time_ns: int, channel: str = "") -> ScanRow | None:
         """Return the scan that was finished at a time; None if there is none.
