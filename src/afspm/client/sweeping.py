@@ -41,6 +41,7 @@ class SweepPoint:
 
     @property
     def spectrum(self) -> Spectrum:
+        """The spectrum."""
         return self._result.spectrum
 
 

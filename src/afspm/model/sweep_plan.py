@@ -175,7 +175,7 @@ def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
             return _finite(name, convert(number, given, unit if unit is not None else given))
     else:
         number = value
-    if unit and name not in BASE_PARAMETERS:
+    if unit and not BASE_PARAMETERS.get(name):  # its own unit, or that of the others? A person knows
         raise UnitError(f"{name}: {value!r} has no unit, others have", hint=f"write it as in '1 {unit}'")
     require_unit(number, unit or "")
     return _finite(name, number)
