@@ -70,7 +70,7 @@ class KeyedResults:
     def intend(self, intent: Plain) -> None:
         """Write down what is going to be asked for, before it is."""
         self._memory["pending"] = intent
-        self._memory.save()
+        self._memory.save(synced=False)  # a power cut may have it measured again, which costs a scan and no harm
 
     def before_sweep(self, key: str) -> list[Parameter] | None:
         """Return the parameters as they were before a sweep that has not been ended; None: no value of it was set."""
@@ -96,7 +96,11 @@ class KeyedResults:
         path = self._path(key)
         if path is None or not path.exists():
             return None
-        head, things = _read(path)
+        try:
+            head, things = _read(path)
+        except (ValueError, KeyError, WireError) as error:  # a power cut came before it was on the disk
+            _log.warning("%s is damaged and measured again: %s: %s", key, path, error)
+            return None
         if head["key"] != key or head["plan"] != plan:
             raise InvalidValue(
                 f"the key {key!r} was used for another measurement in this run: {head['plan']}",
@@ -114,9 +118,9 @@ class KeyedResults:
             for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
                 parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
             with self._outage.trying():
-                write_atomic(path, parts)
+                write_atomic(path, parts, synced=False, soon=True)
         self._memory.pop("pending", None)
-        self._memory.save()
+        self._memory.save(synced=False)
 
     def forget(self, key: str) -> None:
         """Remove what is kept of a key; a component that asks for it again measures again."""
@@ -155,5 +159,5 @@ def _read(path: Path) -> tuple[Plain, list[object]]:
         if len(packets) != 1 + head["things"]:
             raise ValueError("not all of it is there")
         return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]
-    except (OSError, ValueError, WireError) as error:
+    except OSError as error:
         raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure anew") from error

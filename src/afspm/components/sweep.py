@@ -112,7 +112,7 @@ class Sweep(Component):
         with self.scope.sweep(**self._given, **self._what, measure=self.measure, key=KEY, done=done) as points:
             for point in points:
                 self.memory["done"] = point.number
-                if self.memory.save():  # else a restart asks for it again
+                if self.memory.save(synced=False):  # else a restart asks for it again
                     self.scope.forget(point.key)
                 per_point_s = (self.clock.now_s() - start_s) / point.number
                 self.scope.progress(point.number, total, left_s=per_point_s * (total - point.number))

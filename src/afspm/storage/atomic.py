@@ -35,6 +35,7 @@ def replace_file(
     parts: Iterable[bytes | memoryview],
     *,
     synced: bool = True,
+    soon: bool = False,
     aside: Path | None = None,
     mode: int = _ANYONE,
 ) -> None:
@@ -42,6 +43,7 @@ def replace_file(
 
     Args:
         synced: the same of a power cut; that waits for the disk.
+        soon: with `synced` False, have it on the disk a moment later. A power cut before that may leave a damaged file.
         aside: where it is written before it has its name; None: under a hidden name of this process beside it.
         mode: of the file, before the umask; 0o600 for secrets: it never has another, not even for a moment.
 
@@ -55,12 +57,16 @@ def replace_file(
             aside.unlink(missing_ok=True)  # one that was left there has a mode of its own
         with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.writelines(parts)
+            file.flush()
             if synced:
-                file.flush()
                 sync_file(file.fileno())
+            elif soon:
+                SYNCER.soon(file.fileno())
         _rename(aside, path)
         if synced:
             sync_folder(path.parent)
+        elif soon:
+            SYNCER.folder_soon(path.parent)
     except OSError:
         with contextlib.suppress(OSError):
             aside.unlink()
@@ -79,10 +85,10 @@ def _rename(aside: Path, path: Path) -> None:
         threading.Event().wait(_AGAIN_S)  # nobody tells when the reader has closed it
 
 
-def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
-    """Replace a file. Raises FileError: it can't be written."""
+def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True, soon: bool = False) -> None:
+    """Replace a file, as `replace_file` does. Raises FileError: it can't be written."""
     try:
-        replace_file(path, parts, synced=synced)
+        replace_file(path, parts, synced=synced, soon=soon)
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(path)) from error
 
