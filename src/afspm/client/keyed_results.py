@@ -65,7 +65,9 @@ class KeyedResults:
     @property
     def pending(self) -> Plain | None:
         """The intent that was written down and not fulfilled: key, plan, attempt, since_ns, interruptions."""
-        return self._memory.get("pending")
+        intent: Plain | None = self._memory.get("pending")
+        path = None if intent is None else self._path(intent["key"])
+        return None if path is not None and path.exists() else intent
 
     def intend(self, intent: Plain) -> None:
         """Write down what is going to be asked for, before it is."""
@@ -110,7 +112,7 @@ class KeyedResults:
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
         """Keep the result; the intent is fulfilled. Where the disk is full, another life measures it again."""
-        path = self._path(key)
+        path, is_kept = self._path(key), False
         if path is not None:
             things = [wire.encode(thing) for thing in result.things]
             head = {"key": key, "plan": plan, "interruptions": result.interruptions, "things": len(things)}
@@ -119,8 +121,10 @@ class KeyedResults:
                 parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
             with self._outage.trying():
                 write_atomic(path, parts, synced=False, soon=True)
+                is_kept = True
         self._memory.pop("pending", None)
-        self._memory.save(synced=False)
+        if not is_kept:  # else the file shows that it is fulfilled
+            self._memory.save(synced=False)
 
     def forget(self, key: str) -> None:
         """Remove what is kept of a key; a component that asks for it again measures again."""
