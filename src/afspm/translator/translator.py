@@ -149,7 +149,9 @@ class Translator:
 
     def reply(self, response: Response, level: int = logging.INFO) -> None:
         """Answer the request in hand, and log a refusal."""
-        if response.code != ControlResponse.SUCCESS:
+        if response.code == ControlResponse.NO_RESPONSE:  # it waits for the controller, which refuses nothing
+            self._log.log(level, "%s", response.reason)
+        elif response.code != ControlResponse.SUCCESS:
             self._log.log(level, "refused, %s: %s", ControlResponse(response.code).name, response.reason)
         self._port.reply(wire.encode_response(response))
 
