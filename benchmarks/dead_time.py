@@ -28,6 +28,8 @@ from benchmarks.processes import roles
 from benchmarks.rows import Row, measurement
 
 ROWS, WIDTH_M = 32, 1e-6
+FRAME_M = WIDTH_M * ROWS / (ROWS - 1)
+"""The same region as Nanonis counts it: to the edges of its outer pixels, not to their centres."""
 FRAMES, FRAME_S = effort(20, 3), effort(1.28, 0.32)
 SHORT_FRAMES, SHORT_FRAME_S = effort(100, 3), 0.32
 LONG_FRAMES, LONG_FRAME_S = effort(4, 2), effort(10.0, 0.32)
@@ -75,7 +77,7 @@ repeats = {count}
 
 
 def speed_m_s(frame_s: float) -> float:
-    return 2.0 * WIDTH_M * ROWS / frame_s
+    return 2.0 * FRAME_M * ROWS / frame_s
 
 
 def afspm_periods_s(component: str, table: str) -> list[float]:
@@ -112,7 +114,7 @@ class Script:
         channels = [int(np.ravel(channel)[0]) for channel in self.ask("Scan_BufferGet")[1]]
         ends_s = []
         for number in range(count):
-            self.ask("Scan_FrameSet", 0.0, 0.0, WIDTH_M, WIDTH_M, 0.0)
+            self.ask("Scan_FrameSet", 0.0, 0.0, FRAME_M, FRAME_M, 0.0)
             self.ask("Scan_BufferSet", channels, ROWS, ROWS)
             self.ask("Scan_SpeedSet", speed, speed, line_s, line_s, _ON, 1.0)
             self.ask("Scan_Action", _START, _UP)
