@@ -97,6 +97,8 @@ class PlannedScans(Component):
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
         if not step.starts_round or self.memory.get("begun") == step.index:
             return True
+        if not self.beat_s:  # no round has a time of its own, so there is nothing to wait for or to keep
+            return self._total is None or step.index < self._total
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
         before_s = float(self.memory.get("due_s", due_s))
         left_out = rhythm.left_out(max(before_s, self._began_s), due_s)
@@ -146,7 +148,7 @@ class PlannedScans(Component):
             round_s = self.clock.now_s() - self._round_began_s
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
-        if self.memory.save():  # if not saved, a restart requests the same scan
+        if self.memory.save(synced=False):  # if not saved, a restart requests the same scan
             self.scope.forget(step.key)
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)

@@ -77,7 +77,7 @@ class SpectroscopyGrid(Component):
             key = f"spectrum-{place}-{repeat}"
             self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
             self.memory["done"] = index + 1
-            if self.memory.save():  # if not saved, a restart requests the same spectrum
+            if self.memory.save(synced=False):  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
             per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
             self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))

@@ -84,13 +84,14 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
     given = {name: getattr(made, name, None) for name in _PARAMETERS}
+    set_by_setting = {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)}
     return PlannedMeasurements(
         regions,
         positions,
         getattr(plan, "shape", None),
         tuple(getattr(made, "needs_actions", ())),
         tuple(getattr(made, "needs_parameters", ())),
-        {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)},
+        {**set_by_setting, **getattr(made, "planned_parameters", {})},
         getattr(made, "beat_s", 0.0),
         getattr(made, "scan_speed_m_s", None),
         isinstance(settings.get("regions"), list),

@@ -209,6 +209,9 @@ NOTE: Final = MessageDeclaration(
     event="note",
     in_past=True,
 )
+MEASUREMENT_SETTINGS: Final = MessageDeclaration(
+    type=journal_pb2.MeasurementSettings, kind=MessageKind.EVENT, source=Role.SCHEDULER
+)
 DRIFT_MAPPING: Final = MessageDeclaration(
     type=DriftMapping,
     kind=MessageKind.RESULT,

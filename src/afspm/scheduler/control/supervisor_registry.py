@@ -10,6 +10,7 @@ from afspm.basics.formatting import duration_text
 from afspm.basics.frozen import replace
 from afspm.model import (
     LogLines,
+    MeasurementSettings,
     Note,
     ProcessCondition,
     ProcessState,
@@ -162,6 +163,9 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
         mine = thing.name in (event.name, component_of(event.name))
         return _named(told.message, thing.name) if mine else Announcement("", f"{event.name} is not {thing.name}")
     if isinstance(thing, Note) and told.message == "Note":
+        mine = thing.who == event.name
+        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if isinstance(thing, MeasurementSettings) and told.message == "MeasurementSettings":
         mine = thing.who == event.name
         return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
     if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
