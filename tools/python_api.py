@@ -22,7 +22,7 @@ GROUPS = {
         "afspm.client.events.PublishedEvent",
         "afspm.client.sweeping.SweepPoint",
     ],
-    "What is asked for and measured": [
+    "Requests and measurements": [
         "afspm.Region",
         "afspm.Scan",
         "afspm.ScanSet",

@@ -159,7 +159,7 @@ class Scope(ExperimentView):
         Args:
             parameters: the values of each: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s", "points": 4,
                 "spacing": "log"}. The first parameter changes least often.
-            measure: what is taken at each point.
+            measure: the measurement at each point.
             region, shape: of the scans, as for `scan`.
             at, kind: of the spectra, as for `spectrum`.
             order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops;

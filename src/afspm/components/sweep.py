@@ -24,8 +24,8 @@ class Sweep(Component):
     """Takes a scan or a spectrum at each combination of the values of some parameters.
 
     At the end the parameters are set back to their values before the sweep, also where a process was killed in
-    between. Whatever is killed, and whenever, each point is measured once. Control is kept over the whole sweep; a
-    point that was interrupted, by the repair of a tip for instance, is measured again with its parameters set again.
+    between. Each point is measured once, whichever process is killed. Control is kept over the whole sweep; a point
+    that was interrupted, by the repair of a tip for instance, is measured again with its parameters set again.
 
     The keys of its measurements are `sweep-1`, `sweep-2` …, in the order of measurement, and the swept parameters are
     columns of `run.scans` and `run.spectra`. The report shows the scans beside each other in `sweep.png`.
@@ -34,14 +34,14 @@ class Sweep(Component):
         parameters: the values of each parameter: a list, such as ["50 pA", "100 pA"], or a range, such as {from =
             "0.5 um/s", to = "4 um/s", points = 4, spacing = "log"}, with `step` in place of `points` where wanted. The
             first parameter changes least often.
-        measure: what is taken at each point.
+        measure: the measurement at each point.
         order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops over
             the values as listed; "random": shuffled by `seed`.
         seed: of the random order.
-        size: (width, height) of the scans; by default the region that is set.
-        center: (x, y) of the middle of the scans; (0, 0) if not told.
-        angle: of the scans, counter-clockwise; 0 if not told.
-        pixels: (columns, rows) of the scans; by default what is set.
+        size: (width, height) of the scans; by default the present region.
+        center: (x, y) of the middle of the scans; (0, 0) if not given.
+        angle: of the scans, counter-clockwise; 0 if not given.
+        pixels: (columns, rows) of the scans; by default the present ones.
         at: (x, y) of the spectra; by default where the probe stands.
         kind: of the spectra, where the microscope can choose, e.g. "IV" or "force".
         end_when_done: whether to end the whole experiment after the last point.

@@ -105,7 +105,7 @@ class Experiment:
         """Raise ConfigError with all errors, if there are any."""
         errors = [finding for finding in self.check(only, without) if finding.is_error]
         if errors:
-            raise ConfigError("\n".join(map(str, errors)), hint="afspm check shows what is wrong")
+            raise ConfigError("\n".join(map(str, errors)), hint="run afspm check for all faults of the file")
 
     def launches(
         self,

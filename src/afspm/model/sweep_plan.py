@@ -128,7 +128,7 @@ class SweepPlan:
         return listed
 
     def settings(self, places: Sequence[int]) -> tuple[Parameter, ...]:
-        """Return what is set at a point."""
+        """Return the parameter values of a point."""
         return tuple(axis.parameter(place) for axis, place in zip(self.axes, places, strict=True))
 
     def values(self, places: Sequence[int]) -> dict[str, SweptValue]:
@@ -152,7 +152,7 @@ class SweepPlan:
 
 
 def _unit_of(name: str, given: Sequence[SweptValue]) -> str | None:
-    # of a base parameter its SI unit, else that of the first quantity with a unit
+    # a base parameter has its SI unit, another one the unit of the first quantity with a unit
     if unit := BASE_PARAMETERS.get(name):
         return unit
     for value in given:
@@ -175,7 +175,7 @@ def _in_unit(name: str, value: SweptValue, unit: str | None) -> SweptValue:
             return _finite(name, convert(number, given, unit if unit is not None else given))
     else:
         number = value
-    if unit and not BASE_PARAMETERS.get(name):  # its own unit, or that of the others? A person knows
+    if unit and not BASE_PARAMETERS.get(name):  # its own unit or the unit of the others? A person knows
         raise UnitError(f"{name}: {value!r} has no unit, others have", hint=f"write it as in '1 {unit}'")
     require_unit(number, unit or "")
     return _finite(name, number)

@@ -229,7 +229,7 @@ _SETTINGS = MessageMapping(
     parameters=_each("parameters", PARAMETER),
     key=FieldMapping("key", sparse=True),
 )
-# Told is the name on the wire, which must stay compatible
+# Told is the name on the wire, which must stay compatible  # word: told
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )

@@ -35,7 +35,7 @@ def life(lab: Lab, folder: Path, session: str, component: Sweep, deadly_call: in
     return component.run_process(context)
 
 
-def test_sweep_that_is_killed_measures_only_what_is_left(tmp_path: Path) -> None:
+def test_killed_sweep_measures_only_the_remaining_points(tmp_path: Path) -> None:
     for deadly_call in range(5, 40, 3):
         lab, folder = Lab("sweep"), tmp_path / str(deadly_call)
         with pytest.raises(Kill9):

@@ -171,7 +171,7 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
         return Announcement("", f"a {told.message[:80]} can't be relayed, or can't be read")
     if event.user not in (None, SUPERVISOR):
-        return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not that of {event.user}")
+        return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not the key of {event.user}")
     spoken_of = thing.lines if isinstance(thing, LogLines) else thing.processes
     if wrong := [one.name for one in spoken_of if not is_process_name(one.name)]:
         return Announcement("", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process")
