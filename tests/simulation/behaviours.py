@@ -399,7 +399,7 @@ class Teller(Client):
             yield from self.sleep(5.0)
 
 
-class Listener(Client):
+class FeedListener(Client):
     """Only listens, to everything, as a visualiser does."""
 
     listens = ("",)

@@ -13,7 +13,7 @@ from collections.abc import Callable
 _LONGEST_STEP_S = 60.0
 
 
-class Killed(BaseException):
+class LifeEnded(BaseException):
     """This life has ended: raised wherever the code waits, as often as it tries to."""
 
 
@@ -21,7 +21,7 @@ class Baton:
     """One thread of blocking code.
 
     Args:
-        body: the code. What it raises, but for `Killed`, is kept in `error`.
+        body: the code. What it raises, but for `LifeEnded`, is kept in `error`.
     """
 
     def __init__(self, name: str, body: Callable[[], int]) -> None:
@@ -58,23 +58,23 @@ class Baton:
     def wait(self) -> None:
         """Give the baton back, until it comes again."""
         if self._killed:
-            raise Killed
+            raise LifeEnded
         self._to_simulation.release()
         self._to_thread.acquire()
         if self._killed:
-            raise Killed
+            raise LifeEnded
 
     def die(self) -> None:
         """End this life here and now."""
         self._killed = True
-        raise Killed
+        raise LifeEnded
 
     def _run(self) -> None:
         self._to_thread.acquire()
         try:
             if not self._killed:
                 self.code = self._body()
-        except Killed:
+        except LifeEnded:
             self.code = None
         except BaseException as error:
             self.error = error

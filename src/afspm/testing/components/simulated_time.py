@@ -33,7 +33,7 @@ class Timer:
         self.cancelled = True
 
 
-class Timeline:
+class SimulatedTime:
     """All that is going to happen, in order. It is a `Clock` as well.
 
     Args:
