@@ -1,4 +1,21 @@
-"""For those who write drivers, components and clients: conformance suites, commissioning, skeletons.
+"""For those who write drivers, components and clients: conformance suites, commissioning, skeletons, a bench.
 
-No process of a run imports this room.
+No process of a run imports this room. `Bench` is loaded when it is first used.
 """
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from afspm.testing.components.component_bench import Bench
+
+__all__ = ["Bench"]
+
+
+def __getattr__(name: str) -> object:
+    if name != "Bench":
+        raise AttributeError(f"module 'afspm.testing' has no attribute {name!r}")
+    from afspm.testing.components.component_bench import Bench
+
+    return Bench

@@ -150,6 +150,7 @@ class ComponentProcess(BlockingProcess):
         self._folder = folder
         self._inbox: list[Incoming] = []
         self._newest: dict[str, int] = {}
+        self.problems: dict[str, int] = {}
 
     def connect(self) -> None:
         self._inbox = []
@@ -168,6 +169,7 @@ class ComponentProcess(BlockingProcess):
             state_dir=str(self._folder),
             run_dir=str(self._folder),
             simulated=True,
+            problems=self.problems,
         )
         context = ProcessContext(
             launch,
@@ -179,10 +181,12 @@ class ComponentProcess(BlockingProcess):
         )
         return self._make().run_process(context)
 
-    def cut(self) -> None:
-        """Its connections break, and are made again."""
+    def cut(self, for_s: float = 0.0) -> None:
+        """Break its connections; they are made again after about `for_s`."""
+        self._weather.reconnect_s, before_s = max(for_s, self._weather.reconnect_s), self._weather.reconnect_s
         self._line.cut()
         self._feed.cut()
+        self._weather.reconnect_s = before_s
 
     # --- what comes ---
 

@@ -46,7 +46,7 @@ from afspm.scheduler.events import (
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
-from afspm.testing.components.memory_network import ControlLine, LineServer, Feed, PacketSource, Weather
+from afspm.testing.components.memory_network import ControlLine, Feed, LineServer, PacketSource, Weather
 from afspm.testing.components.simulated_process import Alarm, Process
 from afspm.testing.components.simulated_time import SimulatedTime
 
