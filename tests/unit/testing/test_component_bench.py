@@ -112,6 +112,15 @@ def test_error_of_the_component_is_raised() -> None:
         Bench(Broken(), others={"series": scans}).run(until="1 h")
 
 
+def test_error_of_a_script_is_raised() -> None:
+    class BrokenScript(Component):
+        def run(self) -> None:
+            raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        Bench(BrokenScript()).run(until="1 min")
+
+
 @pytest.mark.parametrize(
     ("component", "scans"),
     [
