@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC
 from typing import Any, Literal
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, InvalidValue, RequestError, UnitError
 from afspm.basics.formatting import day_and_time
-from afspm.basics.units import Angle, Length, Period, convert
+from afspm.basics.units import Angle, Length, Period, convert, si
 from afspm.client.component import Component
 from afspm.client.parameter_text import to_parameter
 from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
 from afspm.model import Region, names
 from afspm.model.names import BASE_PARAMETERS
+from afspm.model.planned_work import PlannedWork, planned_rounds
 
 Pixels = tuple[int, int]
 # parameters that every scan with a region needs of the microscope
@@ -67,6 +68,15 @@ class PlannedScans(Component):
         self.keep_control, self.end_when_done, self.missed = keep_control, end_when_done, missed
         self.parameters = checked_parameters(parameters, "parameters")
         self.needs_parameters = (*FRAME, *self.parameters)
+
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork | None:
+        plan = self.plan
+        if plan.shape is None:
+            return None
+        speed_m_s = speed_in_force(self.parameters, speed_m_s)
+        late = self.ends_on_time
+        work = planned_rounds(plan.regions, plan.shape, plan.rounds, self.beat_s, speed_m_s, skips_late=late)
+        return replace(work, ends_experiment=self.end_when_done)
 
     def run(self) -> None:
         self._began_s = self.clock.now_s()
@@ -295,6 +305,18 @@ def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> d
         except (InvalidValue, UnitError) as error:
             raise ConfigError(error.what, where=f"{where}.{name}", hint=error.hint) from error
     return parameters
+
+
+def speed_in_force(parameters: Mapping[str, str | float], before_m_s: float | None) -> float | None:
+    """Return the scan speed after these parameters are set; None if unknown.
+
+    Args:
+        before_m_s: the speed before.
+    """
+    if names.SCAN_SPEED not in parameters:
+        return before_m_s
+    speed = to_parameter(names.SCAN_SPEED, parameters[names.SCAN_SPEED], None)
+    return si(f"{speed.value} {speed.unit or 'm/s'}", "m/s")
 
 
 def period(every_s: float, where: str = "every") -> float:

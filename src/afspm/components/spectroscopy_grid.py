@@ -10,6 +10,7 @@ from afspm.client.component import Component
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import grid_centers
 from afspm.model import names
+from afspm.model.planned_work import PlannedWork
 
 MOST_LINES = 20
 """Limit on log lines about the progress of a grid; `scope.progress` reports each spectrum."""
@@ -68,6 +69,10 @@ class SpectroscopyGrid(Component):
         self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *([names.SPEC_KIND] if kind else []))
         self.repeats = repeats
         self.end_when_done = end_when_done
+
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork:
+        spectra, why = len(self.positions) * self.repeats, "the controller sets the duration of a spectrum"
+        return PlannedWork(spectra=spectra, ends_experiment=self.end_when_done, why=why)
 
     def run(self) -> None:
         total = len(self.positions) * self.repeats
