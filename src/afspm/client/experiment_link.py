@@ -223,7 +223,9 @@ class ExperimentLink:
         """Wait until `done()`, tested after each event; return False if `until_s` (monotonic) comes first.
 
         Raises:
-            ExperimentEnded, StopRequested: waiting makes no more sense.
+            ExperimentEnded: the experiment has ended.
+            StopRequested: the process is being stopped.
+            NoResponse: the link was closed.
             KeyboardInterrupt: the user interrupts.
         """
         with self.activity.waiting(), self.interrupts.heeded():

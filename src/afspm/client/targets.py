@@ -102,7 +102,7 @@ class SpectrumTarget:
         return _facts(self)
 
     def fits(self, spectrum: Spectrum) -> bool:
-        """Return whether a spectrum can be the requested one."""
+        """Return whether the kind and position of a spectrum match this target."""
         if self.kind is not None and spectrum.kind != self.kind:
             return False
         if self.at_m is None or spectrum.position_m is None or self.frame is Frame.SAMPLE:

@@ -161,7 +161,10 @@ class Experiment:
         return process_starts.ends_idle(self.resolved, names)
 
     def asking(self, names: Collection[str]) -> Launch | None:
-        """Return a launch line with which one of `names` asks a scheduler started elsewhere; None if none can."""
+        """Return a launch line for requests to a scheduler on another computer, in the name of the first of `names`.
+
+        None if the scheduler's address is unknown, or if the scheduler is not afspm's.
+        """
         return process_starts.asking(self.resolved, names)
 
     def planned_work(self) -> dict[str, PlannedWork | None]:

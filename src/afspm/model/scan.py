@@ -124,7 +124,7 @@ class Scan:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Return (rows, columns), with or without values; a zero if neither arrived."""
+        """Return (rows, columns) of the values, else of `pixels`; with a zero if both are missing."""
         rows, columns = self.values.shape
         return (rows, columns) if self.values.size or self.pixels is None else self.pixels
 

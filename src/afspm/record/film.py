@@ -196,7 +196,7 @@ def places(run: Run, rows: Sequence[ScanRow]) -> list[list[ScanRow]]:
 
 
 def _recorded_drift(run: Run) -> Mapping[int, XY]:
-    """Return the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates."""
+    # the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates
     if run.frame is Frame.SAMPLE:
         return {}  # regions are in sample coordinates already
     return {point.time_ns: point.translation_m for point in run.drift if not point.lost}
@@ -230,7 +230,7 @@ def _values(run: Run, row: ScanRow, channel: str) -> Array:
 
 
 def _sampled(values: Array, place: Region, window: Region, shape: tuple[int, ...]) -> Array:
-    """Return the values of a scan of `place` at the pixels of `window`; NaN outside, and beside unmeasured pixels."""
+    # NaN outside the scan, and beside its unmeasured pixels
     from scipy.ndimage import map_coordinates
 
     x, y = window.pixels_m((shape[0], shape[1]))

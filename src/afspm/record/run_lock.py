@@ -21,7 +21,7 @@ def lock_run(folder: Path) -> Iterator[None]:
     """Hold the lock of a run in the block; the system releases the lock of a killed process.
 
     Raises:
-        FileError: another process runs it already.
+        FileError: another process holds the lock: the run is still going on.
     """
     with (folder / STATE_DIR / LOCK_FILE).open("a+b") as file:
         try:

@@ -148,7 +148,7 @@ class ScannerCompensation:
         self.turns.append((t_s, float(x), float(y), float(velocity_x), float(velocity_y)))
 
     def at(self, t_s: ArrayLike) -> NDArray[np.float64]:
-        """Return (x, y, z) in m at experiment times, shape t.shape + (3,); z is not followed."""
+        """Return the compensating displacement (x, y, z) in m at experiment times, shape t.shape + (3,); z is 0."""
         t = np.asarray(t_s, dtype=np.float64)
         followed = np.zeros((*t.shape, 3))
         # a long night has thousands of velocities, and mostly the last is needed

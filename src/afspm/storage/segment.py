@@ -29,7 +29,7 @@ _CHECKSUM_MODULUS = 1 << 64
 
 
 class SegmentWriter:
-    """A writer of one segment.
+    """An open file to which the packets of one segment are appended.
 
     Args:
         spare: a file that is no longer needed, to overwrite; None: a new file.

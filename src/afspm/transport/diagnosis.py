@@ -44,7 +44,7 @@ class Handshake(Enum):
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The verdict on one measurement.
+    """The result of one check of `afspm doctor`, with its severity.
 
     Attributes:
         code: identifier for programs.
@@ -179,7 +179,7 @@ LEAST_BYTES_PER_S = 20e6
 
 
 def of_disk(folder: str, free_bytes: int, bytes_per_s: float) -> Iterator[Diagnosis]:
-    """Judge the disk of the run folders."""
+    """Yield the diagnoses of free space and writing speed (bytes/s) of the disk with the run folders."""
     free = f"{free_bytes / 1e9:.1f} GB free"
     if free_bytes < SMALL_FREE_BYTES:
         severity = Severity.ERROR if free_bytes < LEAST_FREE_BYTES else Severity.WARNING

@@ -130,7 +130,7 @@ class HeartbeatListener:
         self._poller = zmq.Poller()
 
     def end_polls_by(self, descriptor: int) -> None:
-        """Have a readable descriptor end the present `poll`; its owner reads it."""
+        """Watch a descriptor too: `poll` returns when the descriptor is readable. The caller reads the descriptor."""
         self._poller.register(descriptor, zmq.POLLIN)
 
     def listen(self, name: str, *, token: str = "", needs_token: bool = False) -> tuple[str, bytes | None]:

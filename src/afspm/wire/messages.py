@@ -66,8 +66,8 @@ class MessageDeclaration:
     Attributes:
         type: the generated class.
         kind: see `MessageKind`.
-        source: role of the process that publishes it; None: a process publishes it only for another.
-        always: every process of that role publishes it; False: only on some request or event.
+        source: role of the process that publishes the message; None: only published on behalf of another process.
+        always: whether every process of that role publishes the message; else only on some request or event.
         named: its envelopes continue after the message's name with size and channel, kind or owner.
         history: number of packets for each envelope that the scheduler keeps for late joiners.
         handler: method of a `Component` and of an `Overview` for this message.

@@ -102,7 +102,11 @@ pcall(imaging.stop) pcall(spectroscopy.stop) pcall(approach.stop_approach)
 
 
 def has_old_commands(release: int) -> bool:
-    """Return True if a release still has the commands from before 17. Raises ConfigError: it is older than 17."""
+    """Return whether a release (17 or 18) has the old commands, which 19 lacks.
+
+    Raises:
+        ConfigError: the release is older than 17.
+    """
     if release < FIRST_RELEASE:
         hint = f"{FIRST_RELEASE} or later"
         raise ConfigError(f"Nanosurf Studio {release} is too old for afspm", where="release", hint=hint)

@@ -1,4 +1,4 @@
-"""`afspm dashboard`: the page of a running experiment, here or on another computer; and the page of `afspm run`."""
+"""`afspm dashboard`: the page of a running experiment, or of a run that has ended; and the page of `afspm run`."""
 
 from __future__ import annotations
 

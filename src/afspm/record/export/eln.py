@@ -197,7 +197,7 @@ def _description(run: Run) -> str:
 
 
 def _text(run: Run, description: str) -> str:
-    """Return the entry as HTML, which notebooks show."""
+    # HTML, which notebooks show
     facts = {
         "Ended": str(run.facts.get("ended") or "not ended"),
         **{k.capitalize(): v for k, v in run.metadata.items()},

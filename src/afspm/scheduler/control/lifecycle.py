@@ -97,7 +97,7 @@ class ExperimentEnd:
         return replace(self, by_s=by_s)
 
     def keep(self, answer: KeptAnswer) -> ExperimentEnd | None:
-        """Keep an answer back; None: it may be sent at once."""
+        """Return the state with an answer kept until the experiment has ended; None if no end is in progress."""
         return None if self.by_s is None else replace(self, kept=(*self.kept, answer))
 
     def is_due(self, now_s: float, *, owes_retract: bool) -> bool:

@@ -89,7 +89,7 @@ class Picture:
 
     Attributes:
         path: an image (bright is high) or an SPM file.
-        width_m: first to last pixel; 0: as in the SPM file. An image needs it.
+        width_m: distance from first to last pixel; 0: as in the SPM file. Required for an image.
         height_range_m: from lowest to highest; 0: as in the SPM file.
     """
 

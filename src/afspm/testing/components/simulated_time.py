@@ -93,7 +93,7 @@ class SimulatedTime:
                 continue
             self._moving = 0 if time_s > self._time_s else self._moving + 1
             if self._moving > _STUCK:
-                raise GoesInCircles(f"time stands still at {time_s} s: somebody goes round in circles")
+                raise GoesInCircles(f"time stands still at {time_s} s: a waiting process goes round in circles")
             self._time_s = time_s
             self.happened += 1
             timer.do(*timer.args)

@@ -20,7 +20,7 @@ _ENOUGH = 0.9  # of all pairs: no better consensus is looked for
 
 @dataclass(frozen=True, eq=False)
 class Transform:
-    """`x -> linear @ (x - center) + center + shift`, in any unit of length."""
+    """An affine transform of points: `x -> linear @ (x - center) + center + shift`, in any unit of length."""
 
     linear: Array
     shift: Array

@@ -37,5 +37,5 @@ class RegistrationTally:
         return self.lately.count(False) > most_unregistered * LATELY
 
     def share_restarted(self) -> RegistrationTally:
-        """Leave the scans so far out of the share: a response was given."""
+        """Return the tally with a new share of unregistered scans, after the scheduler has begun a search."""
         return replace(self, lately=())

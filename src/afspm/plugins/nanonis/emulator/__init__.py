@@ -211,7 +211,7 @@ class NanonisEmulator(Emulator):
         return None
 
     def close(self) -> None:
-        """Listen no more."""
+        """Close the listening socket, if the emulator was started."""
         if hasattr(self, "_server"):
             self._server.close()
 

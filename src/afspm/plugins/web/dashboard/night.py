@@ -78,7 +78,7 @@ class Night:
         return {event.thing.time_ns: event.time_ns for event in self.events if event.message == "Scan2d"}
 
     def spectra_until(self, time_ns: int) -> SpectrumStore:
-        """Read the last spectra before a time."""
+        """Return the last readable spectra up to and including a time."""
         store = SpectrumStore()
         with open_run(self.folder) as run:
             for row in [row for row in run.spectra if row.time_ns <= time_ns][-SPECTRA:]:

@@ -19,7 +19,7 @@ _MOST_BEATS_APART = 4.0
 
 
 def await_beat(beats: BeatRecorder, pump: Pump) -> None:
-    """Wait for the first beat; from then on the last one can't be missed."""
+    """Wait for the first heartbeat: after it the subscription works, so the closing heartbeat will arrive."""
     pump(lambda: bool(beats.beats), _MOST_BEATS_APART * BEAT_S)
 
 

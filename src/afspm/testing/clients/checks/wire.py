@@ -1,4 +1,4 @@
-"""The reference bytes, in both directions."""
+"""Checks that a client reads and writes the reference bytes of `proto/golden.json`."""
 
 from __future__ import annotations
 
