@@ -25,6 +25,7 @@ MODULES = (
     "late_joiner",
     "translator",
     "controllers",
+    "dead_time",
     "reading",
     "recording",
     "experiment",

@@ -16,8 +16,13 @@ from typing import Any
 GROUPS = {
     "Join, open, read": ["afspm.connect", "afspm.open_run", "afspm.find_runs", "afspm.read"],
     "Write a component": ["afspm.Component", "afspm.storage.memory.Memory"],
-    "Use the microscope": ["afspm.Scope", "afspm.client.events.Events", "afspm.client.events.PublishedEvent"],
-    "What is asked for and measured": [
+    "Use the microscope": [
+        "afspm.Scope",
+        "afspm.client.events.Events",
+        "afspm.client.events.PublishedEvent",
+        "afspm.client.sweeping.SweepPoint",
+    ],
+    "Requests and measurements": [
         "afspm.Region",
         "afspm.Scan",
         "afspm.ScanSet",

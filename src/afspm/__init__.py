@@ -1,4 +1,4 @@
-"""afspm automates scanning probe microscopes, whoever made them.
+"""afspm automates scanning probe microscopes of any make.
 
 What one writes components and scripts with is here, loaded when it is first used, so that every process starts fast.
 """

@@ -30,7 +30,7 @@ def test_groups_are_those_of_the_page(tool: ModuleType) -> None:
     assert dict(re.findall(r"^\| `(\w+)` \| (.+?) \|$", page, re.MULTILINE)) == tool.GROUPS
 
 
-def test_newest_version_is_that_of_the_package() -> None:
+def test_newest_version_is_the_version_of_the_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     versions = re.findall(r"^## \[(.+?)\] - \d{4}-\d\d-\d\d$", CHANGELOG, re.MULTILINE)
     assert versions[0] == project["version"]

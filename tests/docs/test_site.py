@@ -42,7 +42,7 @@ def test_every_page_shows_the_version(builder: ModuleType) -> None:
         ("", "/home/ada/afspm", None),
     ],
 )
-def test_repository_is_that_of_the_project_or_of_the_clone(
+def test_repository_link_comes_from_the_project_or_the_clone(
     builder: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, declared: str, origin: str, linked: str | None
 ) -> None:
     urls = f"[project.urls]\nRepository = {json.dumps(declared)}\n" if declared else ""

@@ -36,6 +36,7 @@ WORDS = (
 )
 FOUND = re.compile(rf"\b({'|'.join(WORDS)})\b", re.IGNORECASE)
 IN_A_NAME = re.compile(rf"(?<=_)({'|'.join(word.replace(' ', '_') for word in WORDS)})(?=_|$)")
+EXPRESSION = re.compile(r"\{[^{}]*\}")  # of an f-string
 MARKER = re.compile(r"(?:#|<!--) word: ([\w, ]+)")
 # code blocks, code in a line, and the addresses of links
 NOT_PROSE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]*`|\]\([^)]*\)", re.MULTILINE | re.DOTALL)
@@ -56,7 +57,7 @@ def _sentences(source: str) -> Iterator[tuple[int, str]]:
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         is_text = token.type == tokenize.STRING or tokenize.tok_name[token.type] == "FSTRING_MIDDLE"
         if token.type == tokenize.COMMENT or (is_text and " " in token.string):
-            for offset, line in enumerate(token.string.splitlines()):
+            for offset, line in enumerate(EXPRESSION.sub("", token.string).splitlines()):
                 yield token.start[0] + offset, line
 
 

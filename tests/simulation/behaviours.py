@@ -399,7 +399,7 @@ class Teller(Client):
             yield from self.sleep(5.0)
 
 
-class Listener(Client):
+class FeedListener(Client):
     """Receives everything and sends nothing, as a visualiser does."""
 
     listens = ("",)

@@ -14,11 +14,11 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
+from afspm.testing.components.memory_network import ControlLine, Feed, Weather
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_process import Alarm, Process
+from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.codec import TableCodec
-from tests.simulation.network import ControlLine, Feed, Weather
-from tests.simulation.process import Alarm, Process
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import Timeline
 
 Doing = Generator[float, None, Any]
 """What a component does. It yields how long (real) it waits at most; it goes on when that is over or anything came."""
@@ -43,7 +43,7 @@ class Client(Process):
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         weather: Weather,
         codec: TableCodec,
         scheduler: SchedulerHost,

@@ -25,12 +25,12 @@ from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings, Re
 from afspm.plugins.drift.trackers.paper import PaperForecast
 from afspm.scheduler.events import Delegate, Effect, Publish
 from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_time import START_S
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import InvariantViolated
 from tests.simulation.microscope import SHAPE, FakeMicroscope, FakeScan, Habits
 from tests.simulation.night import Night, Plan
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import START_S
 
 WANTED = Region((0.0, 0.0), (2e-6, 2e-6))
 LONGEST_S = 2.0

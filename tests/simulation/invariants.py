@@ -34,11 +34,11 @@ from afspm.scheduler.events import (
 )
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.settings import SchedulerSettings
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.client import Client
 from tests.simulation.codec import TableCodec
 from tests.simulation.microscope import FakeMicroscope
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import Timeline
 from tests.simulation.tip_safety import TipSafety
 from tests.simulation.within_limits import WithinLimits
 from tests.simulation.written import Written
@@ -63,7 +63,7 @@ class Invariants:
     """Observes the scheduler, the microscope and all components of one simulated night."""
 
     def __init__(
-        self, timeline: Timeline, settings: SchedulerSettings, microscope: FakeMicroscope, codec: TableCodec
+        self, timeline: SimulatedTime, settings: SchedulerSettings, microscope: FakeMicroscope, codec: TableCodec
     ) -> None:
         self._timeline = timeline
         self._settings = settings

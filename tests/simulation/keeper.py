@@ -15,8 +15,8 @@ from afspm.supervisor.supervision.child import (
     KillChild,
     StartChild,
 )
-from tests.simulation.process import Process
-from tests.simulation.timeline import Timeline
+from afspm.testing.components.simulated_process import Process
+from afspm.testing.components.simulated_time import SimulatedTime
 
 _OVER = {ChildPhase.DONE: ProcessCondition.ENDED, ChildPhase.GIVEN_UP: ProcessCondition.GIVEN_UP}
 
@@ -37,7 +37,7 @@ class Keeper:
         given_up: names of processes that it gave up.
     """
 
-    def __init__(self, timeline: Timeline, processes: Iterable[Process], policy: ChildPolicy) -> None:
+    def __init__(self, timeline: SimulatedTime, processes: Iterable[Process], policy: ChildPolicy) -> None:
         self._timeline = timeline
         self._policy = policy
         self._children = {process.name: (process, ChildWatch(policy)) for process in processes}

@@ -25,11 +25,11 @@ from afspm.model import (
     ScopeStatus,
     names,
 )
+from afspm.testing.components.memory_network import ControlLine, Feed
+from afspm.testing.components.simulated_process import Process
+from afspm.testing.components.simulated_time import SimulatedTime, Timer
 from afspm.translator.requests import RequestOutcomes
 from tests.simulation.codec import TableCodec
-from tests.simulation.network import ControlLine, Feed
-from tests.simulation.process import Process
-from tests.simulation.timeline import Timeline, Timer
 
 CHANNELS = ("Height", "Height_Retrace")
 _STARTS = {names.START_SCAN: ScopeState.SCANNING, names.START_SPEC: ScopeState.SPEC}
@@ -101,7 +101,7 @@ class FakeMicroscope(Process):
 
     region = Region((0.0, 0.0), (1e-6, 1e-6))
 
-    def __init__(self, timeline: Timeline, codec: TableCodec, habits: Habits) -> None:
+    def __init__(self, timeline: SimulatedTime, codec: TableCodec, habits: Habits) -> None:
         super().__init__(timeline, "translator")
         self.habits = habits
         self.executed: Counter[tuple[str, int]] = Counter()

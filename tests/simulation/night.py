@@ -16,16 +16,16 @@ from afspm.scheduler.settings import ControlSettings, SchedulerSettings
 from afspm.supervisor.supervision.child import ChildPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.restart import RestartPolicy
+from afspm.testing.components.memory_network import Weather
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_process import Process
+from afspm.testing.components.simulated_time import GoesInCircles, SimulatedTime
 from tests.simulation import behaviours
 from tests.simulation.client import Client
 from tests.simulation.codec import TableCodec
 from tests.simulation.invariants import Invariants, InvariantViolated
 from tests.simulation.keeper import Keeper
 from tests.simulation.microscope import FakeMicroscope, FakeScan, Habits
-from tests.simulation.network import Weather
-from tests.simulation.process import Process
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import GoesInCircles, Timeline
 
 _CALM = 0.15
 """The last part of a night, in which nothing bad happens any more and all must come right again."""
@@ -54,7 +54,7 @@ CAST = {
     "crasher": behaviours.Crasher,
     "operator": behaviours.Operator,
     "stranger": behaviours.Stranger,
-    "listener": behaviours.Listener,
+    "listener": behaviours.FeedListener,
     "old": behaviours.ExperimentWithoutIds,
     "careless": behaviours.Careless,
     "person": behaviours.Person,
@@ -124,7 +124,7 @@ class Plan:
 
 def plan(seed: int, hours: float = 8.0) -> Plan:
     """Return the night of a seed: from a quiet one to one with nearly all faults."""
-    chance = Timeline(seed * 7919 + 1).random
+    chance = SimulatedTime(seed * 7919 + 1).random
     others = [name for name in CAST if name not in _ALWAYS]
     lease_s = chance.choice((None, 900.0, 1800.0))
     cast = [*_ALWAYS, *(name for name in others if chance.random() < 0.5)]
@@ -175,7 +175,7 @@ class Night:
 
     def __init__(self, plan: Plan) -> None:
         self.plan = plan
-        self.timeline = timeline = Timeline(plan.seed, plan.speed)
+        self.timeline = timeline = SimulatedTime(plan.seed, plan.speed)
         self.weather = Weather(doubles=plan.doubles)
         self.codec = self.make_codec()
         habits = Habits(hangs=plan.hangs, loses_answer=plan.loses_answer, retracts=plan.retracts)

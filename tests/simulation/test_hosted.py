@@ -22,12 +22,12 @@ from afspm.scheduler.wire_codec import WireCodec
 from afspm.supervisor.supervision.child import ChildPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.restart import RestartPolicy
+from afspm.testing.components.hosted_processes import ComponentProcess, TranslatorProcess
+from afspm.testing.components.memory_network import Weather
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.bench import CHANNELS, BenchMicroscope
-from tests.simulation.hosted import HostedComponent, HostedTranslator
 from tests.simulation.keeper import Keeper
-from tests.simulation.network import Weather
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import Timeline
 
 TILES = 6
 SCAN_S = 60.0
@@ -77,11 +77,11 @@ def region_of(tile: int) -> Region:
 
 @dataclass
 class Night:
-    timeline: Timeline
+    timeline: SimulatedTime
     scheduler: SchedulerHost
-    survey: HostedComponent
-    translator: HostedTranslator
-    components: dict[str, HostedComponent]
+    survey: ComponentProcess
+    translator: TranslatorProcess
+    components: dict[str, ComponentProcess]
     finished: dict[int, tuple[float, float]]
     folder: Path
     keeper: Keeper
@@ -94,10 +94,10 @@ class Night:
 def night(
     seed: int, folder: Path, *, dies_in_call: float = 0.0, dies_in_step: float = 0.0, worried: bool = True
 ) -> Night:
-    timeline = Timeline(seed, speed=10.0)
+    timeline = SimulatedTime(seed, speed=10.0)
     weather = Weather(doubles=0.05)
     finished: dict[int, tuple[float, float]] = {}
-    translator = HostedTranslator(
+    translator = TranslatorProcess(
         timeline, lambda: BenchMicroscope(SCAN_S, finished), folder, dies_in_call=dies_in_call / 4
     )
     settings = SchedulerSettings()
@@ -116,7 +116,7 @@ def night(
     if worried:
         cast |= {"worrier": Worrier, "fixer": Fixer}
     components = {
-        name: HostedComponent(timeline, weather, scheduler, name, made, folder, dies_in_call=dies_in_call)
+        name: ComponentProcess(timeline, weather, scheduler, name, made, folder, dies_in_call=dies_in_call)
         for name, made in cast.items()
     }
     policy = ChildPolicy(LivenessPolicy(beat_period_s=5.0), RestartPolicy(budget=10**6, longest_delay_s=2.0))

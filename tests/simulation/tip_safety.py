@@ -9,9 +9,9 @@ from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.events import Effect, Input, Kill, Log, Reply, RequestIn
 from afspm.scheduler.publishing.event_log import SCHEDULER
 from afspm.scheduler.settings import SchedulerSettings
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.microscope import FakeMicroscope
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import Timeline
 
 _MALFUNCTION = Problem.DEVICE_MALFUNCTION
 _OF_CONTROL = range(int(ControlRequest.REQUEST_CTRL), int(ControlRequest.END_EXPERIMENT) + 1)
@@ -34,7 +34,7 @@ class TipSafety:
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         settings: SchedulerSettings,
         microscope: FakeMicroscope,
         must: Callable[[bool, str], None],

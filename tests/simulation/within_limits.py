@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from afspm.model import ControlRequest, Region, Request, names
 from afspm.scheduler.settings import SchedulerSettings
+from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.microscope import FakeMicroscope
-from tests.simulation.timeline import Timeline
 
 _SLACK = 1e-6
 
@@ -26,7 +26,7 @@ class WithinLimits:
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         settings: SchedulerSettings,
         microscope: FakeMicroscope,
         must: Callable[[bool, str], None],

@@ -23,10 +23,10 @@ from afspm.model.events import SUPERVISOR
 from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.events import Effect, Input, Publish, Reply
 from afspm.scheduler.publishing.event_log import CONTROL, PERIOD_S, SCHEDULER
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_time import SimulatedTime
 from afspm.wire.messages import JOURNAL
 from tests.simulation.codec import TableCodec
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import Timeline
 
 _NO_RESPONSE, _SUCCESS = int(ControlResponse.NO_RESPONSE), int(ControlResponse.SUCCESS)
 _STARTS = (names.START_SCAN, names.START_SPEC)
@@ -78,7 +78,7 @@ class Written:
     """
 
     def __init__(
-        self, timeline: Timeline, codec: TableCodec, must: Callable[[bool, str], None], name_taken: str
+        self, timeline: SimulatedTime, codec: TableCodec, must: Callable[[bool, str], None], name_taken: str
     ) -> None:
         self._timeline = timeline
         self._codec = codec

@@ -33,7 +33,7 @@ def commission(
     ] = None,
     runs: Runs = RUNS,
     frame: WithinFrame = "",
-    anew: Annotated[bool, opt("Repeat all steps, also those that passed.", "--anew")] = False,
+    anew: Annotated[bool, opt("Repeat all steps, also passed ones.", "--anew")] = False,  # word: anew
     speed: CheckSpeed = 20.0,
 ) -> None:
     """Take a new controller into use, step by step, with the tip withdrawn first.
@@ -54,7 +54,7 @@ def commission(
     before = None if anew else _before(file)
     if before is not None:
         terminal.show(f"continuing with {file}: steps that passed are not repeated")
-    tried_on = "emulator" if simulated else terminal.choose("What is connected?", TRIED_ON[:2])
+    tried_on = "emulator" if simulated else terminal.choose("Which controller is connected?", TRIED_ON[:2])
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     ended = walk(options, terminal, file, tried_on, before)
     if ended.lost:

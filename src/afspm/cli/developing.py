@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _ASK = """This moves the probe, takes scans and spectra, changes gains and bias by a few percent, and switches the
 feedback off and on, all within the present frame, and then restores all settings. It never approaches, pulses or
-crashes. Is the tip so far from the sample that it can't reach it, whatever the feedback does?"""
+crashes. Is the tip so far from the sample that it can't reach it, even at the full extension of the feedback?"""
 
 
 def check_translator(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,6 +35,7 @@ def check(
     """
     from rich.console import Console
 
+    from afspm.cli.estimate_text import estimate_lines
     from afspm.experiment import load
 
     experiment = load(*files)
@@ -46,6 +48,9 @@ def check(
         typer.echo(experiment.expanded(), nl=False)
     if experiment.is_readable:
         console.print(_summary(experiment, findings), markup=False, soft_wrap=True)
+        if not any(finding.is_error for finding in findings):
+            for line in estimate_lines(experiment.planned_work(), experiment.clock().speed, datetime.now(UTC)):
+                console.print(line, markup=False, soft_wrap=True)
     if any(finding.is_error for finding in findings):
         raise typer.Exit(1)
 

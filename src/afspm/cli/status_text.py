@@ -164,6 +164,7 @@ class StatusText:
                 continue
             left_ns = told.remaining_ns(self._now_ns)
             left = "longer than expected" if left_ns == 0 else self._left(left_ns)
+            left += f", ends {day_and_time(self._now_ns + left_ns, seconds=False)}" if left_ns else ""
             said = f"{told.name}: {told.done} of {told.of}  {self._bar(told.done / told.of)} "
             yield _label("progress").append(said + ("done" if told.done >= told.of else left))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from afspm import wire
 from afspm.basics.errors import NoResponse, Refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.experiment_link import ExperimentLink
@@ -11,6 +12,9 @@ from afspm.model import (
     RELAY_REQUEST,
     ControlRequest,
     ControlResponse,
+    MeasurementSettings,
+    Parameter,
+    RelayedMessage,
     Response,
     ResponseDetail,
     ScopeState,
@@ -115,6 +119,19 @@ class CommandRetry:
         self.ask(kind, wanted, until_s=until_s)
         if link.wait(lambda: view.count(message) != count, link.earlier(SETTLED_WITHIN_S, until_s)):
             link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
+
+    def set_parameter(self, wanted: Parameter, until_s: float | None) -> Parameter:
+        """Set a parameter and return it as it is then in force. Control must be held around it. Raises as `ask`."""
+        response = self.ask(ControlRequest.PARAM, wanted, until_s=until_s)
+        return wire.decode_parameter(response.payload) if response.payload else wanted
+
+    def publish_settings(self, settings: tuple[Parameter, ...], key: str) -> None:
+        """Have the scheduler publish the parameters that a sweep has set for the measurement of a key."""
+        link = self._link
+        message = MeasurementSettings(link.clock.now_ns(), link.name, settings, key)
+        response = link.request(RELAY_REQUEST, RelayedMessage(*wire.encode(message)))
+        if not response.ok:  # a scheduler of another make may not know the message
+            link.log.warning("the record lacks the swept parameters of this measurement: %s", response.reason)
 
     def send(
         self,

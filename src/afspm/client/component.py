@@ -20,6 +20,7 @@ if TYPE_CHECKING:
         ScopeStatus,
         Spectrum,
     )
+    from afspm.model.planned_work import PlannedWork
     from afspm.storage.memory import Memory
     from afspm.transport.process.context import ProcessContext
 
@@ -98,6 +99,16 @@ class Component:
     simulated: bool
     packet: Packet | None
     _publish: Callable[[Any, str | None], None]
+
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork | None:
+        """Return the work that the component plans, for `afspm check` and the report; None: no estimate.
+
+        It is called after `__init__` alone, in classes that a package declares.
+
+        Args:
+            speed_m_s: scan speed at the start, if the experiment file gives it.
+        """
+        return None
 
     def run(self) -> None:
         """Run the experiment as a script; at its return the component is done. It excludes ticks."""

@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import zlib
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,8 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue, WireError
 from afspm.basics.plain_data import Plain
-from afspm.model import LoggedPacket, Packet, ScanSet, Spectrum
+from afspm.model import LoggedPacket, Packet, Parameter, ScanSet, Spectrum
+from afspm.model.snapshot import to_plain
 from afspm.storage.atomic import OutageLog, write_atomic
 from afspm.storage.disk import is_full
 from afspm.storage.memory import Memory
@@ -63,11 +65,27 @@ class KeyedResults:
     @property
     def pending(self) -> Plain | None:
         """Return the intent without a result: key, plan, attempt, since_ns, interruptions."""
-        return self._memory.get("pending")
+        intent: Plain | None = self._memory.get("pending")
+        path = None if intent is None else self._path(intent["key"])
+        return None if path is not None and path.exists() else intent
 
     def intend(self, intent: Plain) -> None:
         """Save the intent of a measurement, before its request."""
         self._memory["pending"] = intent
+        self._memory.save(synced=False)  # a power cut may have it measured again, which costs a scan and no harm
+
+    def before_sweep(self, key: str) -> list[Parameter] | None:
+        """Return the parameters as they were before a sweep that has not been ended; None: no value of it was set."""
+        kept = self._memory.get("before_sweep", {}).get(key)
+        return None if kept is None else [Parameter(**one) for one in kept]
+
+    def keep_before_sweep(self, key: str, before: Sequence[Parameter] | None) -> None:
+        """Write down the parameters as they are before a sweep sets the first; None: they are in force again."""
+        kept = self._memory.setdefault("before_sweep", {})
+        if before is None:
+            kept.pop(key, None)
+        else:
+            kept[key] = [to_plain(one) for one in before]
         self._memory.save()
 
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:
@@ -80,7 +98,11 @@ class KeyedResults:
         path = self._path(key)
         if path is None or not path.exists():
             return None
-        head, things = _read(path)
+        try:
+            head, things = _read(path)
+        except (ValueError, KeyError, WireError) as error:  # a power cut came before it was on the disk
+            _log.warning("%s is damaged and measured again: %s: %s", key, path, error)
+            return None
         if head["key"] != key or head["plan"] != plan:
             raise InvalidValue(
                 f"the key {key!r} was used for another measurement in this run: {head['plan']}",
@@ -90,7 +112,7 @@ class KeyedResults:
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
         """Save the result of the intent. On a full disk it is lost, and a later life measures again."""
-        path = self._path(key)
+        path, is_kept = self._path(key), False
         if path is not None:
             things = [wire.encode(thing) for thing in result.things]
             head = {"key": key, "plan": plan, "interruptions": result.interruptions, "things": len(things)}
@@ -98,9 +120,11 @@ class KeyedResults:
             for name, payload in [(_HEAD, json.dumps(head).encode()), *things]:
                 parts += [head_of(LoggedPacket(Packet(name, payload), None, 0)), payload]
             with self._outage.trying():
-                write_atomic(path, parts)
+                write_atomic(path, parts, synced=False, soon=True)
+                is_kept = True
         self._memory.pop("pending", None)
-        self._memory.save()
+        if not is_kept:  # else the file shows that it is fulfilled
+            self._memory.save(synced=False)
 
     def forget(self, key: str) -> None:
         """Remove the saved result of a key; the next request with this key measures again."""
@@ -143,5 +167,5 @@ def _read(path: Path) -> tuple[Plain, list[object]]:
         if len(packets) != 1 + head["things"]:
             raise ValueError("the file is incomplete")
         return head, [wire.decode(packet.envelope, packet.payload) for packet in packets[1:]]
-    except (OSError, ValueError, WireError) as error:
+    except OSError as error:
         raise FileError(f"can't be read: {error}", where=str(path), hint="remove it to measure again") from error

@@ -203,7 +203,7 @@ class MeasurementRunner:
             task.attempt += 1
             self._write_down(task)
         with link.clock.late():
-            self._setup.prepare(target, until_s)
+            self._setup.prepare(target, task.key or "", until_s)
         states = link.view.count("ScopeStateMsg")
         watch = task.watch = task.watch or _Watch(
             link, target, Cycle(target.busy, target.fits, since_ns=link.view.newest_ns)

@@ -21,15 +21,18 @@ class MeasurementSetup:
         self._commands = commands
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
-    def prepare(self, target: Target, until_s: float | None) -> None:
-        """Set everything that a target needs."""
+    def prepare(self, target: Target, key: str, until_s: float | None) -> None:
+        """Set everything that a target needs, and publish its settings as the microscope then reports them."""
         if isinstance(target, ScanTarget):
             self.set_scan(target.parameters, until_s)
-            return
-        if target.kind is not None:
-            self._commands.ask(ControlRequest.PARAM, Parameter(names.SPEC_KIND, target.kind), until_s=until_s)
-        if target.at_m is not None:
-            self.move_probe(target.at_m, until_s)
+        else:
+            if target.kind is not None:
+                self._commands.ask(ControlRequest.PARAM, Parameter(names.SPEC_KIND, target.kind), until_s=until_s)
+            if target.at_m is not None:
+                self.move_probe(target.at_m, until_s)
+        if target.settings:
+            in_force = tuple(self._commands.set_parameter(one, until_s) for one in target.settings)
+            self._commands.publish_settings(in_force, key)
 
     def move_probe(self, xy_m: XY, until_s: float | None) -> None:
         """Move the probe to (x, y) in m, unless it is there already."""

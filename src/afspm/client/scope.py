@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Literal
 
 from afspm import wire
-from afspm.basics.errors import ExperimentEnded, InvalidValue
+from afspm.basics.errors import ExperimentEnded, InvalidValue, RequestError
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
@@ -17,6 +18,7 @@ from afspm.client.keyed_results import KeyedResults, check_key
 from afspm.client.measurement import MeasurementRunner
 from afspm.client.measurement_setup import MeasurementSetup
 from afspm.client.parameter_text import Value, to_parameter, value_in
+from afspm.client.sweeping import ParameterSweep, SweepPoint
 from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
 from afspm.model import (
     RELAY_REQUEST,
@@ -37,10 +39,14 @@ from afspm.model import (
     ScanSet,
     Spectrum,
 )
+from afspm.model.sweep_plan import SweepOrder, SweepPlan, SweptValues
+from afspm.transport.process.parent import StopRequested
 
 __all__ = ["Events", "PublishedEvent", "Scope"]
 
 Place = tuple[float | str, float | str]
+SET_BACK_WITHIN_S = 60.0
+"""Wait for control after a failed sweep."""
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
 
@@ -123,6 +129,85 @@ class Scope(ExperimentView):
         with self._call():
             target = SpectrumTarget.of(at, kind, self._frame)
             return self._runner.take(target, key, self._link.until(timeout_s)).spectrum
+
+    @contextmanager
+    def sweep(
+        self,
+        parameters: Mapping[str, SweptValues],
+        *,
+        measure: Literal["scan", "spectrum"] = "scan",
+        region: Region | None = None,
+        shape: tuple[int, int] | None = None,
+        at: Place | None = None,
+        kind: str | None = None,
+        order: SweepOrder = "snake",
+        seed: int = 0,
+        key: str | None = None,
+        done: int = 0,
+        timeout_s: float | None = None,
+    ) -> Iterator[Iterator[SweepPoint]]:
+        """Take a scan or spectrum at each combination of the values of some parameters.
+
+            with scope.sweep({"zctrl-setpoint": ["50 pA", "100 pA"], "scan-speed": ["1 um/s", "2 um/s"]}) as points:
+                for point in points:
+                    print(point.values, point.scans["Height"].values.std())
+
+        Control is kept over all points. Where it is lost meanwhile, to the repair of a tip for instance, the point is
+        measured again with its parameters set again. However the block ends, the parameters are set back to their
+        values before it. In the record they are columns of `run.scans` and `run.spectra`.
+
+        Args:
+            parameters: the values of each: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s", "points": 4,
+                "spacing": "log"}. The first parameter changes least often.
+            measure: the measurement at each point.
+            region, shape: of the scans, as for `scan`.
+            at, kind: of the spectra, as for `spectrum`.
+            order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops;
+                "random".
+            seed: of the random order.
+            key: makes each measurement happen once in this run, under the keys "<key>-1", "<key>-2" …
+            done: that many points are left out.
+        """
+        plan = SweepPlan.of(parameters, order, seed)
+        target = (
+            ScanTarget.of(region, shape, self._frame) if measure == "scan" else SpectrumTarget.of(at, kind, self._frame)
+        )
+        sweep = ParameterSweep(
+            plan, target, key and check_key(key), link=self._link, control=self._control, commands=self._commands,
+            runner=self._runner, results=self._results,
+        )  # fmt: skip
+        until_s = self._link.until(timeout_s)
+        with self._control.hold(until_s=until_s):
+            try:
+                yield self._each_in_a_call(sweep.points(done, until_s))
+            except (ExperimentEnded, StopRequested):
+                self._log_left_behind(sweep)
+                raise
+            except BaseException:  # also Ctrl-C, and what the block of the user raises
+                with suppress(RequestError):  # logged; the first error says more
+                    self._set_back(sweep, SET_BACK_WITHIN_S)
+                raise
+            self._set_back(sweep, timeout_s)
+
+    def _each_in_a_call(self, points: Iterator[SweepPoint]) -> Iterator[SweepPoint]:
+        while True:
+            with self._call():
+                point = next(points, None)
+            if point is None:
+                return
+            yield point
+
+    def _set_back(self, sweep: ParameterSweep, timeout_s: float | None) -> None:
+        try:
+            with self._call():
+                sweep.set_back(self._link.until(timeout_s))
+        except (RequestError, ExperimentEnded, StopRequested):
+            self._log_left_behind(sweep)
+            raise
+
+    def _log_left_behind(self, sweep: ParameterSweep) -> None:
+        if sweep.left_behind:
+            self._link.log.warning("a sweep ended before its parameters were set back to %s", sweep.left_behind)
 
     def forget(self, key: str) -> None:
         """Remove the saved result of a keyed measurement that is no longer needed, to save space in a long series."""

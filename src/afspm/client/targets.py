@@ -10,7 +10,7 @@ from afspm.basics.errors import InvalidValue, UnitError
 from afspm.basics.formatting import area_text, position_text
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import si_or_text
-from afspm.model import Frame, Region, Scan, ScanParameters, ScopeState, Spectrum, names
+from afspm.model import Frame, Parameter, Region, Scan, ScanParameters, ScopeState, Spectrum, names
 from afspm.model.snapshot import from_plain, to_plain
 
 XY = tuple[float, float]
@@ -29,10 +29,12 @@ class ScanTarget:
 
     Attributes:
         shape: (rows, columns).
+        settings: parameters of a sweep, set before each attempt.
     """
 
     region: Region | None
     shape: tuple[int, int] | None
+    settings: tuple[Parameter, ...] = ()
 
     what: ClassVar = "scan"
     action: ClassVar = names.START_SCAN
@@ -52,7 +54,7 @@ class ScanTarget:
 
     def facts(self) -> Plain:
         """Return the target in JSON's types, so that a later life of the component recognises it."""
-        return {"what": self.what, **to_plain(self)}
+        return _facts(self)
 
     def fits(self, scan: Scan) -> bool:
         """Return whether a scan can be the requested one."""
@@ -78,11 +80,12 @@ class ScanTarget:
 
 @dataclass(frozen=True)
 class SpectrumTarget:
-    """A spectrum to take. None: the present kind or probe position."""
+    """A spectrum to take. None: the present kind or probe position; settings as of `ScanTarget`."""
 
     at_m: XY | None
     kind: str | None
     frame: Frame = Frame.TIP
+    settings: tuple[Parameter, ...] = ()
 
     what: ClassVar = "spectrum"
     action: ClassVar = names.START_SPEC
@@ -96,7 +99,7 @@ class SpectrumTarget:
 
     def facts(self) -> Plain:
         """Return the target in JSON's types, so that a later life of the component recognises it."""
-        return {"what": self.what, **to_plain(self)}
+        return _facts(self)
 
     def fits(self, spectrum: Spectrum) -> bool:
         """Return whether a spectrum can be the requested one."""
@@ -116,6 +119,13 @@ class SpectrumTarget:
 
 
 Target = ScanTarget | SpectrumTarget
+
+
+def _facts(target: Target) -> Plain:
+    facts = to_plain(target)
+    if not target.settings:
+        del facts["settings"]
+    return {"what": target.what, **facts}
 
 
 def target_from(facts: Plain) -> Target:

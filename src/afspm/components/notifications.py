@@ -138,8 +138,8 @@ def _run(command: Sequence[str], notice: Notification, folder: str) -> None:
     except OSError as error:
         raise NotDelivered(f"{program} can't be run: {error.strerror or type(error).__name__}") from None
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        raise NotDelivered(f"{program} ended with {done.returncode}{f': {said[-1][:200]}' if said else ''}")
+        output = done.stderr.decode(errors="replace").strip().splitlines()
+        raise NotDelivered(f"{program} ended with {done.returncode}{f': {output[-1][:200]}' if output else ''}")
 
 
 def _post(url: str, notice: Notification) -> None:

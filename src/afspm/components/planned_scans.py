@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC
 from typing import Any, Literal
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError, InvalidValue, RequestError, UnitError
 from afspm.basics.formatting import day_and_time
-from afspm.basics.units import Angle, Length, Period, convert
+from afspm.basics.units import Angle, Length, Period, convert, si
 from afspm.client.component import Component
 from afspm.client.parameter_text import to_parameter
 from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
 from afspm.model import Region, names
 from afspm.model.names import BASE_PARAMETERS
+from afspm.model.planned_work import PlannedWork, planned_rounds
 
 Pixels = tuple[int, int]
 # parameters that every scan with a region needs of the microscope
@@ -68,6 +69,15 @@ class PlannedScans(Component):
         self.parameters = checked_parameters(parameters, "parameters")
         self.needs_parameters = (*FRAME, *self.parameters)
 
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork | None:
+        plan = self.plan
+        if plan.shape is None:
+            return None
+        speed_m_s = speed_in_force(self.parameters, speed_m_s)
+        late = self.ends_on_time
+        work = planned_rounds(plan.regions, plan.shape, plan.rounds, self.beat_s, speed_m_s, skips_late=late)
+        return replace(work, ends_experiment=self.end_when_done)
+
     def run(self) -> None:
         self._began_s = self.clock.now_s()
         self._round_began_s: float | None = None  # None: the round was interrupted, or begun before a restart
@@ -97,6 +107,8 @@ class PlannedScans(Component):
     def _await(self, step: PlanStep, rhythm: RoundSchedule) -> bool:
         if not step.starts_round or self.memory.get("begun") == step.index:
             return True
+        if not self.beat_s:  # no round has a time of its own, so there is nothing to wait for or to keep
+            return self._total is None or step.index < self._total
         due_s = rhythm.next_due_s(self.memory.get("done_s"))
         before_s = float(self.memory.get("due_s", due_s))
         left_out = rhythm.left_out(max(before_s, self._began_s), due_s)
@@ -146,7 +158,7 @@ class PlannedScans(Component):
             round_s = self.clock.now_s() - self._round_began_s
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
-        if self.memory.save():  # if not saved, a restart requests the same scan
+        if self.memory.save(synced=False):  # if not saved, a restart requests the same scan
             self.scope.forget(step.key)
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
@@ -293,6 +305,18 @@ def checked_parameters(given: Mapping[str, str | float] | None, where: str) -> d
         except (InvalidValue, UnitError) as error:
             raise ConfigError(error.what, where=f"{where}.{name}", hint=error.hint) from error
     return parameters
+
+
+def speed_in_force(parameters: Mapping[str, str | float], before_m_s: float | None) -> float | None:
+    """Return the scan speed after these parameters are set; None if unknown.
+
+    Args:
+        before_m_s: the speed before.
+    """
+    if names.SCAN_SPEED not in parameters:
+        return before_m_s
+    speed = to_parameter(names.SCAN_SPEED, parameters[names.SCAN_SPEED], None)
+    return si(f"{speed.value} {speed.unit or 'm/s'}", "m/s")
 
 
 def period(every_s: float, where: str = "every") -> float:

@@ -10,6 +10,7 @@ from afspm.client.component import Component
 from afspm.components.planned_scans import pair
 from afspm.components.scan_plan import grid_centers
 from afspm.model import names
+from afspm.model.planned_work import PlannedWork
 
 MOST_LINES = 20
 """Limit on log lines about the progress of a grid; `scope.progress` reports each spectrum."""
@@ -69,6 +70,10 @@ class SpectroscopyGrid(Component):
         self.repeats = repeats
         self.end_when_done = end_when_done
 
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork:
+        spectra, why = len(self.positions) * self.repeats, "the controller sets the duration of a spectrum"
+        return PlannedWork(spectra=spectra, ends_experiment=self.end_when_done, why=why)
+
     def run(self) -> None:
         total = len(self.positions) * self.repeats
         start_s = float(self.memory.setdefault("start_s", self.clock.now_s()))
@@ -77,7 +82,7 @@ class SpectroscopyGrid(Component):
             key = f"spectrum-{place}-{repeat}"
             self.scope.spectrum(self.positions[place], kind=self.kind, key=key)
             self.memory["done"] = index + 1
-            if self.memory.save():  # if not saved, a restart requests the same spectrum
+            if self.memory.save(synced=False):  # if not saved, a restart requests the same spectrum
                 self.scope.forget(key)
             per_spectrum_s = (self.clock.now_s() - start_s) / (index + 1)
             self.scope.progress(index + 1, total, left_s=per_spectrum_s * (total - index - 1))

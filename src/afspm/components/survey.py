@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from afspm.basics.errors import ConfigError, Refused
@@ -15,13 +15,14 @@ from afspm.client.component import Component
 from afspm.client.events import Events
 from afspm.client.keyed_results import check_key
 from afspm.client.targets import xy_of
-from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of
+from afspm.components.planned_scans import FRAME, Pixels, checked_parameters, pair, shape_of, speed_in_force
 from afspm.components.scan_plan import ScanPlan
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import Target, find_particles, lowest_beside, nearest
 from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
 from afspm.model.drift_mapping import drift_knowledge
 from afspm.model.geometry import XY
+from afspm.model.planned_work import PlannedWork, planned_rounds
 from afspm.storage.atomic import OutageLog
 from afspm.transport.process.loading import find_object
 
@@ -134,6 +135,15 @@ class Survey(Component):
         """Raise ConfigError if the function that finds targets does not exist."""
         self.finder.check()
 
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork:
+        wide, closer, count = self._wide, self._closer, self.finder.count
+        wide_m_s = speed_in_force(wide.parameters, speed_m_s)
+        survey = planned_rounds((wide.region,), wide.shape, 1, 0.0, wide_m_s)
+        zooms = planned_rounds((closer.region,), closer.shape, count, 0.0, speed_in_force(closer.parameters, wide_m_s))
+        why = survey.why or zooms.why or "zooms depend on the targets found"
+        work = replace(survey + zooms, spectra=count * len(self.curves), why=why)
+        return replace(work, at_most=True, ends_experiment=self.end_when_done)
+
     def run(self) -> None:
         with self.scope.events(MAPPING, timeout_s=0.0) as mappings:
             self._run(mappings)
@@ -145,10 +155,13 @@ class Survey(Component):
         self._keep(self._record)
         visits = self._record.visits
         self._set(self._closer.parameters if visits else {})
+        began_s = float(self.memory.setdefault("visits_began_s", self.clock.now_s()))
         for visit in visits:
             self._visit(visit, mappings)
             self._keep(self._record)
-            self.scope.progress(visit.number, len(visits))
+            left = len(visits) - visit.number
+            per_visit_s = (self.clock.now_s() - began_s) / visit.number
+            self.scope.progress(visit.number, len(visits), left_s=per_visit_s * left)
             if visit.number > int(self.memory.get("done", 0)):  # else it was logged before a restart
                 self._tell(visit, self._record.outcome(visit))
                 self.memory["done"] = visit.number

@@ -23,6 +23,7 @@ from afspm.model import Role
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment
+    from afspm.model.planned_work import PlannedWork
 
 
 class Experiment:
@@ -105,7 +106,7 @@ class Experiment:
         """Raise ConfigError with all errors, if there are any."""
         errors = [finding for finding in self.check(only, without) if finding.is_error]
         if errors:
-            raise ConfigError("\n".join(map(str, errors)), hint="afspm check shows what is wrong")
+            raise ConfigError("\n".join(map(str, errors)), hint="run afspm check for all faults of the file")
 
     def launches(
         self,
@@ -162,6 +163,16 @@ class Experiment:
     def asking(self, names: Collection[str]) -> Launch | None:
         """Return a launch line with which one of `names` asks a scheduler started elsewhere; None if none can."""
         return process_starts.asking(self.resolved, names)
+
+    def planned_work(self) -> dict[str, PlannedWork | None]:
+        """Return the planned work of each component that acts on its own; None: no estimate."""
+        plans = self.resolved.plans
+        speed_m_s = next((plan.scan_speed_m_s for plan in plans.values() if plan.scan_speed_m_s), None)
+        acting = [
+            name for name, process in self.resolved.processes.items() if process.acts and process.role is Role.COMPONENT
+        ]
+        works = {name: plans[name].work if name in plans else None for name in acting}
+        return {name: work and work(speed_m_s) for name, work in works.items()}
 
     def clock(self) -> ExperimentClock:
         """Return the clock of a run that begins now, from [clock]."""

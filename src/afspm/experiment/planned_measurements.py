@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from afspm.basics import entry_points
@@ -14,6 +14,7 @@ from afspm.client.parameter_text import to_parameter
 from afspm.experiment.toml_lines import Table
 from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
 from afspm.model.geometry import XY
+from afspm.model.planned_work import PlannedWork
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
 
@@ -28,6 +29,7 @@ class PlannedMeasurements:
         period_s: between the starts of two rounds; 0: no pause.
         scan_speed_m_s: of a microscope that knows the speed of its first scan.
         is_listed: whether the file lists the regions, each at a place of its own.
+        work: returns the work at a scan speed; see `Component.planned_work`.
     """
 
     regions: tuple[Region, ...] = ()
@@ -40,6 +42,7 @@ class PlannedMeasurements:
     scan_speed_m_s: float | None = None
     is_listed: bool = False
     drift_doubts: tuple[AfspmError, ...] = ()
+    work: Callable[[float | None], PlannedWork | None] | None = None
 
     def frame(self) -> Iterator[Parameter]:
         """Yield the parameters that its scans set: sizes, places and pixels."""
@@ -84,17 +87,19 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
     regions = tuple(r for r in getattr(plan, "regions", ()) if isinstance(r, Region))
     positions = tuple(getattr(made, "positions", ()))
     given = {name: getattr(made, name, None) for name in _PARAMETERS}
+    set_by_setting = {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)}
     return PlannedMeasurements(
         regions,
         positions,
         getattr(plan, "shape", None),
         tuple(getattr(made, "needs_actions", ())),
         tuple(getattr(made, "needs_parameters", ())),
-        {name: _as_parameters(values) for name, values in given.items() if isinstance(values, Mapping)},
+        {**set_by_setting, **getattr(made, "planned_parameters", {})},
         getattr(made, "beat_s", 0.0),
         getattr(made, "scan_speed_m_s", None),
         isinstance(settings.get("regions"), list),
         tuple(getattr(made, "drift_doubts", ())),
+        getattr(made, "planned_work", None),
     )
 
 

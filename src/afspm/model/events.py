@@ -9,7 +9,7 @@ from enum import Enum, IntEnum
 from typing import Protocol
 
 from afspm.basics.errors import InvalidValue
-from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse
+from afspm.model.requests import WAIT_FOR_CONTROL, ControlRequest, ControlResponse, Parameter
 from afspm.model.state import ControlMode
 
 SUPERVISOR = "supervisor"
@@ -235,8 +235,25 @@ class Note:
 
 
 @dataclass(frozen=True, slots=True)
+class MeasurementSettings:
+    """The parameters that a component has set for its next scan or spectrum, as the microscope reports them.
+
+    Attributes:
+        who: the component.
+        parameters: none: its next measurements are not part of a sweep.
+        key: of the measurement, if it is taken exactly once.
+    """
+
+    time_ns: int
+    who: str
+    parameters: tuple[Parameter, ...] = ()
+    key: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class RelayedMessage:
-    """A message that the scheduler publishes for another process: ProcessStates, LogLines, Progress or Note.
+    """A message that the scheduler publishes for another process: ProcessStates, LogLines, Progress,
+    MeasurementSettings or Note.
 
     Its envelope is the name of the message; for ProcessStates and Progress "_" and the sender's name follow.
     """

@@ -249,7 +249,7 @@ def _read(run: Run) -> RunSummary:
 
 
 def _scanned_m(run: Run, scan: ScanRow) -> float:
-    """Return the path of the probe along the lines of a scan, trace and retrace; lines of which none was seen are 0."""
+    """Return the path of the probe along the lines of a scan, trace and retrace; 0 if no line was seen."""
     if scan.region is None or scan.shape is None:
         return 0.0
     rows = scan.shape[0]

@@ -55,7 +55,7 @@ class Film:
         frames: levelled values, shape (scans, rows, columns), [y, x] ascending; NaN where a scan does not reach.
         channel, unit: of the values.
         numbers, times_ns: number and end of each scan.
-        window: the region of each frame, in the frame of its `frame`; that of the first scan.
+        window: the region of each frame, which is the region of the first scan.
         drift_m: displacement of the sample since the first scan that was subtracted, shape (scans, 2), in m; zeros
             where none was recorded.
         aligned_by: "sample coordinates", "recorded drift", or "" if the scans are as they were measured.

@@ -21,7 +21,7 @@ SCHEDULER = ""
 
 _TABLES = """
 CREATE TABLE IF NOT EXISTS about (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
--- Everything that was published. What is measured has its values in a file: the payload is the rest of the message.
+-- All published packets. Values of scans and spectra are in files: the payload is the rest of the message.
 CREATE TABLE IF NOT EXISTS packets (
   time_ns INTEGER NOT NULL, envelope TEXT NOT NULL, message TEXT NOT NULL, source TEXT NOT NULL,
   payload BLOB NOT NULL, scan INTEGER, spectrum INTEGER, channel TEXT, first_row INTEGER, rows INTEGER);

@@ -5,13 +5,24 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from afspm import wire
-from afspm.basics.errors import NoSuchItem, WireError
-from afspm.model import Frame, Region, RegistrationOutcome, Spectrum, names
-from afspm.record.tables import ScanRow, SpectrumRow, Table
+from afspm.basics.errors import NoSuchItem, UnitError, WireError
+from afspm.basics.units import convert, si_unit
+from afspm.model import (
+    Frame,
+    MeasurementSettings,
+    Parameter,
+    Region,
+    RegistrationOutcome,
+    Spectrum,
+    component_of,
+    names,
+)
+from afspm.record.tables import ScanRow, SpectrumRow, SweptSetting, Table
 
 if TYPE_CHECKING:
     import xarray
@@ -136,14 +147,15 @@ def read_scans(query: Query) -> KeyedTable[ScanRow]:
     found = query("SELECT * FROM scans ORDER BY number")
     keys = _keys(query, "scans", names.START_SCAN, found)
     positions = _positions(query)
-    rows = (scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in found)
-    return KeyedTable(rows, ScanRow)
+    rows = [scan_row(row, keys.get(row[0], ""), *positions.get(row[0], (None, None))) for row in found]
+    return KeyedTable(_with_settings(query, "scans", rows), ScanRow)
 
 
 def read_spectra(query: Query, read: Callable[[SpectrumRow], Spectrum]) -> SpectrumTable:
     found = query("SELECT * FROM spectra ORDER BY number")
     keys = _keys(query, "spectra", names.START_SPEC, found)
-    return SpectrumTable((spectrum_row(row, keys.get(row[0], "")) for row in found), read)
+    rows = [spectrum_row(row, keys.get(row[0], "")) for row in found]
+    return SpectrumTable(_with_settings(query, "spectra", rows), read)
 
 
 def _keys(query: Query, table: str, action: str, rows: Sequence[Row]) -> dict[int, str]:
@@ -179,6 +191,40 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
             with suppress(WireError):  # another implementation may encode it differently
                 found[number] = drift_knowledge(wire.decode("DriftMapping", payload))
     return found
+
+
+def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
+    """Return the rows with the settings that the same component published last before their end."""
+    published = query(
+        "SELECT time_ns, payload FROM packets WHERE message = 'MeasurementSettings' ORDER BY time_ns DESC"
+    )
+    if not published:
+        return rows
+    ends: dict[int, int] = dict(query(_PUBLISHED[table]))
+    newest: dict[str, MeasurementSettings] = {}
+    made: dict[int, tuple[SweptSetting, ...]] = {}
+    for end_ns, row in sorted(((ends.get(row.number, row.time_ns), row) for row in rows), key=itemgetter(0)):
+        while published and published[-1][0] <= end_ns:
+            with suppress(WireError):  # of a newer version
+                settings = wire.decode("MeasurementSettings", published.pop()[1])
+                newest[settings.who] = settings
+        if (found := newest.get(component_of(row.holder or ""))) is not None and found.key in ("", row.key):
+            made[row.number] = tuple(map(_swept, found.parameters))
+    return [replace(row, settings=made.get(row.number, ())) for row in rows]
+
+
+def _swept(parameter: Parameter) -> SweptSetting:
+    text, unit = parameter.value or "", parameter.unit or ""
+    if text.lower() in ("true", "false"):
+        return SweptSetting(parameter.name, text.lower() == "true", "")
+    try:
+        number = float(text)
+    except ValueError:
+        return SweptSetting(parameter.name, text, "")
+    with suppress(UnitError):  # a unit of the maker's own stays
+        plain = si_unit(unit) if unit else ""
+        return SweptSetting(parameter.name, float(f"{convert(number, unit, plain):.9g}"), plain)
+    return SweptSetting(parameter.name, number, unit)
 
 
 def _describe_keys(keys: Sequence[str]) -> str:

@@ -113,7 +113,13 @@ class Run:
         """Return the facts beside the values: drift, feedback, the controller's header, notes … Raises as `scan`."""
         header: dict[str, Any] = dict(self._content(row.file, f"number {row.number}").header)
         notes = [f"{note.text} ({note.who})" for note in self.notes_on(row)]
-        return header | ({"notes": notes} if notes else {}) | ({"key": row.key} if row.key else {})
+        settings = {one.column: one.value for one in row.settings}
+        return (
+            header
+            | ({"notes": notes} if notes else {})
+            | ({"key": row.key} if row.key else {})
+            | ({"settings": settings} if settings else {})
+        )
 
     def film(self, scans: Sequence[ScanRow] | None = None, channel: str | None = None) -> Film:
         """Return scans of one place as a film that stands still: `run.film().save("night.gif")`.

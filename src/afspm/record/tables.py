@@ -9,10 +9,10 @@ from dataclasses import dataclass, fields
 from datetime import UTC
 from enum import Enum
 from html import escape
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Final, Generic, NamedTuple, TypeVar, overload
 
 from afspm.basics.errors import FileError
-from afspm.basics.formatting import day_and_time, scale
+from afspm.basics.formatting import day_and_time, quantity, scale
 from afspm.model import ControlState, Frame, ProcessCondition, Region, RegistrationOutcome
 from afspm.model.geometry import XY
 
@@ -23,6 +23,26 @@ if TYPE_CHECKING:
 
 
 T = TypeVar("T")
+
+
+class SweptSetting(NamedTuple):
+    """A parameter that a sweep had set: a number in SI or in the microscope's own unit, a switch, or a text."""
+
+    name: str
+    value: float | str | bool
+    unit: str
+
+    @property
+    def column(self) -> str:
+        """The name of its column: "scan-speed [m/s]"."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    @property
+    def text(self) -> str:
+        """The value for a person: "2 µm/s"."""
+        if isinstance(self.value, bool):
+            return "on" if self.value else "off"
+        return self.value if isinstance(self.value, str) else quantity(self.value, self.unit)
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +60,7 @@ class ScanRow:
         key: of the request, `scope.scan(…, key="tile-1")`; empty if it had none.
         registration: how its position on the sample is known; None without drift correction.
         position_sd_m: standard deviation of that position along its most uncertain axis; None if unknown.
+        settings: parameters that a sweep had set for it, as the microscope reported them; a column for each.
     """
 
     number: int
@@ -57,6 +78,7 @@ class ScanRow:
     key: str = ""
     registration: RegistrationOutcome | None = None
     position_sd_m: float | None = None
+    settings: tuple[SweptSetting, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +100,7 @@ class SpectrumRow:
     filename: str
     file: str
     key: str = ""
+    settings: tuple[SweptSetting, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +180,8 @@ class Table(Sequence[T], Generic[T]):
     def columns(self) -> dict[str, list[Any]]:
         """Return each column by name, as numbers and texts; positions are split (`center_x_m` …), times are ns."""
         taken_apart = [_apart(row) for row in self._rows]
-        return {name: [row[name] for row in taken_apart] for name in _names(self._kind)}
+        swept = dict.fromkeys(one.column for row in self._rows for one in getattr(row, _SETTINGS, ()))
+        return {name: [row.get(name) for row in taken_apart] for name in (*_names(self._kind), *swept)}
 
     def to_numpy(self) -> NDArray[Any]:
         """Return a structured array: times as datetime64[ns], unknown numbers as NaN or -1."""
@@ -201,10 +225,14 @@ _COLUMNS = {
     "rate_m_s": ("rate_x_m_s", "rate_y_m_s"),
 }
 """Attributes that are split into several columns."""
+_SETTINGS = "settings"
+"""The attribute with a column for each parameter of a sweep."""
 
 
 def _names(kind: type) -> list[str]:
-    return [name for field in fields(kind) for name in _COLUMNS.get(field.name, (field.name,))]
+    return [
+        name for field in fields(kind) if field.name != _SETTINGS for name in _COLUMNS.get(field.name, (field.name,))
+    ]
 
 
 def _apart(row: Any) -> dict[str, object]:
@@ -213,6 +241,8 @@ def _apart(row: Any) -> dict[str, object]:
         name, value = field.name, getattr(row, field.name)
         if name in _COLUMNS:
             made |= zip(_COLUMNS[name], _parts(value, len(_COLUMNS[name])), strict=True)
+        elif name == _SETTINGS:
+            made |= {one.column: one.value for one in value}
         elif name == "channels":
             made[name] = ";".join(f"{channel} [{unit}]" for channel, unit in value)
         elif isinstance(value, tuple):

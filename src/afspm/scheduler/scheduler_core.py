@@ -433,7 +433,7 @@ def _lease_ends_at_s(state: SchedulerState | StateDraft) -> float | None:
 
 
 def _malfunction_due(state: SchedulerState | StateDraft) -> tuple[float | None, str]:
-    # (when device-malfunction is to be flagged, or None; in whose name)
+    # (time at which device-malfunction will be flagged, or None; the name that flags it)
     if _MALFUNCTION in state.control.problems or state.control.ended:
         return None, ""
     return (_AT_ONCE_S, SCHEDULER) if state.watchdog.left_to_people else (state.microscope.lost_at_s, TRANSLATOR)

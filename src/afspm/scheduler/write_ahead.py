@@ -38,7 +38,7 @@ class WriteAhead:
         self._log = log
         self._cached = cached
         self._disk = DiskThread()
-        self._outage = OutageLog("what is published now would be lost in a crash", logger)
+        self._outage = OutageLog("packets published now would be lost in a crash", logger)
         self._given_up = OutageLog("packets are given up that are not recorded yet", logger)
         self._missed_ns: int | None = None
         self._problems: frozenset[int] = frozenset()

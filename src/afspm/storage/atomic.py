@@ -35,6 +35,7 @@ def replace_file(
     parts: Iterable[bytes | memoryview],
     *,
     synced: bool = True,
+    soon: bool = False,
     aside: Path | None = None,
     mode: int = _ANYONE,
 ) -> None:
@@ -42,6 +43,7 @@ def replace_file(
 
     Args:
         synced: hold this over a power cut too, which needs a wait for the disk.
+        soon: with `synced` False, sync the file a moment later. A power cut before that may leave a damaged file.
         aside: temporary path of the file; None: a hidden name of this process beside it.
         mode: mode of the file, before the umask; 0o600 for secrets, from its creation on.
 
@@ -57,12 +59,16 @@ def replace_file(
             aside.unlink(missing_ok=True)  # a file left by a killed process keeps its old mode
         with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.writelines(parts)
+            file.flush()
             if synced:
-                file.flush()
                 sync_file(file.fileno())
+            elif soon:
+                SYNCER.soon(file.fileno())
         _rename(aside, path)
         if synced:
             sync_folder(path.parent)
+        elif soon:
+            SYNCER.folder_soon(path.parent)
     except OSError:
         with contextlib.suppress(OSError):
             aside.unlink()
@@ -81,14 +87,14 @@ def _rename(aside: Path, path: Path) -> None:
         threading.Event().wait(_AGAIN_S)  # Windows has no event for the close of another program's file
 
 
-def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True) -> None:
-    """Replace a file.
+def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: bool = True, soon: bool = False) -> None:
+    """Replace a file, as `replace_file` does.
 
     Raises:
         FileError: the file can't be written.
     """
     try:
-        replace_file(path, parts, synced=synced)
+        replace_file(path, parts, synced=synced, soon=soon)
     except OSError as error:
         raise FileError(f"can't be written: {error}", where=str(path)) from error
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
+import os
 from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.plain_data import Plain
-from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, write_atomic
+from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint, previous_generation, write_atomic
 from afspm.storage.disk import DEADLINE_S, DiskThread
 
 SYNCED_WITHIN_S = 5.0  # longest wait; a disk that hangs counts as full
@@ -44,8 +46,11 @@ class Memory(MutableMapping[str, Any]):
             self._values = values or {}
         self._saved = json.dumps(self._values, ensure_ascii=False)
 
-    def save(self) -> bool:
+    def save(self, *, synced: bool = True) -> bool:
         """Write all values to disk, so that they survive a kill and, if synced, a power cut.
+
+        In a loop that the disk must not slow down, `save(synced=False)` is enough for values whose loss only repeats
+        work: after a power cut the values of the save before are still there.
 
         A disk that is full, away or hangs must not end the experiment: it is logged. A caller must check the result
         before an action that must not happen twice.
@@ -56,25 +61,25 @@ class Memory(MutableMapping[str, Any]):
         Raises:
             InvalidValue: a value is not of JSON's types.
         """
-        return self._write(self._text())
+        return self._write(self._text(), synced=synced)
 
     def save_changes(self) -> None:
         """Save if any value differs from the last save, at any depth."""
         if (text := self._text()) != self._saved:
-            self._write(text)
+            self._write(text, synced=True)
 
     @property
     def saved_text(self) -> str:
         """Return all saved values as JSON."""
         return self._saved
 
-    def _write(self, text: str) -> bool:
+    def _write(self, text: str, *, synced: bool) -> bool:
         # after a failure `_saved` keeps the old text, so the next `save_changes` writes again
         with self._outage.trying():
             if (generations := self._generations) is not None:
                 self._disk.run(lambda: generations.save(text.encode()))
             elif (path := self._path) is not None:
-                self._disk.run(lambda: write_atomic(path, [text.encode(), b"\n"]))
+                self._disk.run(lambda: _replace(path, text, synced=synced))
             self._saved = text
             return True
         return False
@@ -106,6 +111,16 @@ class Memory(MutableMapping[str, Any]):
 
     def __repr__(self) -> str:
         return f"<Memory {self._values!r}>"
+
+
+def _replace(path: Path, text: str, *, synced: bool) -> None:
+    if not synced:  # a power cut may damage the new file; the one before is on the disk by now
+        aside = path.with_name(f".{path.name}.before")
+        with contextlib.suppress(OSError):  # the first one, or a file system without links
+            aside.unlink(missing_ok=True)
+            os.link(path, aside)
+            aside.replace(previous_generation(path))
+    write_atomic(path, [text.encode(), b"\n"], synced=synced, soon=not synced)
 
 
 def _number(value: Any) -> Any:

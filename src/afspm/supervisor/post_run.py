@@ -146,8 +146,8 @@ def report(folder: Path, log: RunLog) -> None:
         log.write(LOGGED_AS, logging.WARNING, f"no report: {error}")
         return
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        log.write(LOGGED_AS, logging.WARNING, f"no report: {said[-1] if said else f'exit code {done.returncode}'}")
+        output = done.stderr.decode(errors="replace").strip().splitlines()
+        log.write(LOGGED_AS, logging.WARNING, f"no report: {output[-1] if output else f'exit code {done.returncode}'}")
     else:
         from afspm.record.report import REPORT_FILE
 

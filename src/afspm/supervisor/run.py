@@ -19,7 +19,7 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST, guest_facts
 from afspm.experiment import Experiment, ProcessStart, Role
 from afspm.model.events import LOGGED_AS
-from afspm.record.run_json import COMPUTER, ENDED, METADATA, REAL_S, STATE_DIR, run_json_or_empty
+from afspm.record.run_json import COMPUTER, ENDED, METADATA, PLANNED, REAL_S, STATE_DIR, run_json_or_empty
 from afspm.record.run_lock import lock_run
 from afspm.storage.disk import run_bounded
 from afspm.storage.packet_log import discard_if_recorded, expect_recorder, log_folder
@@ -124,6 +124,8 @@ def go(
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
+        works = {name: work for name, work in experiment.planned_work().items() if work is not None}
+        facts[PLANNED] = before.get(PLANNED) or {name: work.as_dict() for name, work in works.items()}
         if before.get(ENDED) and REAL_S in before:
             facts[REAL_S] = before[REAL_S]
         run_folder.write_run(folder, facts)

@@ -46,7 +46,7 @@ class Activity(ABC):
     settles_s: ClassVar[float] = 0.0
     """Real time until a started measurement must be seen running."""
     call_failures: ClassVar[tuple[type[AfspmError], ...]] = ()
-    """The errors by which a `call` reports that it failed."""
+    """The errors that a failed `call` raises."""
 
     def __init__(self, files: ResultFiles, clock: Clock, log: logging.Logger) -> None:
         self._results = files

@@ -29,6 +29,7 @@ class Connection:
         is_reached: True while the driver is connected.
         stands: True while it is connected, and its state is observed.
         why_lost: the reason of the last loss.
+        ever_stood: True from the first time that it stood.
     """
 
     def __init__(
@@ -46,7 +47,7 @@ class Connection:
         self._on_lost = on_lost
         self.stands = self.is_reached = False
         self.why_lost = self._logged = ""
-        self._ever_stood = self._loss_published = False
+        self.ever_stood = self._loss_published = False
         self._retry_at_s = 0.0
         self._began_s = clock.monotonic_s()
 
@@ -55,7 +56,7 @@ class Connection:
         if self._clock.monotonic_s() < self._retry_at_s:
             return False
         self.reach()
-        self.stands = self._ever_stood = True
+        self.stands = self.ever_stood = True
         if self._logged:
             self._logged = ""
             self._log.info("the controller answers again")
@@ -90,7 +91,7 @@ class Connection:
             do()
             return True
         except ConfigError as error:
-            if not self._ever_stood:
+            if not self.ever_stood:
                 raise
             self.lose(error)
         except (*LOST, AfspmError) as error:
@@ -103,7 +104,7 @@ class Connection:
     def lose(self, error: Exception) -> None:
         """Record the loss, and publish and log it once."""
         now_s = self._clock.monotonic_s()
-        starts = isinstance(error, LOST) and not self._ever_stood and now_s - self._began_s < _STARTUP_S
+        starts = isinstance(error, LOST) and not self.ever_stood and now_s - self._began_s < _STARTUP_S
         self._retry_at_s = now_s + (_STARTUP_RETRY_S if starts else RETRY_S)
         stood, self.stands, self.is_reached = self.stands, False, False
         self.why_lost = str(error) if isinstance(error, AfspmError | OSError) else f"{type(error).__name__}: {error}"

@@ -198,6 +198,9 @@ class Observer:
             self._polling.began((state, *extent), now_s, lasts_s)
         elif state in (ScopeState.FREE, ScopeState.UNDEFINED):
             self._polling.ended(now_s, as_expected=state is ScopeState.FREE and before in MEASURING)
+            if before in MEASURING:
+                # the next scan is asked for at once, and would wait for a dozen questions about values
+                self._all_at_s = max(self._all_at_s, now_s + self._driver.common.poll_period_s)
         else:
             self._polling.moved(now_s)
 

@@ -158,7 +158,9 @@ class RequestHandler:
             else:
                 self._outcomes.finish(request, response)
             self._state.save()
-        self._reply(response, logging.INFO)
+        # it starts together with this process: `Connection` logs a controller that does not come
+        is_starting = response.detail is ResponseDetail.NOT_SENT and not self._connection.ever_stood
+        self._reply(response, logging.DEBUG if is_starting else logging.INFO)
 
 
 def _run_of(frames: Sequence[bytes]) -> str:

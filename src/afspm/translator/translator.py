@@ -157,7 +157,9 @@ class Translator:
 
     def reply(self, response: Response, level: int = logging.INFO) -> None:
         """Answer the current request, and log a refusal."""
-        if response.code != ControlResponse.SUCCESS:
+        if response.code == ControlResponse.NO_RESPONSE:  # the controller is still starting, which is no refusal
+            self._log.log(level, "%s", response.reason)
+        elif response.code != ControlResponse.SUCCESS:
             self._log.log(level, "refused, %s: %s", ControlResponse(response.code).name, response.reason)
         self._port.reply(wire.encode_response(response))
 

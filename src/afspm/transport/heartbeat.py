@@ -48,7 +48,7 @@ class HeartbeatSender:
         network: network of this socket only, closed with it.
 
     Attributes:
-        heard: set once there is a listener; later heartbeats arrive.
+        heard: set once there is a listener; later heartbeats arrive.  # word: heard
     """
 
     def __init__(

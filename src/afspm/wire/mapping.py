@@ -221,7 +221,15 @@ _NOTE = MessageMapping(
     scan_ns=_time("scan"),
     written_ns=_time("written"),
 )
-# Told is the name on the wire, which must stay compatible
+_SETTINGS = MessageMapping(
+    model.MeasurementSettings,
+    journal_pb2.MeasurementSettings,
+    *("who",),
+    time_ns=_time(),
+    parameters=_each("parameters", PARAMETER),
+    key=FieldMapping("key", sparse=True),
+)
+# Told is the name on the wire, which must stay compatible  # word: told
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
 )
@@ -242,6 +250,7 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     MessageMapping(model.LogLines, journal_pb2.LogLines, lines=_each("lines", _LOG_LINE)),
     MessageMapping(model.Progress, journal_pb2.Progress, "name", "done", "of", time_ns=_time(), left_s="remaining"),
     _NOTE,
+    _SETTINGS,
 )
 
 

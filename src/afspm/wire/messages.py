@@ -209,6 +209,9 @@ NOTE: Final = MessageDeclaration(
     event="note",
     in_past=True,
 )
+MEASUREMENT_SETTINGS: Final = MessageDeclaration(
+    type=journal_pb2.MeasurementSettings, kind=MessageKind.EVENT, source=Role.SCHEDULER
+)
 DRIFT_MAPPING: Final = MessageDeclaration(
     type=DriftMapping,
     kind=MessageKind.RESULT,
@@ -336,7 +339,7 @@ def message_of(envelope: str) -> str:
     Raises:
         WireError: the envelope begins with no known name.
     """
-    # the longest name first: the name of a message may begin with that of another and an underscore
+    # the longest name first: the name of a message may begin with the name of another and an underscore
     end = len(envelope)
     while end > 0:
         if (name := envelope[:end]) in _declared:

@@ -51,7 +51,7 @@ def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryvie
         else:
             raise WireError(f"byte {start} begins a field of the unknown kind {wire_type}")
         if at + length > end:
-            raise WireError(f"the message breaks off: the field at byte {start} is longer than what is left")
+            raise WireError(f"the message breaks off: the field at byte {start} is longer than the rest")
         # protobuf allows a repeated field in several packed pieces, and unpacked
         if tag >> 3 == field and wire_type in (_LENGTH, _FIXED64):
             found.append(view[at : at + length])

@@ -118,7 +118,7 @@ def test_status_says_who_is_in_control_and_how_far_it_is(night: Running) -> None
     assert told["progress"]["series"]["remaining_s"] > 0
 
 
-def test_status_tells_of_the_processes(night: Running) -> None:
+def test_status_lists_the_processes(night: Running) -> None:
     told = night.until(lambda told: len(told["processes"]) >= 3)
     assert {"microscope", "scheduler", "series"} <= {one["name"] for one in told["processes"]}
 
@@ -174,7 +174,7 @@ def test_a_report_may_be_had_while_it_goes_on(night: Running) -> None:
     assert "goes on" in Path(said.stdout.strip()).read_text(encoding="utf-8")
 
 
-def test_a_run_whose_supervisor_is_killed_is_told_as_cut_off_everywhere(tmp_path: Path) -> None:
+def test_run_whose_supervisor_was_killed_is_cut_off_in_every_command(tmp_path: Path) -> None:
     run = Running(tmp_path)
     run.wait_for(r"scan 1 of")
     folder = str(latest_run(run.runs))
@@ -233,7 +233,7 @@ def test_status_survives_the_restart_of_the_scheduler(night: Running) -> None:
     assert night.status()["mode"] == "AUTOMATED"
 
 
-def test_where_nothing_runs_that_is_said(tmp_path: Path) -> None:
+def test_commands_report_that_no_run_is_going_on(tmp_path: Path) -> None:
     said = afspm("status", tmp_path)
     assert said.returncode == NOT_RUNNING
     assert "nothing runs here" in said.stderr

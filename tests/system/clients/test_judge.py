@@ -79,7 +79,7 @@ def test_the_command_prints_a_table_and_writes_a_report(tmp_path: Path) -> None:
     assert [check["outcome"] for check in report["checks"]] == ["failed", "passed"]
 
 
-def test_a_program_that_is_not_there_is_said_so(tmp_path: Path) -> None:
+def test_missing_program_is_reported(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["test-client", "--runs", str(tmp_path), "--", "no-such-program"])
     assert result.exit_code != 0
     assert "no-such-program" in str(result.exception)

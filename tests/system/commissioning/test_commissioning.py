@@ -104,7 +104,7 @@ def test_a_controller_that_is_right_passes_and_the_report_says_what_was_tried(ve
         ("LateEnd", "scan", "until its end was noticed"),
     ],
 )
-def test_what_is_wrong_with_a_controller_is_found(
+def test_fault_of_a_controller_is_found(
     vendor: str, fault: str, step: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(tmp_path))

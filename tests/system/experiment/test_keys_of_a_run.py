@@ -56,8 +56,8 @@ def test_component_without_a_role_can_not_take_the_name_of_one_with_the_role(run
     (tmp_path / "thief.py").write_text(THIEF, encoding="utf-8")
     one = run(more=MORE)
     for claimed in ("witness", "terminal"):
-        one.wait_for(" thief ", f"was told: the key is that of thief, not of {claimed}")
-    with afspm.connect(one.folder, "witness") as scope, pytest.raises(AfspmError, match="the key is that of guest"):
+        one.wait_for(" thief ", f"was told: this is the key of thief, not of {claimed}")
+    with afspm.connect(one.folder, "witness") as scope, pytest.raises(AfspmError, match="this is the key of guest"):
         scope.end_experiment()
     with afspm.connect(one.folder, "ada") as scope, pytest.raises(AfspmError, match="does not have the role"):
         scope.end_experiment()

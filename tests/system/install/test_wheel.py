@@ -130,7 +130,7 @@ def test_what_new_makes_is_right_and_measures_at_once(installed: Installed, tmp_
         assert "the roughest is scan" in output
 
 
-def test_what_is_not_installed_is_found_before_anything_starts(installed: Installed, tmp_path: Path) -> None:
+def test_missing_package_is_found_before_any_process_starts(installed: Installed, tmp_path: Path) -> None:
     installed.run("afspm", "new", "experiment", "night", cwd=tmp_path)
     folder = tmp_path / "night"
     (folder / "brief.toml").write_text(

@@ -132,7 +132,7 @@ def test_a_client_is_answered_in_the_frames_of_version_1(rig: Any, plain: Any) -
 
 
 @pytest.mark.parametrize("name", ["", "Ours"])
-def test_who_may_not_speak_is_told_why_in_the_answer(rig: Any, plain: Any, name: str) -> None:
+def test_peer_without_a_role_gets_the_reason_in_the_answer(rig: Any, plain: Any, name: str) -> None:
     rig.start()
     rig.linked(rig.component("Ours"))
     asking = plain(zmq.REQ)
@@ -146,7 +146,7 @@ def test_who_may_not_speak_is_told_why_in_the_answer(rig: Any, plain: Any, name:
     assert ("another component is connected as Ours" if name else "a client without a name") in reason.decode()
 
 
-def test_who_looks_at_the_last_state_sees_those_that_pass_in_a_moment(rig: Any, plain: Any) -> None:
+def test_polling_peer_sees_short_states(rig: Any, plain: Any) -> None:
     rig.start()
     ours = rig.component("Ours")
     rig.linked(ours)
@@ -167,7 +167,7 @@ def test_who_looks_at_the_last_state_sees_those_that_pass_in_a_moment(rig: Any, 
             assert int(passing) in seen
 
 
-def test_without_such_peers_no_state_is_kept_back_and_those_that_are_gone_do_not_count(rig: Any, plain: Any) -> None:
+def test_states_are_not_held_back_without_polling_peers(rig: Any, plain: Any) -> None:
     rig.start()
     ours = rig.component("Ours")
     rig.linked(ours)
@@ -249,7 +249,7 @@ def launch(router: Router) -> Launch:
     return Launch("supervisor:here", sockets=Sockets(control=router.address))
 
 
-def test_our_supervisor_tells_their_scheduler_nothing_and_says_so_once(router: Router) -> None:
+def test_supervisor_sends_nothing_to_a_published_scheduler_and_logs_it_once(router: Router) -> None:
     reporter = Reporter(launch(router), CLOCK, "here")
     complaints: list[str] = []
     reporter.post = lambda news: complaints.append(news.text) if isinstance(news, ReportFailed) else None

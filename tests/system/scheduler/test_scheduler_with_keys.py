@@ -26,7 +26,7 @@ def test_known_key_does_not_allow_the_name_of_another_component(locked_rig: Any)
     assert experiment.ask(ControlRequest.REQUEST_CTRL, 0).ok
     impostor = locked_rig.component("Experiment", owner="Visitor")
     refused = impostor.ask(ControlRequest.ACTION, "start-scan", key="Experiment/impostor/1")
-    assert (refused.code, "the key is that of Visitor" in refused.reason) == (ControlResponse.FAILURE, True)
+    assert (refused.code, "this is the key of Visitor" in refused.reason) == (ControlResponse.FAILURE, True)
     assert not locked_rig.asked
 
 

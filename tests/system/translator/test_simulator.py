@@ -33,7 +33,7 @@ def frame(x_nm: float, y_nm: float, width_nm: float, height_nm: float, angle: fl
     return message.SerializeToString()
 
 
-def test_a_subscriber_is_told_everything_in_force(run: Any) -> None:
+def test_subscriber_receives_all_present_settings(run: Any) -> None:
     heard = states(run().peer().until(FREE))
     assert {"ScanParameters2d", "ZCtrlParameters", "ProbePosition", FREE} <= set(heard)
 
@@ -130,7 +130,7 @@ def test_feedback_is_set_in_part_and_switched(run: Any) -> None:
     assert peer.get("x-feedback-on")[0] == "false"
 
 
-def test_what_is_given_in_part_is_set_in_part(run: Any) -> None:
+def test_partial_scan_parameters_change_only_these(run: Any) -> None:
     peer = run().peer().ready()
     half = spectroscopy_pb2.ProbePosition(units="nm")
     half.point.x = 30.0
@@ -144,7 +144,7 @@ def test_what_is_given_in_part_is_set_in_part(run: Any) -> None:
     assert (shape.x, shape.y) == (24, 8)
 
 
-def test_every_base_parameter_is_told_and_can_be_set_to_what_it_is(run: Any) -> None:
+def test_every_base_parameter_is_read_and_set_to_its_value(run: Any) -> None:
     from afspm.model import names
 
     peer = run().peer().ready()
@@ -275,7 +275,7 @@ def test_it_ends_when_its_parent_goes(run: Any) -> None:
     assert running.stop() == 81
 
 
-def test_told_that_the_experiment_has_ended_it_stops_the_scan_and_ends(run: Any) -> None:
+def test_end_of_the_experiment_stops_the_scan_and_the_translator(run: Any) -> None:
     running = run(speed=1.0)
     peer = running.peer().ready()
     assert peer.act(START_SCAN) == OK

@@ -70,7 +70,7 @@ def until_free(asks: Ask) -> Response:
     return response
 
 
-def test_the_scheduler_of_another_run_is_refused_whatever_it_asks(run: Any, ask: Any) -> None:
+def test_every_request_of_another_runs_scheduler_is_refused(run: Any, ask: Any) -> None:
     running = started(run, OURS)
     theirs, ours = ask(running, Epoch(THEIRS, 1)), ask(running, Epoch(OURS, 1))
     for request in (START, wire.CLOSE):

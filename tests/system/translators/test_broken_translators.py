@@ -66,7 +66,7 @@ def checked(folder: Path, name: str, *only: str, speed: float = SPEED) -> CheckR
         ("SaysNothingAtTheStart", "published/in-force", "expected a ScanParameters at the start"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(
+def test_fault_is_reported_in_one_line(
     name: str, check: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if name in STUCK:  # it is waited for twice, in vain
@@ -114,7 +114,7 @@ def test_the_scan_before_is_not_taken_for_the_new_one(tmp_path: Path) -> None:
     assert "a size of (600, 300) nm instead of" in report.failed[0].line
 
 
-def test_a_translator_that_dies_is_said_to_and_nothing_more_is_tried(tmp_path: Path) -> None:
+def test_death_of_the_translator_ends_the_trial_with_a_report(tmp_path: Path) -> None:
     report = checked(tmp_path, "broken.DiesOfNaN", "refused/scan-speed", "refused/move-speed")
     assert "the process microscope" in report.lost
     assert "exit code 3" in report.lost
@@ -122,7 +122,7 @@ def test_a_translator_that_dies_is_said_to_and_nothing_more_is_tried(tmp_path: P
     assert not report.passed
 
 
-def test_what_can_not_be_put_back_is_said(tmp_path: Path) -> None:
+def test_setting_that_cannot_be_restored_is_reported(tmp_path: Path) -> None:
     report = checked(tmp_path, "broken.OnlyUpwards", "parameter/tip-bias-voltage")
     assert len(report.unrestored) == 1
     assert "the bias is stuck" in report.unrestored[0]

@@ -89,7 +89,7 @@ def test_the_simulator_does_all_that_it_should_and_is_left_as_it_was(file: Path)
     assert after["x-feedback-on"] is True
 
 
-def test_the_report_lists_what_is_supported_and_what_is_not(file: Path) -> None:
+def test_report_lists_supported_and_unsupported_operations(file: Path) -> None:
     report = run(CheckOptions([file], runs=file.parent / "runs", only=["parameter/tip-bias"]))
     written = json.loads((Path(report.folder) / "report.json").read_text(encoding="utf-8"))
     assert written["passed"] is True
@@ -105,7 +105,7 @@ def test_the_report_lists_what_is_supported_and_what_is_not(file: Path) -> None:
     assert parameters["x-fault-kind"]["supported"] is False
 
 
-def test_what_is_not_supported_is_skipped_and_listed(tmp_path: Path) -> None:
+def test_unsupported_operation_is_skipped_and_listed(tmp_path: Path) -> None:
     module = tmp_path / "poor.py"
     module.write_text(
         "from afspm.simulation.simulator import Simulator\n\n\n"
@@ -130,7 +130,7 @@ def test_what_is_not_supported_is_skipped_and_listed(tmp_path: Path) -> None:
     assert report.support.actions["start-spec"] is False
 
 
-def test_a_spectrum_too_short_to_be_stopped_is_said_to_be(file: Path) -> None:
+def test_spectrum_too_short_to_be_stopped_is_reported(file: Path) -> None:
     report = run(
         CheckOptions([file], runs=file.parent / "runs", speed=5000.0, only=["spectrum/cancel", "spectrum/order"])
     )
@@ -215,9 +215,7 @@ def test_ctrl_c_in_the_middle_of_a_scan_puts_everything_back(file: Path) -> None
     assert [instrument[what] for what in ("scan", "spectrum", "move", "occupied")] == [None] * 4
 
 
-def test_a_translator_that_does_not_find_its_controller_is_said_to_with_what_it_said_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_report_quotes_a_translator_without_its_controller(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, "STARTED_S", 8.0)
     (tmp_path / "deaf.py").write_text(
         "from afspm.simulation.simulator import Simulator\n\n\n"
@@ -246,7 +244,7 @@ def test_the_command_ends_with_1_where_something_is_wrong_and_says_what(tmp_path
     assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["passed"] is False
 
 
-def test_a_real_microscope_is_not_touched_before_somebody_says_that_the_tip_is_withdrawn(tmp_path: Path) -> None:
+def test_real_microscope_waits_for_the_confirmation_that_the_tip_is_withdrawn(tmp_path: Path) -> None:
     file = tmp_path / "experiment.toml"
     file.write_text('[microscope]\ncomponent = true\nclass = "Nanonis"\n', encoding="utf-8")
     command = [*AFSPM, "test-translator", "experiment.toml"]

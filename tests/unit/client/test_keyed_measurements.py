@@ -269,3 +269,19 @@ def test_forgotten_key_is_measured_again_and_takes_no_space(tmp_path: Path) -> N
     assert lab.finished == [*TILES, TILES[1]]
     with pytest.raises(InvalidValue, match="can't be a key"):
         scope.forget("../tile-1")
+
+
+@pytest.mark.parametrize("left", [0.0, 0.5, 0.99])
+def test_a_result_that_a_power_cut_has_damaged_is_measured_again(
+    tmp_path: Path, left: float, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab()
+    survey(scope_of(lab, tmp_path, 0))
+    (file,) = (tmp_path / f"{lab.name}.results").glob("tile-1*")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(len(content) * left)])
+    lab.restart_component()
+    lab.answers.clear()  # the scheduler and the translator have lost their last moment, too
+    assert len(survey(scope_of(lab, tmp_path, 1))) == 3
+    assert lab.begun_scans == 4
+    assert "tile-1 is damaged and measured again" in caplog.text

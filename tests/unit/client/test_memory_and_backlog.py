@@ -145,3 +145,15 @@ def test_later_packets_do_not_overtake_those_on_disk() -> None:
     backlog.put(Packet("Scan2d", b"x", 3))  # there would be room for it in memory
     assert first is not None
     assert [first.time_ns, *(packet.time_ns for packet in iter(backlog.take, None))] == [0, 1, 2, 3]
+
+
+def test_a_power_cut_after_an_unsynced_save_leaves_the_generation_before(tmp_path: Path) -> None:
+    memory = Memory(tmp_path / "x.json")
+    for done in (1, 2):
+        memory["done"] = done
+        assert memory.save(synced=False)
+    assert Memory(tmp_path / "x.json")["done"] == 2
+    (tmp_path / "x.json").write_bytes(b"")  # what may be left of a file that was not synced
+    again = Memory(tmp_path / "x.json")
+    assert again["done"] == 1
+    assert again.damage

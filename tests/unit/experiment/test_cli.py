@@ -97,3 +97,17 @@ def test_version_is_printed(runner: CliRunner) -> None:
     assert result.exit_code == 0
     assert result.output.split()[0] == "afspm"
     assert result.output.split()[1][0].isdigit()
+
+
+def test_check_estimates_the_work_and_the_end(runner: CliRunner, tmp_path: Path) -> None:
+    components = {
+        "microscope": 'class = "Simulator"\ninitial = { scan-speed = "4 um/s" }',
+        "scheduler": 'class = "Scheduler"',
+        "series": 'class = "ScanSeries"\nsize = ["2 um", "2 um"]\npixels = [100, 100]\nevery = "10 min"\nscans = 7',
+    }
+    text = "\n".join(f"[{name}]\ncomponent = true\n{lines}" for name, lines in components.items())
+    (tmp_path / "night.toml").write_text(f"[clock]\nspeed = 61.0\n{text}\n", encoding="utf-8")
+    result = runner.invoke(app, ["check", "night.toml"])
+    assert result.exit_code == 0
+    assert "series plans 7 scans, 2.8 mm scanned, 0.56 MB a channel before compression, 1 h 02 min" in result.output
+    assert "(1 h 02 min, 1 min 01 s real)" in result.output

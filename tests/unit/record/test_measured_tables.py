@@ -11,7 +11,15 @@ from tests.unit.record.record_lab import Given, Night
 
 import afspm
 from afspm.basics.errors import InvalidValue
-from afspm.model import ControlResponse, JournalEntries, JournalEntry, names
+from afspm.model import (
+    ControlResponse,
+    JournalEntries,
+    JournalEntry,
+    MeasurementSettings,
+    Parameter,
+    ScopeState,
+    names,
+)
 from afspm.record.export import export
 from afspm.record.store import RecordStore
 
@@ -96,3 +104,56 @@ def test_export_has_the_key_of_a_scan(night: Night, store: RecordStore, tmp_path
     with h5py.File(second) as file:
         assert "key" not in file["entry/afspm"].attrs
     assert ",tile-1" in (tmp_path / "csv" / "scans.csv").read_text(encoding="utf-8")
+
+
+def settings(night: Night, gain: str, key: str = "", who: str = "series", speed: str = "2") -> Given:
+    parameters = (Parameter("zctrl-igain", gain), Parameter("scan-speed", speed, "um/s")) if gain else ()
+    return night.packet(MeasurementSettings(night.now_ns, who, parameters, key))
+
+
+def test_swept_parameters_are_columns_of_the_scans(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take([night.control(), *night.whole_scan(1)])  # before the sweep
+    store.take([settings(night, "5", "sweep-1"), start(night, "sweep-1"), *night.whole_scan(2)])
+    store.take([settings(night, "7", "sweep-2"), start(night, "sweep-2"), night.control("corrector")])
+    store.take([*night.whole_scan(3), night.control()])  # of a component that has control meanwhile
+    store.take([settings(night, "7", "sweep-2"), start(night, "sweep-2"), *night.whole_scan(4)])
+    store.take([settings(night, ""), *night.whole_scan(5)])  # after the sweep
+    scans = afspm.open_run(tmp_path).scans
+    assert [row.holder for row in scans] == ["series", "series", "corrector", "series", "series"]
+    frame = scans.to_pandas()
+    assert frame["zctrl-igain"].tolist() == pytest.approx([np.nan, 5.0, np.nan, 7.0, np.nan], nan_ok=True)
+    assert frame["scan-speed [m/s]"].tolist() == pytest.approx([np.nan, 2e-6, np.nan, 2e-6, np.nan], nan_ok=True)
+    assert "settings" not in frame.columns
+    assert afspm.open_run(tmp_path).about(scans[1])["settings"] == {"zctrl-igain": 5.0, "scan-speed [m/s]": 2e-6}
+    assert "zctrl-igain" in scans._repr_html_()
+
+
+def test_swept_parameters_are_columns_of_the_spectra(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take([night.control(), settings(night, "5"), night.state(ScopeState.SPEC), night.spectrum()])
+    spectra = afspm.open_run(tmp_path).spectra
+    assert spectra.columns()["zctrl-igain"] == [5.0]
+
+
+def test_a_record_without_a_sweep_has_no_column_of_it(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take([night.control(), *night.whole_scan(1)])
+    columns = afspm.open_run(tmp_path).scans.columns()
+    assert not {"settings", "zctrl-igain"} & columns.keys()
+
+
+def test_a_contact_sheet_shows_the_sweep(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    from afspm.record import sweep_sheet
+
+    store.take([night.control(), *night.whole_scan(1)])
+    with afspm.open_run(tmp_path) as run:
+        sweep_sheet.draw(run, "night")
+    assert not (tmp_path / "sweep.png").exists(), "there was no sweep"
+    for number, (gain, speed) in enumerate([("5", "1"), ("5", "2"), ("70", "2"), ("70", "1")], 2):
+        store.take([settings(night, gain, speed=speed), *night.whole_scan(number)])
+    with afspm.open_run(tmp_path) as run:
+        sweep_sheet.draw(run, "night")
+        rows = [(row.settings, run.scan(row).first) for row in run.scans if row.settings]
+    assert (tmp_path / "sweep.png").stat().st_size > 10_000
+    across, down = (sweep_sheet._sorted(one[part] for one, _ in rows) for part in (slice(-1, None), slice(None, -1)))
+    assert [each[0].text for each in across] == ["1 µm/s", "2 µm/s"]
+    assert [each[0].text for each in down] == ["5", "70"]

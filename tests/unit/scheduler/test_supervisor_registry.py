@@ -16,7 +16,9 @@ from afspm.model import (
     ControlResponse,
     LogLine,
     LogLines,
+    MeasurementSettings,
     Note,
+    Parameter,
     ProcessCondition,
     ProcessState,
     ProcessStates,
@@ -230,4 +232,10 @@ def test_key_of_a_component_is_valid_for_its_persons_and_no_other_component(lab:
     asked = replies(lab.ask("dashboard:Ada", ControlRequest.REQUEST_CTRL, 0, user="dashboard"))[-1]
     assert asked.response.code == OK
     other = replies(lab.ask("series:Ada", ControlRequest.REQUEST_CTRL, 0, user="dashboard"))[-1]
-    assert other.response.reason == "the key is that of dashboard, not of series:Ada"
+    assert other.response.reason == "this is the key of dashboard, not of series:Ada"
+
+
+def test_settings_of_a_measurement_are_published_only_for_the_component_that_set_them(lab: Lab) -> None:
+    settings = MeasurementSettings(1, "sweep", (Parameter("zctrl-igain", "5"),), "sweep-1")
+    assert tell(lab, settings, "sweep", user="sweep").code == OK
+    assert tell(lab, settings, "other").code == ControlResponse.FAILURE

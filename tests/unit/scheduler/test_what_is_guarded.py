@@ -340,7 +340,7 @@ def test_no_answer_of_a_microscope_ends_the_scheduler(said: str) -> None:
     assert reply.response.code == ControlResponse.SUCCESS
 
 
-def test_the_time_of_a_use_is_that_of_the_experiment() -> None:
+def test_time_of_a_use_is_experiment_time() -> None:
     lab = in_control(PULSES)
     lab.ask("experiment", ACTION, "x-pulse", "experiment/a/1")
     lab.answer(lab.forwarded[-1])

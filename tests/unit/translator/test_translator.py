@@ -595,6 +595,9 @@ def test_a_controller_that_starts_with_its_translator_is_waited_for_and_nothing_
     bench.microscope.lost = True
     bench.start()
     bench.look(1.8)
+    for subject in (Parameter("scan-speed"), names.RETRACT):  # who asks then has to wait, and is refused nothing
+        response = bench.ask(PARAM if isinstance(subject, Parameter) else ACTION, subject)
+        assert (response.code, response.detail) == (ControlResponse.NO_RESPONSE, ResponseDetail.NOT_SENT)
     assert caplog.records == []
     bench.look(0.3)
     (told,) = caplog.records
@@ -617,6 +620,30 @@ def test_a_controller_that_starts_late_is_found_soon(bench: Any, caplog: Any) ->
     bench.look(0.11)
     assert "ScanParameters2d" in bench.heard()
     assert caplog.records == []
+
+
+def test_requests_to_a_lost_controller_are_logged_and_not_called_refused(bench: Any, caplog: Any) -> None:
+    caplog.set_level(logging.INFO)
+    bench.microscope.lost = True
+    bench.look()
+    bench.ask(PARAM, Parameter("scan-speed"))
+    lost, asked = caplog.messages
+    assert "lost contact" in lost
+    assert asked.startswith("not sent: the controller can't be reached")
+
+
+def test_the_request_after_a_scan_comes_before_the_values_are_read(bench: Any, scan: Any) -> None:
+    bench.ask(ACTION, names.START_SCAN)
+    bench.look(0.05)
+    bench.microscope.files["1"] = [scan()]
+    bench.microscope.state = ScopeState.FREE
+    bench.look(0.045)  # the values are due 5 ms later
+    assert bench.heard()[-1] == "FREE"
+    bench.microscope.got = 0
+    bench.look(0.05)
+    assert bench.microscope.got == 0
+    bench.look(0.06)
+    assert bench.microscope.got > 0
 
 
 def test_a_request_that_was_done_before_the_controller_was_lost_stays_a_success(bench: Any) -> None:

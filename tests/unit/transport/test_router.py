@@ -257,7 +257,7 @@ def test_restarted_peer_is_reported_after_the_end_of_its_former_life(open_: Any)
     assert [type(event) for event in run.listening.told][: len(expected) - 1] == expected[:-1]
 
 
-def test_guests_have_any_name_but_that_of_a_process(open_: Any) -> None:
+def test_guest_may_not_take_the_name_of_a_process(open_: Any) -> None:
     run = Run(open_)
     heard = []
     for n, name in enumerate(("notebook", "dashboard:Ada", "series", "series:Ada", "scheduler", GUEST)):

@@ -30,6 +30,7 @@ AS_MODEL = {
     "LogLines",
     "Progress",
     "Note",
+    "MeasurementSettings",
 }
 
 

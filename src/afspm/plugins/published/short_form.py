@@ -77,7 +77,7 @@ def _variable(name: str, value: object, addresses: Collection[str]) -> str:
     if name in _VARIABLES:
         return "as it is"
     if isinstance(value, str) and value in addresses:
-        return f"{_FILLED_IN}; to be said where they are on several computers"
+        return f"{_FILLED_IN}; name them if they are on several computers"
     return f"{toml(value)} stands where it is named"
 
 

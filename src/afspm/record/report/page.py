@@ -13,7 +13,7 @@ from afspm.model.events import SUPERVISOR
 from afspm.record.drawing import timeline
 from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
-from afspm.record.report import curves, markup, sample
+from afspm.record.report import curves, estimate, markup, sample
 from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
@@ -34,7 +34,7 @@ def html(
     places = [position for group in spectra for position in group.positions]
     body = [
         f"<header><h1>{escape(story.name)}{badge}</h1>{_sample_line(story)}{_duration_line(story, clock)}</header>",
-        section("", _cards(story)),
+        section("", _cards(story) + estimate.html(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
         section("Drift", _drift(story, clock)),

@@ -20,8 +20,9 @@ from afspm.model import (
 )
 from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.overview import Overview, ProcessRestart
+from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
-from afspm.record.run_json import REAL_S
+from afspm.record.run_json import PLANNED, REAL_S
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
@@ -55,6 +56,7 @@ class RunStory:
         problems: spans of all problems except routine ones, in the order of time.
         actions: treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
+        comparisons: planned and measured work of each component with a plan.
     """
 
     name: str
@@ -72,6 +74,7 @@ class RunStory:
     actions: Sequence[JournalEntry]
     notes: Sequence[NoteRow]
     seen_late: Sequence[JournalEntry]
+    comparisons: Sequence[WorkComparison] = ()
 
     @property
     def end_ns(self) -> int:
@@ -163,6 +166,7 @@ def read(run: Run) -> RunStory:
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
+        comparisons=compare(run.facts.get(PLANNED) or {}, scans, run.spectra),
     )
 
 

@@ -10,6 +10,7 @@ from afspm.basics.formatting import duration_text
 from afspm.basics.frozen import replace
 from afspm.model import (
     LogLines,
+    MeasurementSettings,
     Note,
     ProcessCondition,
     ProcessState,
@@ -164,10 +165,13 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
     if isinstance(thing, Note) and told.message == "Note":
         mine = thing.who == event.name
         return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if isinstance(thing, MeasurementSettings) and told.message == "MeasurementSettings":
+        mine = thing.who == event.name
+        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
     if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
         return Announcement("", f"a {told.message[:80]} can't be relayed, or can't be read")
     if event.user not in (None, SUPERVISOR):
-        return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not that of {event.user}")
+        return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not the key of {event.user}")
     spoken_of = thing.lines if isinstance(thing, LogLines) else thing.processes
     if wrong := [one.name for one in spoken_of if not is_process_name(one.name)]:
         return Announcement("", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process")

@@ -91,7 +91,7 @@ def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:
     if draft.microscope.is_free != was_free:
         draft.lease = draft.lease.used(draft.now_ns)
     flagged_by = draft.control.problems.get(Problem.DEVICE_MALFUNCTION)
-    # only the flag raised for the translator: that of a component waits for a person (decision 0016)
+    # only the flag raised for the translator: a flag of a component waits for a person (decision 0016)
     if draft.microscope.lost_since_s is None and flagged_by == TRANSLATOR:
         control_change.decide(draft, ControlInput(ArbitrationEvent.CLEAR, TRANSLATOR, Problem.DEVICE_MALFUNCTION))
     safety_commands.send(draft)

@@ -112,7 +112,7 @@ def _owns_its_name(draft: StateDraft, event: RequestIn) -> bool:
         answers.refuse_peer(draft, event, "a client without a name: set the socket's identity to the component's name")
         return False
     if event.user is not None and event.user != component_of(name):
-        answers.refuse_peer(draft, event, f"the key is that of {event.user}, not of {name}")
+        answers.refuse_peer(draft, event, f"this is the key of {event.user}, not of {name}")
         return False
     # a component of another run at the same address must not act here
     if run and run_of(name, request_id) not in ("", run):

@@ -23,7 +23,7 @@ class TipDuty(Enum):
     """The duty of the scheduler towards a tip that its holder left in danger. Its values stand in saved states."""
 
     NONE = "nothing"
-    OWED = "it is to be retracted"
+    OWED = "it is to be retracted"  # word: is to be
     ASKED = "the microscope is asked to retract it"
     PUT_OFF = "it was not retracted, which is tried again later"
 
@@ -219,7 +219,7 @@ class Watchdog:
 
         The answer may arrive before or after the state that the action leads to.
         """
-        # otherwise a state has overtaken this answer, and shows what is running
+        # otherwise a state has overtaken this answer, and shows the running activity
         is_new = states_seen == microscope.states_seen
         return replace(self, starting=STARTS.get(action, self.starting)) if is_new else self
 
@@ -277,7 +277,7 @@ class Watchdog:
         due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
         return replace(self, in_haste=True, due_s=due_s)
 
-    # --- what is sent ---
+    # --- requests to the translator ---
 
     def next_action(self, microscope: MicroscopeStatus) -> tuple[Watchdog, str | None]:
         """Return the action to send now, or None; it counts as sent."""

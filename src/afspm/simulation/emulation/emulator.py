@@ -191,7 +191,7 @@ class Emulator(ABC):
         """Drop the present activity, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
         self.rig.abandon(self.clock.now_s())
 
-    # -- what is there for it
+    # -- services for subclasses
 
     def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
         """Show a button until it is pressed or removed; there is one at a time.

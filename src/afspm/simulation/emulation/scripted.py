@@ -125,7 +125,7 @@ class ScriptedEmulator(Emulator):
     def not_a_number(self, request: bytes) -> bytes:
         """Return a reply with the value NaN."""
 
-    # -- what is done with it
+    # -- steps of the script
 
     def open(self) -> str:
         """Create the program, and listen."""

@@ -218,6 +218,10 @@ class Simulator(Driver):
         loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
+    def run_drawing(self, work: Callable[[], None]) -> None:
+        """Draw a scan beside everything else."""
+        in_background(work)
+
     def connect(self) -> None:
         """Switch the instrument on, or restore its state."""
         if self._controller is None:
@@ -234,7 +238,7 @@ class Simulator(Driver):
         start_s = kept["start_s"]
         self.faults = Faults(self._faults_settings, FAULT_KINDS, start_s, kept["faults"])
         truth = Truth(self.run_dir / "truth.jsonl", kept)
-        instrument = Instrument(self._world_settings, self._seed, start_s, run=in_background, note=truth.note)
+        instrument = Instrument(self._world_settings, self._seed, start_s, run=self.run_drawing, note=truth.note)
         instrument.setup.approach_s = self._approach_s
         instrument.drawing.wake, instrument.drawing.log = self.wake, self.log
         if "instrument" not in kept:

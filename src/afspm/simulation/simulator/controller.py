@@ -101,7 +101,7 @@ class SimulatedController:
             names.ENGAGE: self.engage,
         }
 
-    # --- what is going on ---
+    # --- the running activity ---
 
     def state(self, now_s: float) -> ScopeState:
         """Return the state of the instrument, after all events up to now."""

@@ -38,4 +38,4 @@ SPREAD = {
     "leverage": 1.1494,
     "most": 39.4562,
 }
-"""By which covariances are larger than their model says, see `Doubt`."""
+"""Ratio of true covariances to those of the model, see `Doubt`."""

@@ -35,7 +35,7 @@ GAIN_SD = 1.0  # of the logarithm
 BEND_SD = 0.15
 BORDER_PX = 1  # filters and splines have no data beyond the border
 FARTHEST_PX = 8.0  # from the result of the search
-TURNED = 0.03  # radians by which the lines of two scans cross
+TURNED = 0.03  # angle in radians between the lines of two scans
 ELSEWHERE_PX = 32  # the farthest shift that a match is compared with
 EXPECTED = 2.0
 """Factor on the allowed probability where a displacement is expected: nearly all wrong matches are of unrelated scans

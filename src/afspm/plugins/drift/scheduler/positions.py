@@ -14,7 +14,7 @@ from afspm.scheduler.events import Codec
 P = TypeVar("P", bound=Region | ProbePosition)
 
 SAME = 1e-3
-"""Share of a region's size by which a controller may round: within it, the reported region is the one that was set."""
+"""Largest rounding by a controller, as a share of the region's size: within it, the reported region is the set one."""
 SAME_PLACE_M = 1e-9
 
 _CANDIDATES = 8

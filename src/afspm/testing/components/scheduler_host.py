@@ -46,9 +46,9 @@ from afspm.scheduler.events import (
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
-from tests.simulation.network import ControlLine, ControlServer, Feed, Publisher, Weather
-from tests.simulation.process import Alarm, Process
-from tests.simulation.timeline import Timeline
+from afspm.testing.components.memory_network import ControlLine, Feed, LineServer, PacketSource, Weather
+from afspm.testing.components.simulated_process import Alarm, Process
+from afspm.testing.components.simulated_time import SimulatedTime
 
 
 @dataclass
@@ -85,7 +85,7 @@ class Disk:
         return restored(SavedState, json.loads(json.dumps(snapshot(self.state, KIND, VERSION))), KIND, VERSION)
 
 
-class Observer(Protocol):
+class StepObserver(Protocol):
     """Checks the scheduler."""
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None: ...
@@ -107,12 +107,12 @@ class SchedulerHost(Process):
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         weather: Weather,
         settings: SchedulerSettings,
         codec: Codec,
         header: Callable[[Packet], PacketHeader],
-        observer: Observer,
+        observer: StepObserver,
         *,
         journal_s: float = 0.1,
         dies_in_step: float = 0.0,
@@ -123,7 +123,7 @@ class SchedulerHost(Process):
         self.core = self._make_core()
         self.disk = Disk()
         self.dies_in_step = dies_in_step
-        self.translator: tuple[ControlServer, Publisher] | None = None
+        self.translator: tuple[LineServer, PacketSource] | None = None
         self._weather = weather
         self._header = header
         self._observer = observer

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from tests.simulation.timeline import Timeline, Timer
+from afspm.testing.components.simulated_time import SimulatedTime, Timer
 
 
 class Cuttable(Protocol):
@@ -54,7 +54,7 @@ class Process:
         step_age_s: the age of its current step, as it reports it.
     """
 
-    def __init__(self, timeline: Timeline, name: str) -> None:
+    def __init__(self, timeline: SimulatedTime, name: str) -> None:
         self.timeline = timeline
         self.name = name
         self.alive = False

@@ -33,7 +33,7 @@ class Timer:
         self.cancelled = True
 
 
-class Timeline:
+class SimulatedTime:
     """All future events in their order. It is a `Clock` as well.
 
     Args:

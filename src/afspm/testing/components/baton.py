@@ -12,7 +12,7 @@ from collections.abc import Callable
 _LONGEST_STEP_S = 60.0
 
 
-class Killed(BaseException):
+class LifeEnded(BaseException):
     """Raised in code that waits when its process is killed, each time it waits."""
 
 
@@ -20,7 +20,7 @@ class Baton:
     """One thread of blocking code.
 
     Args:
-        body: the code. Its exception, other than `Killed`, is kept in `error`.
+        body: the code. Its exception, other than `LifeEnded`, is kept in `error`.
     """
 
     def __init__(self, name: str, body: Callable[[], int]) -> None:
@@ -57,23 +57,23 @@ class Baton:
     def wait(self) -> None:
         """Return the baton, and wait for it."""
         if self._killed:
-            raise Killed
+            raise LifeEnded
         self._to_simulation.release()
         self._to_thread.acquire()
         if self._killed:
-            raise Killed
+            raise LifeEnded
 
     def die(self) -> None:
         """End this process here and now."""
         self._killed = True
-        raise Killed
+        raise LifeEnded
 
     def _run(self) -> None:
         self._to_thread.acquire()
         try:
             if not self._killed:
                 self.code = self._body()
-        except Killed:
+        except LifeEnded:
             self.code = None
         except BaseException as error:
             self.error = error

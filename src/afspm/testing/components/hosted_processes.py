@@ -1,6 +1,6 @@
 """Real components and the real translator as simulated processes: their own code, in-memory ports, a folder for a disk.
 
-`HostedComponent` runs a `Component` as `afspm.supervisor.host` does, `HostedTranslator` a `Driver` behind the
+`ComponentProcess` runs a `Component` as `afspm.supervisor.host` does, `TranslatorProcess` a `Driver` behind the
 real `Translator`. All of it speaks the real wire format.
 """
 
@@ -16,6 +16,11 @@ from afspm.basics.launch import Launch, Sockets
 from afspm.client.component import Component
 from afspm.model import Packet, Request, Response
 from afspm.storage.memory import Memory
+from afspm.testing.components.baton import Baton
+from afspm.testing.components.memory_network import ControlLine, Feed, Weather
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_process import Process
+from afspm.testing.components.simulated_time import SimulatedTime, Timer
 from afspm.translator.driver import Driver
 from afspm.translator.translator import Translator, TranslatorRun
 from afspm.transport.late_joiners import PublishedHistory
@@ -24,24 +29,19 @@ from afspm.transport.port import (
     ControlConnected,
     ControlDisconnected,
     Incoming,
+    Killed,
     PacketReceived,
     ReplyReceived,
     RequestReceived,
     Served,
     SubscriberJoined,
 )
-from afspm.transport.port import Killed as KillReceived
 from afspm.transport.process.context import ProcessActivity, ProcessContext
-from tests.simulation.baton import Baton
-from tests.simulation.network import ControlLine, Feed, Weather
-from tests.simulation.process import Process
-from tests.simulation.scheduler import SchedulerHost
-from tests.simulation.timeline import Timeline, Timer
 
 SOURCE = "memory://scheduler"
 
 
-class HostedProcess(Process):
+class BlockingProcess(Process):
     """A process with blocking code.
 
     Args:
@@ -51,7 +51,7 @@ class HostedProcess(Process):
         ended_with: the end of its last life: an exit code or an exception; None if it was killed.
     """
 
-    def __init__(self, timeline: Timeline, name: str, *, dies_in_call: float = 0.0) -> None:
+    def __init__(self, timeline: SimulatedTime, name: str, *, dies_in_call: float = 0.0) -> None:
         super().__init__(timeline, name)
         self.dies_in_call = dies_in_call
         self.ended_with: int | BaseException | None = None
@@ -124,7 +124,7 @@ class HostedProcess(Process):
         """Close the connections of the life that has ended."""
 
 
-class HostedComponent(HostedProcess):
+class ComponentProcess(BlockingProcess):
     """A `Component`, made for every life, on a `Port` in memory.
 
     Args:
@@ -134,7 +134,7 @@ class HostedComponent(HostedProcess):
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         weather: Weather,
         scheduler: SchedulerHost,
         name: str,
@@ -150,6 +150,7 @@ class HostedComponent(HostedProcess):
         self._folder = folder
         self._inbox: list[Incoming] = []
         self._newest: dict[str, int] = {}
+        self.problems: dict[str, int] = {}
 
     def connect(self) -> None:
         self._inbox = []
@@ -168,6 +169,7 @@ class HostedComponent(HostedProcess):
             state_dir=str(self._folder),
             run_dir=str(self._folder),
             simulated=True,
+            problems=self.problems,
         )
         context = ProcessContext(
             launch,
@@ -179,10 +181,12 @@ class HostedComponent(HostedProcess):
         )
         return self._make().run_process(context)
 
-    def cut(self) -> None:
-        """Break its connections, which are then reopened."""
+    def cut(self, for_s: float = 0.0) -> None:
+        """Break the connections, which are reopened after about `for_s`."""
+        self._weather.reconnect_s, before_s = max(for_s, self._weather.reconnect_s), self._weather.reconnect_s
         self._line.cut()
         self._feed.cut()
+        self._weather.reconnect_s = before_s
 
     # --- what comes ---
 
@@ -208,7 +212,7 @@ class HostedComponent(HostedProcess):
         self._put(CaughtUp(SOURCE))
 
     def killed(self, feed: Feed) -> None:
-        self._put(KillReceived())
+        self._put(Killed())
 
     def _put(self, incoming: Incoming) -> None:
         self._inbox.append(incoming)
@@ -236,11 +240,11 @@ class HostedComponent(HostedProcess):
 class MemoryPort:
     """See `afspm.transport.port.Port`."""
 
-    def __init__(self, host: HostedComponent) -> None:
+    def __init__(self, host: ComponentProcess) -> None:
         self._host = host
 
     @property
-    def clock(self) -> Timeline:
+    def clock(self) -> SimulatedTime:
         return self._host.timeline
 
     def send(self, frames: Sequence[bytes]) -> None:
@@ -262,7 +266,7 @@ class MemoryPort:
         """There is nothing to close: connections belong to the process."""
 
 
-class HostedTranslator(HostedProcess):
+class TranslatorProcess(BlockingProcess):
     """A `Driver`, made for every life, behind the real `Translator`.
 
     Args:
@@ -272,7 +276,7 @@ class HostedTranslator(HostedProcess):
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         make: Callable[[], Driver],
         folder: Path,
         *,
@@ -353,11 +357,11 @@ class HostedTranslator(HostedProcess):
 class MemoryServerPort:
     """See `afspm.transport.port.ServerPort`."""
 
-    def __init__(self, host: HostedTranslator) -> None:
+    def __init__(self, host: TranslatorProcess) -> None:
         self._host = host
 
     @property
-    def clock(self) -> Timeline:
+    def clock(self) -> SimulatedTime:
         return self._host.timeline
 
     def poll(self, timeout_s: float | None) -> list[Served]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from afspm.model import Packet, Request, Response
-from tests.simulation.timeline import Timeline
+from afspm.testing.components.simulated_time import SimulatedTime
 
 Deliver = Callable[..., None]
 
@@ -43,7 +43,7 @@ class Host(Protocol):
 class Pipe:
     """One direction of a line: first in, first out."""
 
-    def __init__(self, timeline: Timeline, weather: Weather, receiver: Host) -> None:
+    def __init__(self, timeline: SimulatedTime, weather: Weather, receiver: Host) -> None:
         self._timeline = timeline
         self._weather = weather
         self._receiver = receiver
@@ -66,7 +66,7 @@ class Pipe:
             self._receiver.take(do, *args)
 
 
-class ControlServer(Host, Protocol):
+class LineServer(Host, Protocol):
     """Answers requests: scheduler or translator."""
 
     def peer_connected(self, line: ControlLine) -> None: ...
@@ -74,7 +74,7 @@ class ControlServer(Host, Protocol):
     def peer_asked(self, line: ControlLine, request: Request, number: int) -> None: ...
 
 
-class ControlClient(Host, Protocol):
+class LineClient(Host, Protocol):
     """Sends requests."""
 
     def line_up(self, line: ControlLine) -> None: ...
@@ -94,10 +94,10 @@ class ControlLine:
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         weather: Weather,
-        client: ControlClient,
-        server: ControlServer,
+        client: LineClient,
+        server: LineServer,
         name: str,
         *,
         doubling: bool = True,
@@ -168,14 +168,14 @@ class ControlLine:
         self._back.send(self._client.line_up, self)
 
 
-class Publisher(Host, Protocol):
+class PacketSource(Host, Protocol):
     """Publishes packets, and keeps them for late joiners."""
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]: ...
     def left(self, feed: Feed) -> None: ...
 
 
-class Listener(Host, Protocol):
+class FeedListener(Host, Protocol):
     """Subscribes to packets."""
 
     def since_ns(self, feed: Feed) -> int: ...
@@ -189,10 +189,10 @@ class Feed:
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: SimulatedTime,
         weather: Weather,
-        listener: Listener,
-        publisher: Publisher,
+        listener: FeedListener,
+        publisher: PacketSource,
         prefixes: Sequence[str] = ("",),
     ) -> None:
         self._timeline = timeline
@@ -255,7 +255,7 @@ class Feed:
         self._joined = True
 
 
-def _fall_silent(timeline: Timeline, pipes: Sequence[Pipe | None]) -> None:
+def _fall_silent(timeline: SimulatedTime, pipes: Sequence[Pipe | None]) -> None:
     for pipe in timeline.random.choice((pipes, pipes[:1], pipes[1:])):
         if pipe is not None:
             pipe.silent = True

@@ -1,0 +1,56 @@
+"""The planned work of a run beside the measured work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from afspm.basics.clock import NS_PER_S
+from afspm.model.planned_work import PlannedWork, path_length_m
+from afspm.record.tables import ScanRow, SpectrumRow
+
+
+@dataclass(frozen=True)
+class WorkComparison:
+    """The planned and the measured work of a component; the measured duration includes interruptions."""
+
+    name: str
+    planned: PlannedWork
+    measured: PlannedWork
+
+
+def compare(
+    planned: Mapping[str, Mapping[str, object]], scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]
+) -> list[WorkComparison]:
+    """Return the comparison of each component with a plan.
+
+    Args:
+        planned: as in run.json.
+        scans, spectra: all of the run; each counts if it began while the component was in control.
+    """
+    all_scans, all_spectra = list(scans), list(spectra)
+    return [
+        WorkComparison(
+            name,
+            PlannedWork.from_dict(data),
+            _measured(
+                [scan for scan in all_scans if scan.holder == name and not scan.interrupted],
+                [spectrum for spectrum in all_spectra if spectrum.holder == name],
+            ),
+        )
+        for name, data in planned.items()
+    ]
+
+
+def _measured(scans: list[ScanRow], spectra: list[SpectrumRow]) -> PlannedWork:
+    rows: list[ScanRow | SpectrumRow] = [*scans, *spectra]
+    began_ns = min((row.time_ns if row.began_ns is None else row.began_ns for row in rows), default=0)
+    lasted_ns = max((row.time_ns for row in rows), default=0) - began_ns
+    seen = [(scan.region, scan.shape) for scan in scans if scan.region is not None and scan.shape is not None]
+    return PlannedWork(
+        scans=len(scans),
+        spectra=len(spectra),
+        path_m=sum(path_length_m(region, shape[0]) for region, shape in seen),
+        pixels=sum(shape[0] * shape[1] for _, shape in seen),
+        duration_s=lasted_ns / NS_PER_S,
+    )

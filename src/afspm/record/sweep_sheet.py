@@ -1,0 +1,138 @@
+"""The contact sheet of a sweep: its scans beside each other, labelled by the swept parameters, for the report."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import FileError
+from afspm.basics.formatting import scale, typeset
+from afspm.model import Scan
+from afspm.model.line_levelling import flattened
+from afspm.record.drawing.raster import reduced, shared_range
+from afspm.record.report.pictures import topography
+from afspm.record.run import Run
+from afspm.record.tables import ScanRow, SweptSetting
+
+MOST: Final = 600
+_LARGEST_PX: Final = 160
+_PANEL_IN, _GAP_IN, _TEXT = 1.15, 0.06, 7.5
+_TOP_IN, _BOTTOM_IN, _RIGHT_IN, _CHARACTER_IN = 0.85, 0.12, 0.85, 0.068
+_log = logging.getLogger("afspm.report")
+Values = tuple[object, ...]
+
+
+def draw(run: Run, title: str) -> None:
+    """Draw `sweep.png` into the folder of a run with scans of a sweep; a second sweep has a number in its name."""
+    swept: dict[tuple[str, ...], list[ScanRow]] = {}
+    for row in run.scans:
+        if row.settings and row.file and not row.interrupted:
+            swept.setdefault(tuple(one.column for one in row.settings), []).append(row)
+    for number, rows in enumerate(swept.values(), 1):
+        if len(rows) > MOST:
+            _log.warning("a sweep of %d scans has no contact sheet: at most %d fit", len(rows), MOST)
+            continue
+        scans = [(row.settings, scan) for row in rows if (scan := _scan(run, row)) is not None]
+        if scans:
+            draw_sheet(scans, run.folder / (f"sweep_{number}.png" if number > 1 else "sweep.png"), title)
+
+
+def _scan(run: Run, row: ScanRow) -> Scan | None:
+    try:
+        scans = run.scan(row)
+    except FileError as error:
+        _log.warning("scan %d is missing on the contact sheet of its sweep: %s", row.number, error)
+        return None
+    return scans[topography(scans)]
+
+
+def draw_sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], path: Path, title: str) -> None:
+    """Draw scans in rows and columns by their settings: the last parameter along a row, all others down the rows.
+
+    All have one range of colours. Of two scans with the same settings the later one is drawn.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from afspm.record.plotting import draw_scale_bar, gold
+
+    across, down = _sorted(one[-1:] for one, _ in scans), _sorted(one[:-1] for one, _ in scans)
+    last, others = scans[0][0][-1], scans[0][0][:-1]
+    left_in = 0.2 + _CHARACTER_IN * max([0, *(len(_label(row)) for row in down), len(_names(others))])
+    pitch_in = _PANEL_IN + _GAP_IN
+    width_in = left_in + max(len(across) * pitch_in, 2.4) + _RIGHT_IN
+    height_in = _TOP_IN + len(down) * pitch_in + _BOTTOM_IN
+    figure = Figure(figsize=(width_in, height_in), facecolor="white")
+    FigureCanvasAgg(figure)
+
+    def text(x_in: float, y_in: float, words: str, **how: Any) -> None:
+        figure.text(x_in / width_in, 1 - y_in / height_in, words, fontsize=_TEXT, **how)
+
+    text(0.1, 0.2, title, va="center", weight="bold")
+    text(left_in, 0.46, last.name, va="center", style="italic")
+    text(left_in - 0.1, 0.46, _names(others), va="center", ha="right", style="italic")
+    for column, settings in enumerate(across):
+        text(left_in + column * pitch_in + _PANEL_IN / 2, 0.72, _label(settings), va="center", ha="center")
+    for row, settings in enumerate(down):
+        y_in = _TOP_IN + row * pitch_in + _PANEL_IN / 2
+        text(left_in - 0.1, y_in, _label(settings), va="center", ha="right")
+    pictures = {one: (scan, _picture(scan)) for one, scan in scans}
+    span = shared_range([picture for _, picture in pictures.values()])
+    for settings, (scan, picture) in pictures.items():
+        place = (across.index(settings[-1:]), down.index(settings[:-1]))
+        x_in, y_in = left_in + place[0] * pitch_in, _TOP_IN + place[1] * pitch_in
+        axes = figure.add_axes(
+            (x_in / width_in, 1 - (y_in + _PANEL_IN) / height_in, _PANEL_IN / width_in, _PANEL_IN / height_in)
+        )
+        axes.set_facecolor("0.6")  # not measured
+        width_m, height_m = scan.region.size_m
+        axes.imshow(
+            np.ma.masked_invalid(picture), cmap=gold(), vmin=span.low, vmax=span.high, origin="lower",
+            extent=(0.0, width_m, 0.0, height_m), interpolation="nearest",
+        )  # fmt: skip
+        axes.set_xlim(0.0, width_m)
+        axes.set_ylim(0.0, height_m)
+        axes.set_xticks([])
+        axes.set_yticks([])
+        is_first = place == (0, len(down) - 1)
+        draw_scale_bar(axes, scan.region.size_m, (0.0, 0.0), 1.0, font=_TEXT, named=is_first)
+    scan = scans[0][1]
+    factor, unit = scale(max(abs(span.low), abs(span.high)), scan.unit)
+    tall_in = min(2.0 * pitch_in, len(down) * pitch_in) - _GAP_IN
+    bar = figure.add_axes(
+        ((left_in + len(across) * pitch_in + 0.05) / width_in, 1 - (_TOP_IN + tall_in) / height_in,
+         0.1 / width_in, tall_in / height_in)
+    )  # fmt: skip
+    drawn = figure.colorbar(figure.axes[0].images[0], cax=bar)
+    drawn.ax.yaxis.set_major_formatter(lambda value, _: f"{value * factor:.3g}".replace("-", "−"))
+    drawn.ax.tick_params(labelsize=_TEXT)
+    drawn.set_label(f"{scan.channel} / {unit}" if unit else scan.channel, fontsize=_TEXT)
+    figure.savefig(path, dpi=200)
+
+
+def _picture(scan: Scan) -> NDArray[np.float64]:
+    return reduced(flattened(scan.values), _LARGEST_PX)
+
+
+def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSetting, ...]]:
+    """Return different settings, numbers rising, all else in the order in which it came."""
+    found = list(dict.fromkeys(settings))
+    seen: list[Any] = [one.value for each in found for one in each]
+
+    def rank(one: SweptSetting) -> float:
+        return float(one.value) if isinstance(one.value, int | float) else float(seen.index(one.value))
+
+    return sorted(found, key=lambda each: tuple(map(rank, each)))
+
+
+def _names(settings: tuple[SweptSetting, ...]) -> str:
+    return ", ".join(one.name for one in settings)
+
+
+def _label(settings: tuple[SweptSetting, ...]) -> str:
+    return ", ".join(typeset(one.text) for one in settings)

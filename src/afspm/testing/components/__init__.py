@@ -1,0 +1,1 @@
+"""One component in one process: real decisions, a simulated microscope, a fake clock, an in-memory network."""

@@ -1,0 +1,336 @@
+"""`Bench`: a component under test, with everything else of an experiment around it, in one process."""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from afspm import wire
+from afspm.basics.errors import ConfigError
+from afspm.basics.exit_codes import ExitCode
+from afspm.basics.units import si
+from afspm.client.component import Component
+from afspm.client.loop import ComponentLoop
+from afspm.model import (
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    ControlState,
+    Packet,
+    ProblemNames,
+    Request,
+    Response,
+    Scan,
+    ScanSet,
+)
+from afspm.scheduler.events import Effect, Input, Publish
+from afspm.scheduler.safety.limits import ExperimentLimits
+from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.wire_codec import WireCodec
+from afspm.simulation.simulator import Simulator
+from afspm.testing.components.hosted_processes import ComponentProcess, TranslatorProcess
+from afspm.testing.components.memory_network import ControlLine, Weather
+from afspm.testing.components.scheduler_host import SchedulerHost
+from afspm.testing.components.simulated_process import Process
+from afspm.testing.components.simulated_time import SimulatedTime
+from afspm.transport.process.context import ProcessContext
+
+Time = str | float
+"""Experiment time: text with a unit ("20 min"), or seconds."""
+
+_RESTART_S = 1.0
+_SETTLE_S = 0.5
+
+
+class Bench:
+    """A component under test with the real scheduler decisions, a simulated microscope and a fake clock.
+
+    ::
+
+        bench = Bench(MyComponent(), microscope={"surface": "steps"})
+        bench.run(until="2 h")
+        assert len(bench.scans) == 4
+
+    A component that ends with an error raises that error from `run`.
+
+    Args:
+        component: under test, as its constructor returns it. Each life runs a copy.
+        others: more components by name, such as one that takes the scans.
+        microscope: settings of the simulated microscope, as in the experiment file.
+        problems: problems of your own, names and numbers, as in the experiment file.
+        limits: of the scheduler.
+        folder: for saved state and scans; None: a temporary one.
+        seed: the same seed gives the same run.
+        dies_in_call: the chance that the component is killed at a call to the network.
+
+    Attributes:
+        packets: all packets that the scheduler published, oldest first.
+    """
+
+    def __init__(
+        self,
+        component: Component,
+        *,
+        others: Mapping[str, Component] | None = None,
+        microscope: Mapping[str, Any] | None = None,
+        problems: Mapping[str, int] | None = None,
+        limits: ExperimentLimits | None = None,
+        folder: Path | None = None,
+        seed: int = 1,
+        dies_in_call: float = 0.0,
+    ) -> None:
+        self._temporary = TemporaryDirectory(prefix="afspm-bench-") if folder is None else None
+        self.folder = Path(self._temporary.name) if self._temporary else Path(folder or "")
+        self.name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(component).__name__).lower()
+        if self.name in (others or {}):
+            raise ConfigError(f"two components have the name {self.name!r}", hint="rename the one in `others`")
+        self.packets: list[Packet] = []
+        self._times = {self.name: _Life(), **{name: _Life() for name in others or {}}}
+        self._problems, self._named = ProblemNames(problems), dict(problems or {})
+        self._time = time = SimulatedTime(seed)
+        self._weather = Weather()
+        settings = SchedulerSettings(limits=limits or ExperimentLimits())
+        settings = replace(settings, rules=settings.control.rules(self._problems), watchdog=settings.control.watchdog())
+        self._scheduler = SchedulerHost(
+            time, self._weather, settings, WireCodec(), lambda one: wire.header(one.envelope, one.payload), self
+        )
+        self._scheduler.writes_ahead = True
+        given = dict(microscope or {})
+        self._translator = _BenchTranslator(time, lambda: _BenchSimulator(**copy.deepcopy(given)), self.folder)
+        self._scheduler.translator = (self._translator, self._translator)
+        self._components = {
+            name: self._process(name, one, dies_in_call if name == self.name else 0.0)
+            for name, one in {self.name: component, **(others or {})}.items()
+        }
+        self._person = _Person(time, self._weather, self._scheduler)
+        self._processes: dict[str, Process] = {
+            "translator": self._translator,
+            "scheduler": self._scheduler,
+            "person": self._person,
+            **self._components,
+        }
+        self._running = False
+        for process in self._processes.values():
+            process.exited = lambda code, process=process: self._exited(process, code)  # type: ignore[misc]
+            process.start()
+
+    def _process(self, name: str, component: Component, dies_in_call: float) -> ComponentProcess:
+        life = self._times[name]
+
+        def make() -> Component:
+            life.component = made = copy.deepcopy(component)
+            made.run_process = life.run  # type: ignore[method-assign]
+            return made
+
+        process = ComponentProcess(
+            self._time, Weather(), self._scheduler, name, make, self.folder, dies_in_call=dies_in_call
+        )
+        process.problems = self._named
+        return process
+
+    # --- running ---
+
+    @property
+    def now_s(self) -> float:
+        """Experiment time since the start, in s."""
+        return self._time.monotonic_s()
+
+    def run(self, *, until: Time) -> None:
+        """Run until an experiment time since the start.
+
+        Raises:
+            Exception: the error that a component ended with.
+        """
+        until_s = _seconds(until)
+        if until_s < self.now_s:
+            raise ConfigError(f"{until} has passed: it is {self.now_s:.0f} s after the start", where="Bench.run")
+        self._go_to(until_s)
+
+    def at(self, when: Time, do: Callable[..., None], *args: Any) -> None:
+        """Call `do(*args)` at an experiment time since the start: `bench.at("20 min", bench.kill)`."""
+        self._time.at(max(_seconds(when), self.now_s), do, args)
+
+    def _go_to(self, until_s: float) -> None:
+        self._running = True
+        try:
+            self._time.run_until(until_s)
+        finally:
+            self._running = False
+        for process in (*self._components.values(), self._translator):
+            if isinstance(process.ended_with, Exception):
+                error, process.ended_with = process.ended_with, None
+                raise error
+
+    def _settle(self) -> None:
+        """Let a fault reach the component, unless the fault was planned by `at`."""
+        if not self._running:
+            self._go_to(self.now_s + _SETTLE_S)
+
+    # --- faults ---
+
+    def flag(self, problem: str | int) -> None:
+        """Flag a problem, as another component does."""
+        self._ask(ControlRequest.ADD_EXP_PRBLM, self._problems.number(problem))
+
+    def clear(self, problem: str | int) -> None:
+        """Clear a problem, as its solver does."""
+        self._ask(ControlRequest.RMV_EXP_PRBLM, self._problems.number(problem))
+
+    def set_mode(self, mode: ControlMode) -> None:
+        """Set the mode, as a person does: MANUAL takes control from the component."""
+        self._ask(ControlRequest.SET_CONTROL_MODE, int(mode))
+
+    def kill(self, name: str = "", *, restarts: bool = True) -> None:
+        """Kill the component, or another process by name ("scheduler", "translator").
+
+        It starts again after a second with its saved state, unless `restarts` is False.
+        """
+        if (process := self._processes.get(name or self.name)) is None:
+            raise ConfigError(f"there is no process {name!r}", hint=f"there are {', '.join(self._processes)}")
+        process.banned = not restarts
+        process.kill()
+        self._settle()
+
+    def lose_connection(self, for_time: Time = 0.0) -> None:
+        """Break the connections of the component; they are made again after `for_time`."""
+        self._components[self.name].cut(_seconds(for_time))
+        self._settle()
+
+    def refuse(self, subject: str, *, times: int = 1, reason: str = "refused by the bench") -> None:
+        """Have the microscope refuse the next requests of an action ("start-scan") or of a parameter."""
+        self._translator.refusals[subject] = (times, reason)
+
+    def _ask(self, kind: ControlRequest, subject: object) -> None:
+        self._person.ask(Request(kind, subject, wire.encode_request(Request(kind, subject))[-1]))
+        self._settle()
+
+    # --- results ---
+
+    @property
+    def scans(self) -> list[ScanSet]:
+        """All scans that were published, each with its channels."""
+        found: dict[str, list[Scan]] = {}
+        for packet in self.packets:
+            if packet.envelope.startswith("Scan2d"):
+                scan = wire.decode("Scan2d", packet.payload)
+                found.setdefault(scan.filename or str(scan.time_ns), []).append(scan)
+        return [ScanSet(scans) for scans in found.values()]
+
+    @property
+    def component(self) -> Any:
+        """The component in its current or last life."""
+        return self._times[self.name].component
+
+    @property
+    def memory(self) -> dict[str, Any]:
+        """The memory of the component."""
+        return dict(self.component.memory)
+
+    @property
+    def is_done(self) -> bool:
+        """True once the component has returned from `run`, or has ended with the experiment."""
+        return self._components[self.name].ended_with in (ExitCode.DONE, ExitCode.ENDED)
+
+    @property
+    def control_state(self) -> ControlState:
+        """Mode, holder and problems, as the scheduler decides them."""
+        return self._scheduler.core.control.published()
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """Names of the problems that are flagged."""
+        return tuple(map(self._problems.name, self.control_state.problems))
+
+    # --- for the processes ---
+
+    def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
+        """See `StepObserver`."""
+
+    def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
+        """Keep each packet that the scheduler publishes."""
+        if isinstance(effect, Publish):
+            self.packets.append(effect.packet)
+
+    def _exited(self, process: Process, code: int) -> None:
+        if code in (ExitCode.DONE, ExitCode.ENDED) or process.banned:
+            return
+        if isinstance(process, (ComponentProcess, TranslatorProcess)) and isinstance(process.ended_with, Exception):
+            return  # `run` raises it
+        self._time.after(_RESTART_S, process.start)
+
+
+class _Life:
+    """The lives of one component: the newest is at hand, and its errors are not turned into exit codes."""
+
+    component: Component | None = None
+
+    def run(self, context: ProcessContext) -> int:
+        assert self.component is not None
+        return _RaisingLoop(self.component, Component, context).run()
+
+
+class _RaisingLoop(ComponentLoop):
+    def _fail(self, error: Exception, state_dir: Path) -> ExitCode:
+        raise error
+
+
+class _BenchSimulator(Simulator):
+    def run_drawing(self, work: Callable[[], None]) -> None:
+        work()  # in this thread: the same seed gives the same run
+
+
+class _BenchTranslator(TranslatorProcess):
+    """A translator that refuses on demand. What it has to refuse outlives a kill."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        super().__init__(*args, **settings)
+        self.refusals: dict[str, tuple[int, str]] = {}
+
+    def peer_asked(self, line: ControlLine, request: Request, number: int) -> None:
+        subject = getattr(request.subject, "name", request.subject)
+        left, reason = self.refusals.get(subject, (0, "")) if isinstance(subject, str) else (0, "")
+        if left and request.kind != ControlRequest.ACTION_SUPPORT:
+            self.refusals[subject] = (left - 1, reason)
+            line.answer(Response(int(ControlResponse.FAILURE), b"", reason, request.id), number)
+        else:
+            super().peer_asked(line, request, number)
+
+
+class _Person(Process):
+    """Sends requests, once each, and waits for the connection if there is none."""
+
+    def __init__(self, time: SimulatedTime, weather: Weather, scheduler: SchedulerHost) -> None:
+        super().__init__(time, "person")
+        self._weather, self._scheduler = weather, scheduler
+        self._unsent: list[Request] = []
+        self._asked = 0
+
+    def begin(self) -> None:
+        self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
+
+    def ask(self, request: Request) -> None:
+        self._asked += 1
+        request.id = f"person/{self._asked}"
+        self._unsent.append(request)
+        self.line_up(self._line)
+
+    def line_up(self, line: ControlLine) -> None:
+        if self._line.up:
+            unsent, self._unsent = self._unsent, []
+            for request in unsent:
+                self._line.ask(request)
+
+    def line_down(self, line: ControlLine) -> None:
+        """The line is made again by itself."""
+
+    def answered(self, line: ControlLine, number: int, response: Response) -> None:
+        """The state that the scheduler publishes shows the effect."""
+
+
+def _seconds(time: Time) -> float:
+    return si(time, "s")

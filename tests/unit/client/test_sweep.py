@@ -1,0 +1,178 @@
+"""A sweep measures each point once with its parameters in force, and sets them back, whatever is killed or lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import pytest
+from tests.unit.client.client_lab import SCAN_S, SOURCE, Kill9, Lab, LabPort
+
+from afspm import wire
+from afspm.basics.errors import InvalidValue, Refused
+from afspm.client.experiment_link import ExperimentLink
+from afspm.client.scope import Scope
+from afspm.model import ControlRequest, ControlResponse, MeasurementSettings, Parameter, Problem, Request, Response
+from afspm.model.sweep_plan import SweptValues
+from afspm.scheduler.control.arbitration import ArbitrationEvent
+
+SWEPT: dict[str, SweptValues] = {"tip-bias-voltage": ["0.1 V", "0.2 V"], "zctrl-igain": [1, 2]}
+SNAKE = [("0.1", "1"), ("0.1", "2"), ("0.2", "2"), ("0.2", "1")]
+TWO_POINTS: dict[str, SweptValues] = {"tip-bias-voltage": ["0.1 V", "0.2 V"], "zctrl-igain": [1]}
+BEFORE = ("0.5", "7")
+
+
+class SweepLab(Lab):
+    """Notes the parameters in force when each scan or spectrum ends."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values["zctrl-igain"] = BEFORE[1]
+        self.measured: list[tuple[str, str]] = []
+
+    @property
+    def in_force(self) -> tuple[str, str]:
+        return self.values["tip-bias-voltage"], self.values["zctrl-igain"]
+
+    def _finish_scan(self) -> None:
+        self.measured.append(self.in_force)
+        super()._finish_scan()
+
+    def _finish_spectrum(self) -> None:
+        self.measured.append(self.in_force)
+        super()._finish_spectrum()
+
+
+def scope_of(lab: Lab, folder: Path | None = None, life: int = 0, port: LabPort | None = None) -> Scope:
+    return Scope(ExperimentLink(port or LabPort(lab), lab.name, source=SOURCE, session=str(life)), state_dir=folder)
+
+
+def sweep(scope: Scope, key: str | None = "gains", swept: dict[str, SweptValues] = SWEPT) -> list[Any]:
+    with scope.sweep(swept, shape=(8, 8), key=key) as points:
+        return list(points)
+
+
+def test_each_point_is_measured_with_its_parameters_in_force_and_they_are_set_back() -> None:
+    lab = SweepLab()
+    points = sweep(scope_of(lab), key=None)
+    assert lab.measured == SNAKE
+    assert lab.in_force == BEFORE
+    assert [point.values["tip-bias-voltage"] for point in points] == [0.1, 0.1, 0.2, 0.2]
+    assert [(point.number, point.of) for point in points] == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert lab.control.holder is None
+    assert lab.count(ControlRequest.REQUEST_CTRL) == 1, "control is kept over all points"
+
+
+def test_spectra_are_swept_too() -> None:
+    lab = SweepLab()
+    with scope_of(lab).sweep(SWEPT, measure="spectrum", at=(1e-7, 0.0), kind="IV") as points:
+        assert [point.spectrum.kind for point in points] == ["IV"] * 4
+    assert lab.measured == SNAKE
+    assert lab.in_force == BEFORE
+
+
+@pytest.mark.parametrize("is_noticed", [True, False])
+@pytest.mark.parametrize("is_late", [True, False])
+def test_killed_at_any_step_each_point_is_measured_once_and_the_parameters_are_set_back(
+    *, is_late: bool, is_noticed: bool
+) -> None:
+    for deadly_call in range(1, 1000):
+        lab = SweepLab()
+        with TemporaryDirectory() as folder:
+            try:
+                sweep(scope_of(lab, Path(folder), 0, LabPort(lab, deadly_call, is_late=is_late)), swept=TWO_POINTS)
+                break  # survived: all steps were tried
+            except Kill9:
+                pass
+            if is_noticed:
+                lab.does(ArbitrationEvent.DEAD, lab.name)
+            lab.restart_component()
+            assert len(sweep(scope_of(lab, Path(folder), 1), swept=TWO_POINTS)) == 2
+        assert lab.measured == [("0.1", "1"), ("0.2", "1")], f"killed at call {deadly_call}"
+        assert lab.in_force == BEFORE, f"killed at call {deadly_call}"
+    assert deadly_call > 30
+
+
+def test_parameters_that_others_changed_while_control_was_lost_are_set_again() -> None:
+    lab = SweepLab()
+
+    def repair() -> None:
+        lab.flag(Problem.TIP_SHAPE_CHANGED)
+        lab.values["tip-bias-voltage"] = "3.0"
+
+    lab.at(1.5 * SCAN_S, repair)
+    lab.at(3.0 * SCAN_S, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    points = sweep(scope_of(lab), key=None)
+    assert lab.measured == SNAKE
+    assert [len(point.scans.interruptions) for point in points] == [0, 1, 0, 0]
+    assert lab.in_force == BEFORE
+
+
+@pytest.mark.parametrize("leave", [lambda lab: lab.ctrl_c(), None])
+def test_parameters_are_set_back_however_the_block_ends(leave: Callable[[Lab], None] | None) -> None:
+    lab = SweepLab()
+    if leave is not None:
+        lab.at(1.5 * SCAN_S, lambda: leave(lab))
+
+    def look(scope: Scope) -> None:
+        with scope.sweep(SWEPT) as points:
+            for point in points:
+                if leave is None and point.number == 2:
+                    raise ZeroDivisionError
+
+    with pytest.raises((KeyboardInterrupt, ZeroDivisionError)):
+        look(scope_of(lab))
+    assert lab.in_force == BEFORE
+    assert lab.control.holder is None
+
+
+def test_a_refused_value_ends_the_sweep_and_the_parameters_are_set_back() -> None:
+    lab = SweepLab()
+
+    def limit(request: Request) -> Response | str:
+        is_above = isinstance(request.subject, Parameter) and request.subject.value == "0.2"
+        return Response(ControlResponse.PARAM_ERROR, reason="above 0.15 V") if is_above else "go on"
+
+    lab.intercept = limit
+    with pytest.raises(Refused, match=r"above 0\.15 V"):
+        sweep(scope_of(lab))
+    assert lab.measured == SNAKE[:2]
+    assert lab.in_force == BEFORE
+
+
+def test_a_value_that_can_not_be_set_back_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    lab = SweepLab()
+
+    def limit(request: Request) -> Response | str:
+        is_before = isinstance(request.subject, Parameter) and request.subject.value == BEFORE[0]
+        return Response(ControlResponse.PARAM_ERROR, reason="only below 0.3 V") if is_before else "go on"
+
+    lab.intercept = limit
+    sweep(scope_of(lab))
+    assert lab.in_force == ("0.2", BEFORE[1])
+    assert "tip-bias-voltage 0.5 V stays as the sweep has set it" in caplog.text
+    assert "only below 0.3 V" in caplog.text
+
+
+def test_the_settings_are_published_before_each_measurement_and_their_end_too() -> None:
+    lab = SweepLab()
+    sweep(scope_of(lab))
+    messages = [wire.decode(one.message, one.payload) for one in lab.told("MeasurementSettings")]
+    assert all(isinstance(one, MeasurementSettings) and one.who == lab.name for one in messages)
+    assert [tuple(p.value for p in one.parameters) for one in messages] == [*SNAKE, ()]
+    assert [one.key for one in messages] == ["gains-1", "gains-2", "gains-3", "gains-4", ""]
+
+
+def test_a_key_with_other_values_is_refused_before_anything_is_set(tmp_path: Path) -> None:
+    lab = SweepLab()
+    sweep(scope_of(lab, tmp_path))
+    lab.restart_component()
+    with (
+        pytest.raises(InvalidValue, match="was used for another measurement"),
+        scope_of(lab, tmp_path, 1).sweep({"zctrl-igain": [3]}, shape=(8, 8), key="gains") as points,
+    ):
+        list(points)
+    assert len(lab.measured) == 4
+    assert lab.in_force == BEFORE

@@ -1,0 +1,86 @@
+"""The component `Sweep` in the laboratory in memory: its settings, its kills and its refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tests.unit.client.client_lab import Kill9, Lab, LabPort, context_of, run
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.exit_codes import ExitCode
+from afspm.components.sweep import Sweep
+from afspm.experiment.planned_measurements import plan_of, refusals
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+
+BIAS = {"tip-bias-voltage": ["0.1 V", "0.2 V", "0.3 V"]}
+
+
+def sweep(parameters: dict[str, Any] = BIAS, **given: Any) -> Sweep:
+    return Sweep(parameters, end_when_done=True, **given)
+
+
+def test_sweep_measures_each_point_sets_back_and_ends_the_experiment() -> None:
+    lab = Lab("sweep")
+    assert run(sweep(), lab) == ExitCode.ENDED
+    assert lab.begun_scans == 3
+    assert lab.values["tip-bias-voltage"] == "0.5"
+
+
+def life(lab: Lab, folder: Path, session: str, component: Sweep, deadly_call: int = 0) -> int:
+    context = context_of(lab, folder)
+    context.session = session
+    context.open_port = lambda: LabPort(lab, deadly_call)
+    return component.run_process(context)
+
+
+def test_killed_sweep_measures_only_the_remaining_points(tmp_path: Path) -> None:
+    for deadly_call in range(5, 40, 3):
+        lab, folder = Lab("sweep"), tmp_path / str(deadly_call)
+        with pytest.raises(Kill9):
+            life(lab, folder, "0", sweep(), deadly_call)
+        lab.restart_component()
+        assert life(lab, folder, "1", sweep()) == ExitCode.ENDED
+        assert lab.begun_scans == 3, deadly_call
+        assert lab.values["tip-bias-voltage"] == "0.5", deadly_call
+        assert not list((folder / "sweep.results").glob("*")), "what is kept of each point is removed"
+
+
+def test_sweep_refuses_other_values_than_it_was_begun_with(tmp_path: Path) -> None:
+    lab = Lab("sweep")
+    with pytest.raises(Kill9):
+        life(lab, tmp_path, "0", sweep(), 35)
+    lab.restart_component()
+    begun = lab.begun_scans
+    with pytest.raises(ConfigError, match="begun with other values"):
+        life(lab, tmp_path, "1", sweep({"tip-bias-voltage": ["0.1 V", "0.4 V"]}))
+    assert lab.begun_scans == begun
+
+
+@pytest.mark.parametrize(
+    ("given", "where"),
+    [
+        ({"kind": "IV"}, "kind"),
+        ({"at": (0.0, 0.0)}, "at"),
+        ({"measure": "spectrum", "size": (1e-6, 1e-6)}, "size"),
+        ({"center": (0.0, 0.0)}, "center"),
+        ({"parameters": {}}, "parameters"),
+        ({"parameters": {"tip-bias-voltage": ["1 nm"]}}, "parameters.tip-bias-voltage"),
+        ({"parameters": {"scan-size-x": ["1 nm"]}, "size": (1e-6, 1e-6)}, "parameters.scan-size-x"),
+        ({"parameters": {"scan-resolution-x": [64]}, "pixels": (8, 8)}, "parameters.scan-resolution-x"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused_with_their_place(given: dict[str, Any], where: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        Sweep(**({"parameters": BIAS} | given))
+    assert caught.value.where == where
+
+
+def test_check_finds_swept_values_outside_the_limits() -> None:
+    plan = plan_of(Sweep, {"parameters": {"tip-bias-voltage": {"from": 0.1, "to": 3.0, "points": 30}}})
+    assert plan is not None
+    limits = ExperimentLimits(parameters={"tip-bias-voltage": Limit(high=2.5, unit="V")})
+    found = refusals("sweep", plan, limits)
+    assert found
+    assert {one.where for one in found} == {("parameters", "tip-bias-voltage")}
