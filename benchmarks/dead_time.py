@@ -139,7 +139,7 @@ class Script:
 @contextlib.contextmanager
 def script() -> Iterator[Script]:
     """A script that is connected to an emulated controller in another process."""
-    from nanonis_spm import Nanonis  # type: ignore[import-untyped]
+    from nanonis_spm import Nanonis
 
     with tempfile.TemporaryDirectory() as folder, roles() as processes:
         address = processes.start("emulator", vendor="nanonis", folder=folder)

@@ -46,7 +46,8 @@ class _Forked:
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload(IMPORTED)
         (stdin, to_it), (from_it, stderr) = os.pipe(), os.pipe()
-        self.stdin, self.stderr = os.fdopen(to_it, "wb"), os.fdopen(from_it, "rb")
+        self.stdin: IO[bytes] = os.fdopen(to_it, "wb")
+        self.stderr: IO[bytes] = os.fdopen(from_it, "rb")
         with Connection(stdin) as its_stdin, Connection(stderr) as its_stderr:  # these find their way into it
             settings = dict(environment), Path.cwd()
             self._process = context.Process(target=_run, args=(its_stdin, its_stderr, *settings))
@@ -64,6 +65,7 @@ class _Forked:
 
 def _run(stdin: Connection, stderr: Connection, environment: Mapping[str, str], folder: Path) -> None:
     from afspm.supervisor import host
+    from afspm.transport.process.parent import end_within
 
     for number, pipe in ((0, stdin), (2, stderr)):
         with pipe:
@@ -73,5 +75,5 @@ def _run(stdin: Connection, stderr: Connection, environment: Mapping[str, str], 
     os.chdir(folder)
     tempfile.tempdir = None  # the environment says where
     code = int(host.main())
-    host.end_within(host.EXIT_GRACE_S, code)
+    end_within(host.EXIT_GRACE_S, code)
     sys.exit(code)

@@ -325,7 +325,7 @@ def ready(peer: Peer, region: Region = TURNED, shape: tuple[int, int] = SHAPE) -
     peer.until(ScopeState.FREE)
 
 
-def small(made: VendorBench[Any], **settings: object) -> Peer:
+def small(made: VendorBench[Any], **settings: Any) -> Peer:
     """Start a translator that has found the microscope, with a frame of few pixels."""
     peer = made.start(**settings)
     peer.until(ScopeState.FREE)

@@ -12,7 +12,7 @@ import psutil
 import pytest
 
 WINDOWS: Final = sys.platform == "win32"
-WINE: Final = WINDOWS and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
+WINE: Final = sys.platform == "win32" and hasattr(ctypes.WinDLL("ntdll"), "wine_get_version")
 """A Windows Python runs the tests, but Windows' own functions are those of Wine."""
 PATIENCE: Final = 4.0 if WINE else 1.0
 """Factor of timeouts under Wine, where the start of a process takes seconds."""
@@ -20,7 +20,7 @@ KILLED: Final = 1 if WINDOWS else -9
 """The exit code of a process after Popen.kill."""
 KILLED_FROM_OUTSIDE: Final = 15 if WINDOWS else -9
 """The exit code of a process after `kill`."""
-HAS_CONSOLE: Final = not WINDOWS or bool(ctypes.WinDLL("kernel32").GetConsoleWindow())
+HAS_CONSOLE: Final = sys.platform != "win32" or bool(ctypes.WinDLL("kernel32").GetConsoleWindow())
 
 can_interrupt = pytest.mark.skipif(not HAS_CONSOLE, reason="without a console nobody can press Ctrl-C in it")
 

@@ -79,7 +79,7 @@ def test_a_stalled_browser_does_not_delay_others(stage: Stage, browser: Any, pag
     frozen = open_page(browser, stage.url)
     frozen.evaluate("setTimeout(() => { const end = Date.now() + 6000; while (Date.now() < end); }, 0)")
     before, end_s = stage.memory_bytes(), time.monotonic() + 5.0
-    late_ms = []
+    late_ms: list[float] = []
     while time.monotonic() < end_s:
         late_ms.append(latency_ms(page, stage, len(late_ms)))
     assert sorted(late_ms)[len(late_ms) // 2] < 300.0

@@ -137,7 +137,7 @@ def test_adjustable_parameters_are_set_while_a_component_measures(night: Night, 
     with afspm.connect(night.folder, "holder") as scope, scope.control():
         scope.set("scan-speed", "50 nm/s")
         scope.action(names.START_SCAN)
-        night.until(lambda: night.follower.overview.status.state is ScopeState.SCANNING)
+        night.until(lambda: night.state is ScopeState.SCANNING)
         after = seen(night)
         fill(page, "zctrl-setpoint", f"{0.9 * float(number):g} {unit}")
         press(page, "Set")
@@ -145,7 +145,7 @@ def test_adjustable_parameters_are_set_while_a_component_measures(night: Night, 
         assert not night.entry(ADA, "zctrl-setpoint", after=after).refused
         assert night.control().holder == "holder"
         keep(page, "adjusted")
-        assert night.follower.overview.status.state is ScopeState.SCANNING, "the scan goes on"
+        assert night.state is ScopeState.SCANNING, "the scan goes on"
         scope.action(names.STOP_SCAN)
         scope.set("scan-speed", "4 um/s")
 
@@ -256,10 +256,10 @@ def test_a_scan_is_stopped_after_taking_over(night: Night, page: Any) -> None:
     press(page, "Set")
     said(page, "scan-speed is now 50 nm/s")
     press(page, "Scan as set")
-    night.until(lambda: night.follower.overview.status.state is ScopeState.SCANNING)
+    night.until(lambda: night.state is ScopeState.SCANNING)
     press(page, "Stop the scan")
     said(page, "The scan is stopped")
-    night.until(lambda: night.follower.overview.status.state is ScopeState.FREE)
+    night.until(lambda: night.state is ScopeState.FREE)
     assert any(span.label == "interrupted" for span in night.follower.overview.timelines.scope_state.spans)
     fill(page, "scan-speed", "4 um/s")
     press(page, "Set")

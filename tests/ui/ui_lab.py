@@ -13,7 +13,7 @@ from afspm_process import AfspmProcess
 
 from afspm import wire
 from afspm.client.follower import Follower
-from afspm.model import ControlState, JournalEntry, Role
+from afspm.model import ControlState, JournalEntry, Role, ScopeState
 
 DEADLINE_S = 30.0
 Opened = Callable[..., Any]
@@ -82,6 +82,12 @@ class Night(AfspmProcess):
             super().close()
             raise
         self.follower.catch_up()
+
+    @property
+    def state(self) -> ScopeState | None:
+        """The state received last."""
+        status = self.follower.overview.status
+        return None if status is None else status.state
 
     def until(self, condition: Callable[[], object]) -> Any:
         """Receive the scheduler's messages until `condition()`; return its value."""

@@ -191,7 +191,7 @@ def test_asylum_angles_are_clockwise() -> None:
     # Asylum's software calculates the start of a scan with the fast axis along (cos, -sin) of ScanAngle.
     there = {"XOffset": 0.0, "YOffset": 0.0, "FastScanSize": 2e-6, "SlowScanSize": 1e-6, "ScanAngle": 90.0}
     told = generic(there | {"ScanPoints": 8, "ScanLines": 8, "ScanRate": 1.0})
-    corner = (told[names.SCAN_TOP_LEFT_X], told[names.SCAN_TOP_LEFT_Y])
+    corner = (float(told[names.SCAN_TOP_LEFT_X]), float(told[names.SCAN_TOP_LEFT_Y]))
     region = Region.from_top_left(corner, (2e-6, 1e-6), float(told[names.SCAN_ANGLE]))
     first, along = region.corners_m()[:2]
     assert along - first == pytest.approx((0.0, -2e-6), abs=1e-18)
@@ -261,7 +261,7 @@ def test_unreachable_folder_is_a_config_error(monkeypatch: pytest.MonkeyPatch) -
         {"spots": "?"},
     ],
 )
-def test_invalid_settings_are_refused(setting: dict[str, str]) -> None:
+def test_invalid_settings_are_refused(setting: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         Asylum(**setting)
 

@@ -345,6 +345,7 @@ def test_files_are_read_by_igor2(tmp_path: Path) -> None:
     assert wave["bin_header"]["noteSize"] == len(wave["note"])
     assert wave["wData"].shape == (16, 8, len(igor.rig.channels))
     assert wave["labels"][2][1:3] == [b"HeightTrace", b"HeightRetrace"]
+    assert igor.rig.scan is not None
     drawn = igor.rig.scan.channels()["Height"][1]
     np.testing.assert_allclose(wave["wData"][:, :, 0].T, drawn, rtol=1e-6)
     note = wave["note"].split(b"\r")

@@ -28,7 +28,8 @@ class Waves:
         column = self._k.T @ [x_m[:, 0], y_m[:, 0]] + self._phase[:, None]
         row = self._k.T @ [x_m[0] - x_m[0, 0], y_m[0] - y_m[0, 0]]
         height = self._height_m[:, None]
-        return (height * np.cos(column)).T @ np.cos(row) - (height * np.sin(column)).T @ np.sin(row)
+        there: Array = (height * np.cos(column)).T @ np.cos(row) - (height * np.sin(column)).T @ np.sin(row)
+        return there
 
     def at_points(self, xy_m: Array) -> Array:
         """Return heights at any points (..., 2)."""

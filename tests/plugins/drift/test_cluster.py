@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.plugins.drift.test_study_command import SMALL, told
@@ -13,7 +14,7 @@ from afspm.basics.errors import ConfigError
 from afspm.plugins.drift.study.workers import TaskOutcome, on_cluster
 
 pytestmark = pytest.mark.timeout(60)
-NEEDED = {"modname": "distributed", "reason": "needs Dask, the extra `study`"}
+NEEDED: dict[str, Any] = {"modname": "distributed", "reason": "needs Dask, the extra `study`"}
 
 
 @pytest.fixture(scope="module")

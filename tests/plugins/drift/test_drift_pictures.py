@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import errno
 import json
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from afspm.simulation import World
 from afspm.translator.own_files import FileFacts, encode_scan
 
 pytest.importorskip("matplotlib")
-SETTINGS = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (60e-12, -30e-12, 0.0)}}
+SETTINGS: dict[str, Any] = {"surface": {"kind": "particles"}, "drift": {"velocity_m_per_s": (60e-12, -30e-12, 0.0)}}
 PIXELS, EVERY_S, SWITCHED_ON = 48, 600.0, 4
 
 
@@ -75,7 +76,7 @@ def mapping(path: Path, region: Region, middle_s: float, *, correcting: bool) ->
     """Return the mapping of a scheduler that follows the sample without error."""
     velocity = np.array(SETTINGS["drift"]["velocity_m_per_s"][:2])
     drift = velocity * (middle_s - PIXELS / 2)
-    message = wire.message_type("DriftMapping")(
+    message: Any = wire.message_type("DriftMapping")(
         matrix=[1.0, 0.0, -drift[0], 0.0, 1.0, -drift[1]],
         covariance=[1e-18, 0.0, 0.0, 1e-18],
         rate=velocity,
@@ -93,7 +94,7 @@ def night(folder: Path) -> Lab:
     lab = Lab("drift_pictures")
     for k, one in enumerate(saved(folder)):
         told = mapping(*one, correcting=k >= SWITCHED_ON)
-        lab.at(100.0 * (k + 1), lambda told=told: lab.publish(told, "DriftMapping"))  # type: ignore[misc]
+        lab.at(100.0 * (k + 1), partial(lab.publish, told, "DriftMapping"))
     return lab
 
 
@@ -198,7 +199,7 @@ def test_a_missing_channel_is_logged_at_once(tmp_path: Path, caplog: pytest.LogC
     assert "no pictures: only 0 of 9 scans can be read" in caplog.text
 
 
-def true_m(folder: Path, *at: tuple[float, tuple[float, float]]) -> object:
+def true_m(folder: Path, *at: tuple[float, tuple[float, float]]) -> Any:
     """Return the true drift at times and places."""
     places = [(mid_s, Region(center_m, (1e-6, 1e-6))) for mid_s, center_m in at]
     return true_drift(folder, [DriftScan(np.zeros((4, 4)), region, mid_s, mid_s) for mid_s, region in places])
@@ -223,7 +224,7 @@ def test_the_truth_of_a_rotating_sample_depends_on_the_place(tmp_path: Path) -> 
     feature_m = (1e-6 + 3e-6 * np.exp(4e-3) * np.cos(2e-3), 3e-6 * np.exp(4e-3) * np.sin(2e-3))
     moved_m = np.subtract(feature_m, (4e-6, 0.0))
     true = true_m(tmp_path, (100.0, (0.0, 0.0)), (300.0, feature_m), (300.0, (1e-6, 0.0)))
-    np.testing.assert_allclose(true, [(0.0, 0.0), moved_m, (0.0, 0.0)], atol=1e-15)
+    np.testing.assert_allclose(true, [(0.0, 0.0), tuple(moved_m), (0.0, 0.0)], atol=1e-15)
 
 
 def test_a_malformed_truth_is_refused(tmp_path: Path) -> None:

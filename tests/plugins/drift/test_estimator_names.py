@@ -54,6 +54,10 @@ def test_a_right_result_passes_unchanged() -> None:
     assert said(refused) is refused
 
 
+def wrong(**changes: Any) -> Registration:
+    return replace(FOUND, **changes)
+
+
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
@@ -63,7 +67,7 @@ def test_a_right_result_passes_unchanged() -> None:
         (replace(FOUND, displacement_m=np.array([np.nan, 0.0])), "displacement_m"),
         (replace(FOUND, center_m=np.array([np.inf, 0.0])), "center_m"),
         (replace(FOUND, displacement_m=np.zeros(3)), "shape"),
-        (replace(FOUND, linear=(0, 0)), "linear"),
+        (wrong(linear=(0, 0)), "linear"),
         (replace(FOUND, covariance_m2=np.zeros((2, 2))), "covariance"),
         (replace(FOUND, covariance_m2=np.diag([1e-20, -1e-20])), "covariance"),
         (replace(FOUND, covariance_m2=np.array([[1e-20, 9e-21], [0.0, 1e-20]])), "covariance"),
@@ -71,7 +75,7 @@ def test_a_right_result_passes_unchanged() -> None:
         (replace(FOUND, linear=np.diag([-2.0, 0.0])), "mirrored"),
         (replace(FOUND, linear=np.diag([-1.0, 0.0])), "mirrored or flat"),
         (replace(FOUND, linear=np.diag([0.0, 1.5])), "stretched by 2.5"),
-        (replace(FOUND, linear_seen=np.zeros((2, 2))), "instead of a LinearSeen"),
+        (wrong(linear_seen=np.zeros((2, 2))), "instead of a LinearSeen"),
         (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), np.eye(2))), "shapes (2, 2) and (4, 4)"),
         (replace(FOUND, linear_seen=LinearSeen(np.full((2, 2), np.nan), np.eye(4))), "finite"),
         (replace(FOUND, linear_seen=LinearSeen(np.zeros((2, 2)), -np.eye(4))), "invalid covariance"),

@@ -60,8 +60,10 @@ def test_the_displacement_is_in_tip_coordinates_for_a_frame_that_follows_the_dri
 def test_pixels_need_not_be_square(kind: str) -> None:
     surface, drift_m = Waves(3), (6.0 * PIXEL_M, 9.5 * PIXEL_M)
     tall = Region((0.0, 0.0), (127 * PIXEL_M, 149 * PIXEL_M))
-    pair = [scanned(surface, tall, (100, 128), drift, seed=k) for k, drift in enumerate([(0.0, 0.0), drift_m])]
-    check(estimator(kind).register(*pair), drift_m, 0.5)
+    reference, scan = [
+        scanned(surface, tall, (100, 128), drift, seed=k) for k, drift in enumerate([(0.0, 0.0), drift_m])
+    ]
+    check(estimator(kind).register(reference, scan), drift_m, 0.5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -70,8 +72,10 @@ def test_resolutions_may_differ(kind: str, which: int) -> None:
     surface = Waves(4)
     shapes = [SHAPE, SHAPE]
     shapes[which] = (180, 230)
-    pair = [scanned(surface, REGION, s, d, seed=1) for s, d in zip(shapes, [(0.0, 0.0), DRIFT_M], strict=True)]
-    check(estimator(kind).register(*pair), DRIFT_M, 0.5)
+    reference, scan = [
+        scanned(surface, REGION, s, d, seed=1) for s, d in zip(shapes, [(0.0, 0.0), DRIFT_M], strict=True)
+    ]
+    check(estimator(kind).register(reference, scan), DRIFT_M, 0.5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -147,12 +151,12 @@ def test_the_prior_selects_the_searched_area(kind: str) -> None:
 def test_a_periodic_surface_is_ambiguous() -> None:
     x, y = REGION.pixels_m(SHAPE)
     k = 2 * np.pi / (8 * PIXEL_M)
-    lattice = [
+    reference, scan = [
         replace(scanned(Waves(1), REGION, SHAPE), values=np.cos(k * (x - dx)) + np.cos(k * (y - dx)))
         for dx in (0.0, 2.5 * PIXEL_M)
     ]
     for kind in KINDS:
-        assert not estimator(kind).register(*lattice).accepted
+        assert not estimator(kind).register(reference, scan).accepted
 
 
 @pytest.mark.parametrize("kind", KINDS[:3])

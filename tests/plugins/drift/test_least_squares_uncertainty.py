@@ -25,11 +25,12 @@ REGION = Region((0.0, 0.0), (63 * PIXEL_M, 63 * PIXEL_M))
 
 def waves(x_m: NDArray[np.float64], y_m: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
     random = np.random.default_rng(seed)
-    height = np.zeros_like(x_m)
+    height: NDArray[np.float64] = np.zeros_like(x_m)
     for _ in range(80):
         kx, ky = 2 * np.pi * random.uniform(-1, 1, 2) / (8 * PIXEL_M)
         height += np.cos(kx * x_m + ky * y_m + random.uniform(0, 2 * np.pi)) / (1 + 1e-15 * (kx**2 + ky**2))
-    return height / height.std()
+    even: NDArray[np.float64] = height / height.std()
+    return even
 
 
 def scanned(
@@ -121,7 +122,7 @@ def test_a_difference_of_velocities_does_not_apply_to_scans_taken_differently(
     assert sd is None
 
 
-def told(shift: float, shear: float) -> tuple[NDArray[np.float64], ...]:
+def told(shift: float, shear: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return information from images that determine a shift along x plus ten times a shear to 0.1 px.
 
     Everything else is determined well.

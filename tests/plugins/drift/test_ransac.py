@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from afspm.plugins.drift.estimators.ransac import (
 )
 
 small = st.floats(-0.05, 0.05)
-LINEAR = {
+LINEAR: dict[str, Callable[[float, float, float, float], np.ndarray]] = {
     "translation": lambda a, b, c, d: np.eye(2),
     "euclidean": lambda a, b, c, d: np.array([[math.cos(a), -math.sin(a)], [math.sin(a), math.cos(a)]]),
     "similarity": lambda a, b, c, d: np.array([[1 + a, -b], [b, 1 + a]]),

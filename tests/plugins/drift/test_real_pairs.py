@@ -24,6 +24,7 @@ def scanned(name: str, channel: str) -> DriftScan:
     from afspm.storage.formats import read
 
     (scan,) = (scan for scan in read(FOLDER / f"{name}.h5").scans if scan.channel == channel)
+    assert scan.time_ns is not None
     start_s = scan.time_ns / 1e9
     return DriftScan(scan.values, scan.region, start_s, start_s + 256.0, key=name)
 

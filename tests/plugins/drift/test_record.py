@@ -21,7 +21,7 @@ def record(n: int = 20, seed: int = 1) -> DriftRecord:
     spread = np.array([[4.0, 1.0], [1.0, 9.0]]) * 1e-18
     return DriftRecord(
         keys=tuple(f"scan, {k}" for k in range(n)),
-        time_s=900.0 * np.arange(n) + 1.8e9,
+        time_s=900.0 * np.arange(n, dtype=np.float64) + 1.8e9,
         center_m=drift + random.normal(0.0, 3e-9, (n, 2)),
         drift_m=drift,
         covariance_m2=np.tile(spread, (n, 1, 1)),

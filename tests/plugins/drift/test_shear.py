@@ -158,4 +158,4 @@ def test_a_tracker_notices_an_up_frame_followed_by_a_down_frame() -> None:
         update = following.add(scan)
     assert update.after.rate_m_s == pytest.approx(VELOCITY, rel=0.05)
     drift = VELOCITY * 1.2 * FRAME_S
-    assert -update.after.mapping.translation_m == pytest.approx(drift, abs=0.05 * np.linalg.norm(drift))
+    assert -update.after.mapping.translation_m == pytest.approx(drift, abs=0.05 * float(np.linalg.norm(drift)))

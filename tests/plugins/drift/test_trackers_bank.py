@@ -67,12 +67,13 @@ def test_the_bank_predicts_better_than_the_last_step(nights: list[tuple[World, l
 
 def test_the_bank_knows_its_own_uncertainty(nights: list[tuple[World, list[Update]]]) -> None:
     """Neither over-confident nor over-cautious, before a scan and after it."""
-    before, after = [], []
+    before: list[float] = []
+    after: list[float] = []
     for world, updates in nights:
         for update in updates[8:]:
             for chi2, known in ((before, update.before), (after, update.after)):
                 error = error_m(world, known)
-                chi2.append(error @ np.linalg.solve(known.covariance_m2, error) / 2)
+                chi2.append(float(error @ np.linalg.solve(known.covariance_m2, error)) / 2)
     assert 0.1 < np.mean(before) < 1.2
     assert 0.1 < np.mean(after) < 2.5
 

@@ -31,7 +31,7 @@ SHM: dict[str, Any] = {"transport": "shm"}
 BRIDGE: dict[str, Any] = {}
 
 
-def small(made: Bench, **settings: object) -> Peer:
+def small(made: Bench, **settings: Any) -> Peer:
     """Start a translator with a small frame."""
     peer = made.start(**settings)
     ready(peer, Region((0.0, 0.0), (100e-9, 1e-6)), (8, 16))

@@ -60,12 +60,15 @@ def test_values_are_read_as_they_were_pickled(protocol: int) -> None:
 @pytest.mark.parametrize("array", ARRAYS)
 def test_arrays_are_read_alone_and_in_a_tuple(protocol: int, array: np.ndarray) -> None:
     content = pickle.dumps((array, ["Bias"], (1.0, 2.0)), protocol)
+    whole = pickles.loads(content)
+    assert isinstance(whole, tuple)
     for found in (
         pickles.loads(pickle.dumps(array, protocol)),
-        pickles.loads(content)[0],
+        whole[0],
         pickles.loads(content.replace(b"numpy._core", b"numpy.core")) if protocol == 3 else (array,),
     ):
         one = found[0] if isinstance(found, tuple) else found
+        assert isinstance(one, np.ndarray)
         assert one.dtype == array.dtype
         np.testing.assert_array_equal(one, array)
 

@@ -153,22 +153,22 @@ def test_reported_names_may_be_existing_files_until_saving(bench: Make) -> None:
     with calling(made) as gxsm:
         small(gxsm)
 
-        def name(channel: int) -> str:
+        def reported(channel: int) -> str:
             return Path(gxsm.call("chfname", channel)).name
 
         gxsm.call("startscan")
         until(made, lambda: bool(bits(gxsm) & 2))
-        assert name(0) == "scan001-M-Xp-ZSmTopo.nc", "which is there already"
+        assert reported(0) == "scan001-M-Xp-ZSmTopo.nc", "which is there already"
         until(made, lambda: not bits(gxsm) & 2)
-        until(made, lambda: name(0) == "scan003-M-Xp-ZSmTopo.nc")
-        assert name(2) == "scan001-Xp-ImTunnel.nc", "each channel counts by itself"
+        until(made, lambda: reported(0) == "scan003-M-Xp-ZSmTopo.nc")
+        assert reported(2) == "scan001-Xp-ImTunnel.nc", "each channel counts by itself"
         until(made, lambda: len(list(made.data.glob("*.nc"))) == 6)
         gxsm.call("startscan")
-        saved = name(0)
+        saved = reported(0)
         started = made.emulator.program.scan.activity
         assert started is not None
         assert saved == "scan003-M-Xp-ZSmTopo.nc" or made.clock.now_s() > started.start_s + 0.04
-        until(made, lambda: name(0) == "scan004-M-Xp-ZSmTopo.nc")
+        until(made, lambda: reported(0) == "scan004-M-Xp-ZSmTopo.nc")
         assert gxsm.call("chfname", 4) == "EE: invalid channel"
 
 
@@ -185,7 +185,7 @@ def test_stopped_scan_is_saved_with_rows_of_the_previous_one(bench: Make) -> Non
         path = made.data / "scan001-M-Xp-ZSmTopo.nc"
         until(made, lambda: path.exists() and _readable(path))
         (scan,) = read(path).scans
-        there = np.isfinite(scan.values).all(axis=1)
+        there = np.asarray(np.isfinite(scan.values).all(axis=1))
         assert there[-3:].all(), "from the top"
         assert not there[0]
         assert gxsm.call("get_slice", 0, 0, 0, 7, 1).tolist() == [[0.0] * 16]

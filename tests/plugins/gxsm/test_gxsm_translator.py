@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -607,8 +608,12 @@ def test_clock_of_gxsms_computer_may_differ_and_be_set(bench: Make) -> None:
     made = bench(speed=20.0)
     peer = made.start()
     ready(peer)
+
+    def set_behind(emulator: Any, behind_s: float) -> None:
+        emulator.program.panel.behind_s = behind_s
+
     for behind_s in (0.0, 3600.0, 3600.0, 7200.0, 60.0):
-        made.at_panel(lambda emulator, behind_s=behind_s: setattr(emulator.program.panel, "behind_s", behind_s))
+        made.at_panel(partial(set_behind, behind_s=behind_s))
         assert len(scanned(peer)) == 4
 
 

@@ -10,7 +10,7 @@ import pytest
 from tests.plugins.nanonis.nanonis_bench import Bench
 from tests.plugins.vendor_bench import SOON, scans, small, states
 
-from afspm.model import ControlRequest, ControlResponse, ProbePosition, Scan, ScopeState, Spectrum, names
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, Response, Scan, ScopeState, Spectrum, names
 from afspm.supervisor.ports import FreePorts
 
 Make = Callable[..., Bench]
@@ -381,13 +381,14 @@ def test_translator_survives_nonsense_replies(bench: Make, seed: int) -> None:
     ends_s = made.clock.now_s() + 200.0
     asked = 0
     while made.clock.now_s() < ends_s:
-        for ask in (
+        asks: tuple[Callable[[], Response], ...] = (
             lambda: peer.act(names.START_SCAN),
             lambda: peer.set(names.SCAN_RESOLUTION_X, 32),
             lambda: peer.act(names.START_SPEC),
             lambda: peer.ask(ControlRequest.SET_PROBE_POS, ProbePosition((1e-8, 2e-8))),
             lambda: peer.act(names.STOP_SCAN),
-        ):
+        )
+        for ask in asks:
             assert ask() is not None
             asked += 1
     assert asked >= 5
@@ -397,5 +398,5 @@ def test_translator_survives_nonsense_replies(bench: Make, seed: int) -> None:
     peer.act_once_free(names.STOP_SCAN)
     while not (response := peer.act(names.START_SCAN)).ok:
         assert response.code in (ControlResponse.NOT_FREE, ControlResponse.NO_RESPONSE), response.reason
-    found = peer.until(lambda one: isinstance(one, Scan) and np.isfinite(one.values).all())
+    found = peer.until(lambda one: isinstance(one, Scan) and bool(np.isfinite(one.values).all()))
     assert scans(found)

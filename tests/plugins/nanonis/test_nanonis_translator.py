@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,7 +56,8 @@ def test_rows_and_columns_match_the_sample(bench: Make, direction: str, fetch: b
     # shows.
     seen = 20.0 if fetch else 100.0  # a scan without a file must be seen running
     made = bench(seen, surface="steps", tip={"radius_m": 0.1e-9}, scanner={"band_limit_px": 0.0}, **FLAT)
-    peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
+    settings: dict[str, Any] = {"session_dir": str(made.folder / "not there")} if fetch else {}
+    peer = made.start(**settings)
     region = Region((40e-9, -25e-9), (60e-9, 300e-9), math.radians(30))
     ready(peer, region, (48, 32))
     assert peer.set(names.SCAN_DIRECTION, direction).ok
@@ -213,7 +215,8 @@ def test_probe_moves_at_its_speed_and_keeps_its_position_during_a_scan(bench: Ma
 @pytest.mark.parametrize("fetch", [False, True])
 def test_spectrum_has_its_position(bench: Make, kind: str, first: str, fetch: bool) -> None:
     made = bench(speed=20.0)
-    peer = made.start(**({"session_dir": str(made.folder / "not there")} if fetch else {}))
+    settings: dict[str, Any] = {"session_dir": str(made.folder / "not there")} if fetch else {}
+    peer = made.start(**settings)
     ready(peer)
     moved(peer, 12.3456789e-9, -50e-9)
     assert peer.set(names.SPEC_KIND, kind).ok

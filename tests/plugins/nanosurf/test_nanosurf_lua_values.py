@@ -32,7 +32,9 @@ def test_values(text: str, value: object) -> None:
 
 
 def test_not_a_number() -> None:
-    assert math.isnan(parse("{(0/0)}")[1])
+    found = parse("{(0/0)}")
+    assert isinstance(found, dict)
+    assert math.isnan(found[1])
 
 
 @pytest.mark.parametrize("text", ["", "{", "{1,", "1 2", "function() end", "{[1}", "x", "\xff\xfe", "{" * 100])

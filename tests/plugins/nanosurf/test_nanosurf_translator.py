@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +103,12 @@ def test_a_force_curve_is_a_single_one_at_the_tip_with_any_grid_on_the_panel(ben
     made = bench()
     peer = made.start()
     ready(peer)
+
+    def put(emulator: Any, name: str, value: float) -> None:
+        emulator.program.put(f"spectroscopy.grid_{name}", value)
+
     for name, value in (("columns", 4), ("rows", 3), ("center_offset_x", 10e-6), ("width", 5e-6)):
-        made.at_panel(lambda emulator, name=name, value=value: emulator.program.put(f"spectroscopy.grid_{name}", value))
+        made.at_panel(partial(put, name=name, value=value))
     moved(peer, 120e-9, -40e-9)
     assert peer.act(names.START_SPEC).ok
     curves = [one for one in peer.until(FREE) if isinstance(one, Spectrum)]
@@ -220,9 +225,7 @@ def test_restarted_translator_finds_the_scan(bench: Make) -> None:
         ({}, {"gallery_dir": "/nowhere/at/all"}, "does not exist on this computer"),
     ],
 )
-def test_mismatches_are_reported(
-    bench: Make, emulator: dict[str, int], settings: dict[str, object], logged: str
-) -> None:
+def test_mismatches_are_reported(bench: Make, emulator: dict[str, int], settings: dict[str, Any], logged: str) -> None:
     made = bench(**emulator)
     made.start(**settings)
     made.until_logged(logged)
@@ -244,7 +247,7 @@ def test_commands_missing_in_the_release_are_not_called(bench: Make) -> None:
     made = bench(release=19)
     asked: list[bytes] = []
     answer = made.emulator.answer
-    made.emulator.answer = lambda client, request: asked.append(request) or answer(client, request)  # type: ignore[method-assign,func-returns-value]
+    made.emulator.answer = lambda client, request: asked.append(request) or answer(client, request)  # type: ignore[method-assign]
     scanned(small(made))
     assert asked
     assert not any(b"is_scanning" in script for script in asked)

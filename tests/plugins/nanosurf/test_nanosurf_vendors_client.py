@@ -18,6 +18,7 @@ from tests.plugins.nanosurf.nanosurf_bench import Emulated
 
 import afspm
 from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import AfspmError
 
 Run = Callable[..., dict[str, object]]
 CLIENT = importlib.util.find_spec("nanosurf")
@@ -248,7 +249,7 @@ def wait_for_files(folder: Path, count: int) -> None:
         try:
             if len([afspm.read(path) for path in folder.glob("*.nhf")]) == count:
                 return
-        except afspm.AfspmError:
+        except AfspmError:
             pass
         time.sleep(0.02)  # another process's files
     raise AssertionError(f"there are {list(folder.iterdir())}")

@@ -25,12 +25,12 @@ class SmartScan(SmartScanProgram):
     """SmartScan with calls in the form of scripts, on a clock that advances until a call has ended."""
 
     def __init__(self, folder: Path) -> None:
-        self.clock = FakeClock()
-        rig = Instrument({"surface": "particles"}, seed=3, start_s=self.clock.t_s)
+        self.fake_clock = FakeClock()
+        rig = Instrument({"surface": "particles"}, seed=3, start_s=self.fake_clock.t_s)
         rig.setup.shape = (8, 16)
         log = logging.getLogger("test")
         faults = Faults([], ParkEmulator.fault_kinds, 0.0)
-        super().__init__(rig, faults, self.clock, folder, log, start_s=0.1, file_s=0.1)
+        super().__init__(rig, faults, self.fake_clock, folder, log, start_s=0.1, file_s=0.1)
 
     def begin(self, path: str, *given: object) -> Any:
         return self.ask("call", path, list(given))
@@ -40,10 +40,10 @@ class SmartScan(SmartScanProgram):
         if not isinstance(found, Wait):
             return found
         for _ in range(1000):
-            self.advance(self.clock.t_s)
+            self.advance(self.fake_clock.t_s)
             if not found.waiting():
                 return found.value()
-            self.clock.t_s += 0.1
+            self.fake_clock.t_s += 0.1
         raise AssertionError(f"{path} does not end")
 
     def value(self, path: str) -> Any:
@@ -119,7 +119,7 @@ def test_value_out_of_range_is_refused_and_nothing_moves(smartscan: SmartScan, p
     with pytest.raises(InvalidValue):
         smartscan.begin(path, *given)
     assert smartscan.rig.engaged
-    assert not smartscan.rig.busy(smartscan.clock.t_s)
+    assert not smartscan.rig.busy(smartscan.fake_clock.t_s)
 
 
 @pytest.mark.parametrize(
@@ -137,8 +137,8 @@ def test_moves_are_refused_during_a_scan(smartscan: SmartScan, path: str, given:
     for _ in range(3):  # the ramp to the first line, and the first lines
         with pytest.raises(InstrumentBusy, match="busy with a scan"):
             smartscan.begin(path, *given)
-        smartscan.clock.t_s += 0.4
-        smartscan.advance(smartscan.clock.t_s)
+        smartscan.fake_clock.t_s += 0.4
+        smartscan.advance(smartscan.fake_clock.t_s)
 
 
 # --- the sample's stage ---
@@ -148,7 +148,7 @@ def test_stage_puts_another_place_under_the_tip_and_back(smartscan: SmartScan) -
     before = scanned(smartscan)
     smartscan.call("xystage.moveTo", 30.0, -20.0, 1, 1)
     elsewhere = scanned(smartscan)
-    x, y = smartscan.rig.world.sample.under((0.0, 0.0), smartscan.clock.t_s)
+    x, y = smartscan.rig.world.sample.under((0.0, 0.0), smartscan.fake_clock.t_s)
     assert (x, y) == pytest.approx((30e-6, -20e-6))
     assert smartscan.value("xystage.pos") == {"x": 30.0, "y": -20.0}
     smartscan.call("xystage.reset")
@@ -167,8 +167,8 @@ def test_files_exist_for_recorded_channels_only(smartscan: SmartScan, tmp_path: 
     smartscan.call("addChannel", "current")
     assert smartscan.call("scan.channels.names") == ["Height", "Current"]
     scanned(smartscan)
-    smartscan.clock.t_s += 10.0
-    smartscan.advance(smartscan.clock.t_s)
+    smartscan.fake_clock.t_s += 10.0
+    smartscan.advance(smartscan.fake_clock.t_s)
     written = sorted(path.stem.partition("_0001_")[2] for path in tmp_path.glob("*.tiff"))
     assert written == ["Current_Forward", "Height_Backward", "Height_Forward"]
 
@@ -188,9 +188,9 @@ def test_average_takes_its_time_and_has_less_noise(smartscan: SmartScan) -> None
     smartscan.call("zscanner.retractAll")  # noise alone
     one, many = ([smartscan.call("readChannelAveraged", "current", n, 1)["value"] for _ in range(30)] for n in (1, 100))
     assert np.std(many) < 0.3 * np.std(one)
-    began_s = smartscan.clock.t_s
+    began_s = smartscan.fake_clock.t_s
     smartscan.call("readChannelAveraged", "current", 100, 20)
-    assert smartscan.clock.t_s - began_s == pytest.approx(2.0, abs=0.15)
+    assert smartscan.fake_clock.t_s - began_s == pytest.approx(2.0, abs=0.15)
 
 
 # --- what takes its time ---
@@ -198,12 +198,12 @@ def test_average_takes_its_time_and_has_less_noise(smartscan: SmartScan) -> None
 
 def test_line_is_scanned_until_it_is_stopped_and_nothing_is_saved(smartscan: SmartScan, tmp_path: Path) -> None:
     smartscan.call("scan.triggerLineScan")
-    smartscan.clock.t_s += 3600.0
-    smartscan.advance(smartscan.clock.t_s)
+    smartscan.fake_clock.t_s += 3600.0
+    smartscan.advance(smartscan.fake_clock.t_s)
     assert smartscan.scanning
     smartscan.call("scan.stop")
     assert not smartscan.scanning
-    smartscan.advance(smartscan.clock.t_s + 10.0)
+    smartscan.advance(smartscan.fake_clock.t_s + 10.0)
     assert not list(tmp_path.glob("*.tiff"))
 
 
@@ -211,7 +211,7 @@ def test_sweep_of_the_drive_frequency_keeps_the_instrument_busy(smartscan: Smart
     sweep = smartscan.begin("ncm.sweepAutoFullRange")
     with pytest.raises(InstrumentBusy, match="busy with a sweep"):
         smartscan.begin("scan.triggerImageScan")
-    smartscan.clock.t_s += 3.1
+    smartscan.fake_clock.t_s += 3.1
     assert not sweep.waiting()
 
 
@@ -227,18 +227,18 @@ def test_script_sleeps_in_the_experiments_time(smartscan: SmartScan) -> None:
     script = Script(source, smartscan.names, smartscan.ask)
     naps = 0
     while (found := run_on(script)) is None:
-        wakes_s = smartscan.next_waking_s(smartscan.clock.t_s)
+        wakes_s = smartscan.next_waking_s(smartscan.fake_clock.t_s)
         assert wakes_s is not None
-        assert wakes_s - smartscan.clock.t_s == pytest.approx(0.02, abs=1e-6)
-        smartscan.clock.t_s, naps = wakes_s, naps + 1
+        assert wakes_s - smartscan.fake_clock.t_s == pytest.approx(0.02, abs=1e-6)
+        smartscan.fake_clock.t_s, naps = wakes_s, naps + 1
     assert (found[0], naps) == (100, 5)
-    assert smartscan.next_waking_s(smartscan.clock.t_s) is None
+    assert smartscan.next_waking_s(smartscan.fake_clock.t_s) is None
 
 
 def test_value_of_a_slow_call_returns_to_the_script(smartscan: SmartScan) -> None:
     script = Script("spm.readChannelAveraged('current', 2, 10).unit", smartscan.names, smartscan.ask)
     assert run_on(script) is None
-    smartscan.clock.t_s += 1.0
+    smartscan.fake_clock.t_s += 1.0
     assert run_on(script) == ("pA", "pA")
 
 

@@ -184,7 +184,10 @@ def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make) -> 
         if len(stops) > 1:
             made.emulator.program.stop_curve()
 
-    made.at_panel(lambda emulator: emulator.program._methods.update({"spect.stop": stop}))
+    def replace_stop(emulator: Any) -> None:
+        emulator.program._methods["spect.stop"] = stop
+
+    made.at_panel(replace_stop)
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
     assert peer.act(names.STOP_SPEC).ok

@@ -3,6 +3,7 @@ from __future__ import annotations
 import stat
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -103,7 +104,8 @@ def test_names_of_others_and_unknown_names_are_refused(host: str, kept: str) -> 
 
 
 def test_the_common_password_may_be_in_the_environment_and_lets_look_only() -> None:
-    guard = access(kept="", people={}, **{PASSWORD: "from the shell"})
+    environment: dict[str, Any] = {PASSWORD: "from the shell"}
+    guard = access(kept="", people={}, **environment)
     assert who(guard, guard.enter("", "from the shell", "x")) == ""
     assert guard.enter("Ada", "from the shell", "x") is None
     assert guard.enter("", "", "x") is None

@@ -19,7 +19,7 @@ def surface(x_px: int = 0, y_px: int = 0) -> np.ndarray:
     """A rough surface of 40 nm, seen through a window."""
     rough = np.random.default_rng(3).normal(size=(3 * SIDE, 3 * SIDE))
     for axis in (0, 1):
-        rough = sum(np.roll(rough, step, axis) for step in range(7))
+        rough = np.sum([np.roll(rough, step, axis) for step in range(7)], axis=0)
     return 1e-9 * rough[SIDE + y_px : 2 * SIDE + y_px, SIDE + x_px : 2 * SIDE + x_px]
 
 

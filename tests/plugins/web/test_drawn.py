@@ -42,7 +42,7 @@ S = 1_000_000_000
 HERE = Region((0.0, 0.0), (1e-6, 1e-6))
 
 
-def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more: bool) -> ScanSummary:
+def taken(time_s: float, region: Region = HERE, channel: str = "Height", **more: Any) -> ScanSummary:
     return ScanSummary(round(time_s * S), None, channel, "m", region, (8, 8), holder="series", **more)
 
 
@@ -132,7 +132,7 @@ def test_a_probe_outside_the_view_is_shown_by_an_arrow_with_its_distance(
 
 def test_targets_of_a_component_are_on_the_map() -> None:
     overview = Overview()
-    message = wire.message_type("SpatialPointWithScoreList")(channel="Height")
+    message: Any = wire.message_type("SpatialPointWithScoreList")(channel="Height")
     for x_nm, score in ((100.0, 0.5), (-200.0, 0.9)):
         entry = message.spatials.add(score=score)
         entry.spatial.point.x, entry.spatial.units = x_nm, "nm"

@@ -33,13 +33,15 @@ class Browser:
         self._cookies = httpx.Cookies()
 
     def get(self, path: str, **more: Any) -> httpx.Response:
-        return completed(self._ask("GET", path, **more))
+        answer: httpx.Response = completed(self._ask("GET", path, **more))
+        return answer
 
     def post(self, path: str, **more: Any) -> httpx.Response:
-        return completed(self._ask("POST", path, **more))
+        answer: httpx.Response = completed(self._ask("POST", path, **more))
+        return answer
 
     async def _ask(self, method: str, path: str, **more: Any) -> httpx.Response:
-        transport = httpx.ASGITransport(self._app)  # type: ignore[arg-type]
+        transport = httpx.ASGITransport(self._app)
         async with httpx.AsyncClient(transport=transport, base_url=self._at, cookies=self._cookies) as client:
             answer = await client.request(method, path, **more)
             self._cookies = client.cookies
@@ -61,7 +63,7 @@ class Browser:
         async def send(message: Any) -> None:
             told.append(message.get("text") or message["type"].removeprefix("websocket."))
 
-        completed(self._app(scope, receive, send))  # type: ignore[arg-type]
+        completed(self._app(scope, receive, send))
         return told
 
 

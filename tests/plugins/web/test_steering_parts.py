@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 
@@ -103,7 +104,7 @@ def test_a_problem_has_advice_and_names_the_component_that_solves_it() -> None:
 def test_the_first_thermal_drift_is_shown_as_normal() -> None:
     overview = Overview()
     overview.take("ControlState", ControlState(ControlMode.AUTOMATED, None, (int(Problem.THERMAL_DRIFT),)), S)
-    asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
+    asked: Any = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
     asked.timestamp.FromNanoseconds(S)
     (before,) = flags(overview)
     overview.take("DriftRescan", asked, S + 1)

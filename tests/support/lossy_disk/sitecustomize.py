@@ -136,7 +136,7 @@ class Shadow:
 def watch(shadow: Shadow) -> None:
     """Record the syncs and removals of this process."""
 
-    def syncing(call: Callable[[int], None]) -> Callable[[int], None]:
+    def syncing(call: Callable[[int], None]) -> Callable[..., None]:
         def called(descriptor: int) -> None:
             with shadow.syncing():
                 call(descriptor)

@@ -202,7 +202,7 @@ def test_a_lost_connection_is_noticed_and_found_again(tmp_path: Path) -> None:
             for child in psutil.Process().children(recursive=True)
             if any(one.laddr.port == int(told[1]) and one.status == "LISTEN" for one in child.net_connections())
         ]
-        return found
+        return int(found)
 
     def end() -> str:
         freeze(pid())

@@ -23,7 +23,8 @@ class Echo(Emulator):
         return f"{LOOPBACK}:{self._listener.getsockname()[1]}"
 
     def serve(self, timeout_s: float) -> None:
-        ready, _, _ = select.select([self.woken, self._listener], [], [], timeout_s)
+        sources: list[Any] = [self.woken, self._listener]
+        ready, _, _ = select.select(sources, [], [], timeout_s)
         if self._listener not in ready:
             return
         with self._listener.accept()[0] as client:

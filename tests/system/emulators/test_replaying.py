@@ -64,7 +64,7 @@ def run(folder: Path, command: str, *files: Path) -> tuple[subprocess.CompletedP
     try:
         done = subprocess.run(arguments, capture_output=True, encoding="utf-8", timeout=90.0 * PATIENCE, check=False)
     except subprocess.TimeoutExpired as error:
-        pytest.fail(f"{error}:\n{error.stdout}\n{error.stderr}")
+        pytest.fail(f"{error}:\n{error.stdout!r}\n{error.stderr!r}")
     runs = sorted((folder / "runs").glob("*-*"))
     assert runs, done.stdout + done.stderr
     return done, runs[-1]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from tests.system.experiment.experiment_lab import AfspmRun
 
 from afspm.storage.formats import read
@@ -167,7 +168,7 @@ class Lay:
         seen_m = np.subtract(drift_m, compensated_m)
         return cls(complex(*turn["about_m"]), cmath.rect(turn["scale"], turn["angle_rad"]), complex(*seen_m[:2]))
 
-    def to_tip_of(self, first: Lay, xy_m: np.ndarray) -> np.ndarray:
+    def to_tip_of(self, first: Lay, xy_m: ArrayLike) -> np.ndarray:
         """Return the tip coordinates, at the time of the first scan, of features at positions (..., 2) now."""
         x_m, y_m = np.moveaxis(np.asarray(xy_m), -1, 0)
         on_sample = self.about_m + (x_m + 1j * y_m - self.about_m - self.drift_m) / self.turn
@@ -186,7 +187,7 @@ def surveyed(run: AfspmRun) -> Surveyed:
     regions = [next(iter(read(path))).region for path in scans]  # type: ignore[union-attr]
     true = [lay[path.name].to_tip_of(first, region.center_m) for path, region in zip(scans, regions, strict=True)]
     corners = [lay[path.name].to_tip_of(first, region.corners_m()) for path, region in zip(scans, regions, strict=True)]
-    positions = [next(iter(read(path))).position_m for path in spectra]  # type: ignore[union-attr]
+    positions: list[Any] = [next(iter(read(path))).position_m for path in spectra]  # type: ignore[union-attr]
     at = [lay[path.name].to_tip_of(first, at_m) for path, at_m in zip(spectra, positions, strict=True)]
     return Surveyed(
         said_m=np.array([one["center_m"] for one in noted if "scan" in one]),

@@ -53,9 +53,8 @@ def require_each_once(one: AfspmRun, targets: int, said: str = "") -> None:
     wanted = ["survey", *(f"zoom-{number}" for number in numbers)]
     wanted += [f"curve-{name}-{number}" for name in ("top", "beside") for number in numbers]
     assert (len(scans), len(spectra)) == (1 + targets, 2 * targets), said or one.output
-    keys = Counter(
-        row.key for row in [*scans, *spectra] if row.key
-    )  # the key of the last one before a kill may be lost
+    # the key of the last one before a kill may be lost
+    keys = Counter([row.key for row in scans if row.key] + [row.key for row in spectra if row.key])
     assert set(keys) <= set(wanted)
     assert set(keys.values()) == {1}, one.output
     assert outcomes(one.folder) == ["measured"] * targets

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -156,7 +157,9 @@ def test_a_notebook_joins_measures_and_shows_a_scan(installed: Installed, tmp_pa
     installed.add(f"afspm[notebook] @ {installed.wheel.as_uri()}")
     installed.run("afspm", "new", "experiment", "night", cwd=tmp_path)
     folder = tmp_path / "night"
-    cells = [{"cell_type": "code", "id": "a", "metadata": {}, "outputs": [], "execution_count": None, "source": LOOK}]
+    cells: list[dict[str, Any]] = [
+        {"cell_type": "code", "id": "a", "metadata": {}, "outputs": [], "execution_count": None, "source": LOOK}
+    ]
     kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3"}}
     made = {"cells": cells, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
     (folder / "look.ipynb").write_text(json.dumps(made), encoding="utf-8")

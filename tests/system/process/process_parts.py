@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 from afspm.client.component import Component
 from afspm.model import Region, Scan
@@ -91,7 +92,7 @@ class Peaks(Component):
     def run(self) -> None:
         from afspm import wire
 
-        message = wire.message_type("PeakList")()
+        message: Any = wire.message_type("PeakList")()
         message.heights.extend([1.0, 2.0])
         say(message.DESCRIPTOR.name, len(message.heights))
 

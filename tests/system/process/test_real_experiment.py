@@ -32,7 +32,7 @@ class Experiment:
         ports = FreePorts()
         self.scheduler_pub, self.router, self.translator_pub, self.server = (ports.address() for _ in range(4))
         self.clock = ExperimentClock.starting_now(speed=SPEED)
-        self._common = {
+        self._common: dict[str, Any] = {
             "clock": self.clock.as_dict(),
             "run_dir": str(folder),
             "state_dir": str(folder / "state"),

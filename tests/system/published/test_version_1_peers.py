@@ -216,7 +216,7 @@ def test_their_translator_is_sent_what_version_1_has_until_after_the_end(rig: An
     assert ask(PARAM, control_pb2.ParameterMsg(parameter="x-unknown")) == 8
     assert [frames[0][0] for frames in server.asked] == [1, 4, PARAM]
     assert server.asked[1] == [b"\4", b""]
-    server.publish(control_pb2.ScopeStateMsg(scope_state=SCANNING), CLOCK.now_ns())
+    server.publish(control_pb2.ScopeStateMsg(scope_state=control_pb2.SS_SCANNING), CLOCK.now_ns())
     rig.until(lambda: ours.packets("ScopeStateMsg"))
     assert ask(END) == SUCCESS
     rig.until(lambda: any(isinstance(incoming, Killed) for incoming in ours.found))

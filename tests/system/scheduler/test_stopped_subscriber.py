@@ -107,7 +107,10 @@ def _require_dropped(rig: Any, listener: Callable[[str], Listener]) -> None:
         publish(number)
         rig.until(lambda number=number: len(healthy.times) > number)
     assert healthy.times == [first_ns + 1_000_000 * number for number in range(SCANS + 1)]
-    grown = lambda: memory_bytes(rig.process.pid, "VmRSS") - before  # noqa: E731
+
+    def grown() -> int:
+        return memory_bytes(rig.process.pid, "VmRSS") - before
+
     rig.until(lambda: grown() < MOST_GROWTH_BYTES < SCANS * SCAN_BYTES, timeout_s=DROPPED_WITHIN_S)
 
     stopped.process.send_signal(signal.SIGCONT)

@@ -244,14 +244,14 @@ def test_after_a_kill_results_come_again_at_the_time_of_the_first(run: Any) -> N
     running = run()
     peer = running.peer().ready()
     peer.act(START_SCAN)
-    first = []
+    first: list[tuple[str, int]] = []
     while len(first) < 5:
         packet = peer.next()
         if packet[0] == "Scan2d":
             first.append((packet[1].channel, packet[2]))
     running.kill()
     running.start()
-    again = []
+    again: list[tuple[str, int]] = []
     while len(again) < 5:
         packet = peer.next()
         if packet[0] == "Scan2d":

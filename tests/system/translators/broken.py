@@ -21,6 +21,9 @@ from afspm.translator.observer import Observer
 from afspm.translator.parameters import Value
 from afspm.translator.translator import run_translator
 
+REPLACEABLE: Any = commands
+"""The module without its types: mypy refuses to replace a name that it imports."""
+
 
 class Broken(Simulator):
     """A simulated microscope with something in between."""
@@ -148,7 +151,7 @@ class CancelledSpectrumUntold(Broken):
     """A spectrum that is stopped is free at once, as if it had come to its end."""
 
     def spoil(self) -> None:
-        sequence.StatusSequence.interrupt = lambda self: self._say(ScopeStatus(ScopeState.FREE))  # type: ignore[method-assign]
+        sequence.StatusSequence.interrupt = lambda self: self._publish(ScopeStatus(ScopeState.FREE))  # type: ignore[method-assign]
 
 
 class WrongUnit(Broken):
@@ -196,7 +199,7 @@ class FreeBeforeTheScan(Broken):
         def after_measuring(
             self: sequence.StatusSequence, seen: ScopeStatus, results: bool, now_s: float
         ) -> list[sequence.SequenceStep]:
-            return [*self._say(seen), sequence.PublishResults()] if results else []
+            return [*self._publish(seen), sequence.PublishResults()] if results else []
 
         sequence.StatusSequence._after_measuring = after_measuring  # type: ignore[method-assign]
 
@@ -213,7 +216,7 @@ class Clamps(Broken):
 
         plainly = parameters.ParameterSpec.checked
         parameters.ParameterSpec.checked = checked  # type: ignore[method-assign]
-        commands.apply = lambda driver, values, about_to_act=None: driver.write(values)  # type: ignore[assignment]
+        REPLACEABLE.apply = lambda driver, values, about_to_act=None: driver.write(values)
 
 
 class AcceptsNaN(Broken):
@@ -245,7 +248,7 @@ class BusyNotRefused(Broken):
 
 class SuccessWithoutChange(Broken):
     def spoil(self) -> None:
-        commands.apply = lambda driver, values, about_to_act=None: None  # type: ignore[assignment]
+        REPLACEABLE.apply = lambda driver, values, about_to_act=None: None
 
 
 class KnowsEveryAction(Broken):
@@ -281,7 +284,7 @@ class SaysNothingAtTheStart(Broken):
     """Tells what changes, and not what is there."""
 
     def spoil(self) -> None:
-        Observer.publish_all = lambda self: self.publish(self._state.sequence.said)  # type: ignore[method-assign]
+        Observer.publish_all = lambda self: self.publish(self._state.sequence.published)  # type: ignore[method-assign]
 
 
 class InOtherCoordinates(Broken):

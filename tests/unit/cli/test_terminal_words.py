@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -105,7 +106,7 @@ def test_process_missing_from_the_states_is_not_shown_as_well(night: Overview) -
         is_gone = "series no report for 7 min 00 s" in shown(night)
         assert is_gone is (after_s > 121)
     assert "scheduler no report" not in shown(night)
-    told = StatusText(night, ABOUT, START + 600 * S).as_json()["processes"]
+    told: Any = StatusText(night, ABOUT, START + 600 * S).as_json()["processes"]
     assert {one["name"]: one["heard_of"] for one in told} == {
         "series": False, "judge": False, "grid": False, "scheduler": True,
     }  # fmt: skip
@@ -142,7 +143,7 @@ def test_notes_are_listed_with_their_scan(night: Overview) -> None:
     text = shown(night)
     assert "terminal:Ada on scan 1: scratch [/x]" in text
     assert "series: dry" in text
-    told = StatusText(night, ABOUT, START + 160 * S).as_json()["notes"]
+    told: Any = StatusText(night, ABOUT, START + 160 * S).as_json()["notes"]
     assert [(one["who"], one["text"], one["scan"] is None) for one in told] == [
         ("terminal:Ada", "scratch [/x]", False), ("series", "dry", True),
     ]  # fmt: skip

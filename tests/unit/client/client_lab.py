@@ -95,7 +95,7 @@ class Lab:
         self.parameters = ScanParameters(OTHER_REGION, (8, 8))
         self.position = ProbePosition((0.0, 0.0))
         self.values: dict[str, str] = {"tip-bias-voltage": "0.5"}
-        self.channels = ("Height", "Phase")
+        self.channels: tuple[str, ...] = ("Height", "Phase")
         self.executed: list[str] = []
         self.requests: list[Request] = []
         self.published: list[tuple[str, bytes]] = []
@@ -104,7 +104,7 @@ class Lab:
         self.begun_scans = 0
         self.finished: list[Region] = []
         self.cached: dict[str, Packet] = {}
-        self._happenings: list[tuple[float, int, Callable[[], None]]] = []
+        self._happenings: list[tuple[float, int, Callable[[], object]]] = []
         self._numbers = itertools.count()
         self._inbox: list[Incoming] = []
         self._newest_ns = 0
@@ -154,7 +154,7 @@ class Lab:
 
     # --- what can be made to happen ---
 
-    def at(self, in_s: float, happen: Callable[[], None]) -> None:
+    def at(self, in_s: float, happen: Callable[[], object]) -> None:
         heapq.heappush(self._happenings, (self.clock.passed_s + in_s, next(self._numbers), happen))
 
     def publish(self, thing: Any, envelope: str | None = None) -> Packet:
@@ -253,7 +253,7 @@ class Lab:
         """Kill the component: its unread packets are lost, and the cache is sent again."""
         self._inbox = self.replay()
 
-    def count(self, kind: ControlRequest) -> int:
+    def count(self, kind: int) -> int:
         return sum(request.kind == kind for request in self.requests)
 
     def told(self, message: str) -> list[RelayedMessage]:
@@ -341,8 +341,9 @@ class Lab:
 
     def _finish_scan(self) -> None:
         assert isinstance(self.parameters.region, Region)
+        assert isinstance(self.parameters.shape, tuple)
         self.finished.append(self.parameters.region)
-        self.publish_scan(self.parameters.region, self.parameters.shape or (8, 8))
+        self.publish_scan(self.parameters.region, self.parameters.shape)
 
     def _finish_spectrum(self) -> None:
         values, kind = np.zeros((3, 2)), self.values.get("x-spec-kind") or "IV"
@@ -406,7 +407,7 @@ def context_of(lab: Lab, state_dir: Path | None = None, **launch: Any) -> Proces
     return ProcessContext(
         Launch(lab.name, sockets=Sockets(subscribe=(SOURCE,)), state_dir=str(state_dir or ""), **launch),
         lab.clock,
-        open_port=lambda: LabPort(lab),  # type: ignore[arg-type,return-value]
+        open_port=lambda: LabPort(lab),
         log=logging.getLogger("afspm.test"),
         activity=ProcessActivity(lab.clock),
     )

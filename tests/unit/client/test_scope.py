@@ -141,7 +141,7 @@ def test_restart_of_the_translator_costs_one_attempt(lab: Lab, scope: Scope) -> 
 
 
 def test_accepted_scan_that_never_begins_is_requested_again(lab: Lab, scope: Scope) -> None:
-    swallowed = []
+    swallowed: list[str] = []
 
     def swallow(request: model.Request) -> Response | str:
         if request.subject == "start-scan" and not swallowed:
@@ -549,7 +549,7 @@ def test_an_old_control_state_is_not_taken_for_a_loss(lab: Lab, scope: Scope) ->
             return "go on"
         lab.at(0.5, lambda: lab.publish(model.ControlState(ControlMode.AUTOMATED, None, ())))
         lab.at(0.6, lambda: lab.publish(lab.control.published()))
-        publish, lab.publish = lab.publish, lambda thing, envelope=None: None  # type: ignore[assignment,misc]
+        publish, lab.publish = lab.publish, lambda thing, envelope=None: None  # type: ignore[assignment,return-value]
         response = lab._answer(request)
         lab.publish = publish  # type: ignore[method-assign]
         return response

@@ -54,6 +54,8 @@ class DriftingLab(Lab):
         self.values["scan-speed"] = "10"
         self.registrations: list[Registered] = []
         self.off_m: list[float] = []
+        self._end_s = 0.0
+        self._first_off_m = np.zeros(2)
         following = tracker("bank", unguarded() if estimator is None else estimator)
         self._tracker = following
         self._estimation = Estimation(

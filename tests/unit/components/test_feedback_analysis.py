@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from tests.unit.client.client_lab import Lab, run
@@ -37,7 +39,7 @@ def night(
         lab.publish(Scan(HERE, "Height", "m", HEIGHT, lab.clock.now_ns()))
 
     for number, share in enumerate(shares):
-        lab.at(100.0 * (number + 1), lambda share=share: publish(share))
+        lab.at(100.0 * (number + 1), partial(publish, share))
     lab.at(100.0 * (len(shares) + 1), lab.kill)
     assert run(FeedbackAnalysis(), lab) == ExitCode.ENDED
     return lab

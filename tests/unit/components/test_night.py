@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import re
 import threading
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,7 +59,7 @@ def night(scans: int = 12) -> NightRecord:
 
 def test_thermal_drift_until_the_first_scan_was_taken_both_ways_is_left_out_of_the_picture(tmp_path: Path) -> None:
     drift = int(Problem.THERMAL_DRIFT)
-    asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
+    asked: Any = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
     lab = Lab()
     asked.timestamp.FromNanoseconds(lab.clock.now_ns())
     lab.publish(ControlState(holder="rescanner", problems=(drift,)))
@@ -188,7 +190,7 @@ def test_scans_are_taken_in_while_the_drawing_is_loaded(monkeypatch: pytest.Monk
 def test_paused_scan_has_its_time_of_beginning_before_the_pause(tmp_path: Path) -> None:
     lab = _lab()
     for at_s, is_paused in ((110.0, True), (130.0, None)):
-        lab.at(at_s, lambda is_paused=is_paused: lab.publish(ScopeStatus(ScopeState.SCANNING, is_paused)))
+        lab.at(at_s, partial(lab.publish, ScopeStatus(ScopeState.SCANNING, is_paused)))
     lab.at(500.0, lab.kill)
     component = NightPicture()
     run(component, lab, tmp_path / "state", run_dir=str(tmp_path))

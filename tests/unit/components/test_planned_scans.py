@@ -143,7 +143,7 @@ def test_missed_scan_is_logged_in_the_singular(caplog: pytest.LogCaptureFixture)
 def _killed_at(call: int, make: type[Component] | object, state_dir: Path, *, is_late: bool) -> Lab:
     lab = Lab("series")
     context = context_of(lab, state_dir)
-    context.open_port = lambda: LabPort(lab, call, is_late=is_late)  # type: ignore[assignment,return-value]
+    context.open_port = lambda: LabPort(lab, call, is_late=is_late)
     try:
         make().run_process(context)  # type: ignore[operator]
     except Kill9:

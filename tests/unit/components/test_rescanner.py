@@ -33,21 +33,21 @@ ELSEWHERE = Region((3e-6, 1e-6), (1e-6, 0.5e-6), 0.2)
 class Drifting(Lab):
     """A scheduler that publishes a given outcome for each scan: "well", "off", "lost" or "unmatched"."""
 
-    def __init__(self, told: list[str]) -> None:
+    def __init__(self, outcomes: list[str]) -> None:
         super().__init__("rescanner")
-        self.told = iter(told)
+        self._outcomes = iter(outcomes)
         self.parameters = ScanParameters(REGION, (8, 8))
         self.publish(self.parameters)
         self.values[names.SCAN_DIRECTION] = names.UP
         self.directions: list[str] = []
 
     def publish_scan(self, region: Region, shape: tuple[int, int] = (8, 8)) -> None:
-        told = next(self.told, "well")
+        outcome = next(self._outcomes, "well")
         self.publish(
             DriftMapping(
-                matched=told not in ("lost", "unmatched"),
-                lost=told == "lost",
-                rescan="too far" if told == "off" else "",
+                matched=outcome not in ("lost", "unmatched"),
+                lost=outcome == "lost",
+                rescan="too far" if outcome == "off" else "",
             )
         )
         self.directions.append(self.values[names.SCAN_DIRECTION])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -117,8 +118,8 @@ def test_a_list_takes_the_tables_of_an_experiment_file() -> None:
 def test_spectra_need_either_a_grid_or_positions() -> None:
     assert SpectroscopyGrid(positions=[(1.0, 2.0)]).positions == ((1.0, 2.0),)
     assert len(SpectroscopyGrid(counts=(2, 3), spacing=(1.0, 1.0)).positions) == 6
-    listed = {"positions": [(0.0, 0.0)]}
-    for settings in (
+    listed: dict[str, Any] = {"positions": [(0.0, 0.0)]}
+    refused: tuple[dict[str, Any], ...] = (
         {},
         {"positions": []},
         {"counts": (2, 2)},
@@ -126,6 +127,7 @@ def test_spectra_need_either_a_grid_or_positions() -> None:
         {"center": (1e-6, 0.0), **listed},
         {"angle": 0.1, **listed},
         {"spacing": (1e-6, 1e-6), **listed},
-    ):
+    )
+    for settings in refused:
         with pytest.raises(ConfigError):
-            SpectroscopyGrid(**settings)  # type: ignore[arg-type]
+            SpectroscopyGrid(**settings)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +110,7 @@ def test_no_scan_or_curve_is_missing_or_repeated_after_a_kill_anywhere(tmp_path:
         lab, folder = ParticleLab(), tmp_path / str(call)
         folder.mkdir()
         context = context_of(lab, folder / "state", run_dir=str(folder))
-        context.open_port = lambda lab=lab, call=call: LabPort(lab, call, is_late=is_late)  # type: ignore[assignment,return-value,misc]
+        context.open_port = partial(LabPort, lab, call, is_late=is_late)
         made = survey()
         made.on_end = lambda: None  # type: ignore[method-assign]
         try:

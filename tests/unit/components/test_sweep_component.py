@@ -31,7 +31,7 @@ def test_sweep_measures_each_point_sets_back_and_ends_the_experiment() -> None:
 def life(lab: Lab, folder: Path, session: str, component: Sweep, deadly_call: int = 0) -> int:
     context = context_of(lab, folder)
     context.session = session
-    context.open_port = lambda: LabPort(lab, deadly_call)  # type: ignore[assignment,return-value]
+    context.open_port = lambda: LabPort(lab, deadly_call)
     return component.run_process(context)
 
 

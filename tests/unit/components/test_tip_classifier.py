@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,19 +20,21 @@ from afspm.scheduler.control.arbitration import ArbitrationEvent
 TIP = Problem.TIP_SHAPE_CHANGED
 
 
-def publish_at(lab: Lab, at_s: float, pair: tuple[Scan, Scan]) -> None:
+def publish_at(lab: Lab, at_s: float, pair: tuple[Scan, ...]) -> None:
     for scan in pair:
-        lab.at(at_s, lambda scan=scan: lab.publish(scan))
+        lab.at(at_s, partial(lab.publish, scan))
 
 
-def night(lab: Lab) -> tuple[tuple[Scan, Scan], ...]:
+def night(lab: Lab) -> tuple[tuple[Scan, ...], ...]:
     """Take three scans to learn from, two of a double tip, and one of a good tip again."""
     pairs = channels(1, "double", 5)
-    good_again = tuple(Scan(s.region, s.channel, s.unit, s.values, pairs[6][0].time_ns + 1) for s in pairs[3])
+    time_ns = pairs[6][0].time_ns
+    assert time_ns is not None
+    good_again = tuple(Scan(s.region, s.channel, s.unit, s.values, time_ns + 1) for s in pairs[3])
     story = (*pairs[:3], *pairs[5:7], good_again)
     for number, pair in enumerate(story):
         publish_at(lab, 100.0 * (number + 1), pair)
-    return story  # type: ignore[return-value]
+    return story
 
 
 def classifier(**settings: int) -> TipClassifier:
@@ -114,7 +117,7 @@ def test_treated_tip_is_flagged_by_later_bad_scans_only() -> None:
     elsewhere = Region((0.0, 0.0), (5e-6, 5e-6))  # an overview, without a reference
     for scan in pairs[3]:
         overview = Scan(elsewhere, scan.channel, scan.unit, scan.values, (pairs[5][0].time_ns or 0) + 10**9)
-        lab.at(600.0, lambda overview=overview: lab.publish(overview))
+        lab.at(600.0, partial(lab.publish, overview))
     lab.at(800.0, lab.kill)
     run(classifier(), lab)
     assert lab.control.published().problems == ()
@@ -128,7 +131,7 @@ def test_a_kind_of_scan_that_is_new_while_a_problem_is_flagged_is_unclear_and_no
         publish_at(lab, 100.0 * (number + 1), pair)
     time_ns = (pairs[5][0].time_ns or 0) + 10**9
     zoom = tuple(replace(s, region=Region((0.0, 0.0), (5e-7, 5e-7)), time_ns=time_ns) for s in pairs[6])
-    publish_at(lab, 500.0, zoom)  # type: ignore[arg-type]
+    publish_at(lab, 500.0, zoom)
     lab.at(700.0, lab.kill)
     component = classifier()
     run(component, lab)

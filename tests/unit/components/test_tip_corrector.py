@@ -6,6 +6,7 @@ import errno
 import logging
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,7 @@ class MovesInItsFrame(Repairs):
     def _execute(self, request: Request) -> Response:
         if request.kind == ControlRequest.SET_PROBE_POS:
             (x, y), region = request.subject.xy_m, self.parameters.region
+            assert isinstance(region, Region)
             if not region.contains((x, y)):
                 return Response(ControlResponse.PARAM_ERROR, reason="not in the frame")
         return super()._execute(request)
@@ -300,10 +302,10 @@ def test_microscope_without_crash_is_given_up_without_one() -> None:
 def test_repair_never_exceeds_the_allowed_treatments_after_a_kill_anywhere(tmp_path: Path, is_late: bool) -> None:
     for call in range(1, 120, 6):
         lab = Repairs([BAD] * 30)
-        lab.at(10.0, lambda lab=lab: lab.flag(TIP))
+        lab.at(10.0, partial(lab.flag, TIP))
         lab.at(30_000.0, lab.kill)
         context = context_of(lab, tmp_path / f"{call}")
-        context.open_port = lambda lab=lab, call=call: LabPort(lab, call, is_late=is_late)  # type: ignore[misc]
+        context.open_port = partial(LabPort, lab, call, is_late=is_late)
         try:
             corrector().run_process(context)
         except Kill9:

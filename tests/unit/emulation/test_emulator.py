@@ -160,7 +160,7 @@ def test_unexpected_error_ends_the_activity_and_not_the_emulator(
     clumsy = Clumsy(port=0)
     with clumsy.running(tmp_path) as address:
         assert ask(address, "scan", "hello") == ["1 scan", "1"]
-    assert [record.exc_info[1].args[0] for record in caplog.records if record.exc_info] == [  # type: ignore[index,union-attr]
+    assert [record.exc_info[1].args[0] for record in caplog.records if record.exc_info] == [  # type: ignore[union-attr]
         "of a request",
         "of the end of a scan",
     ]

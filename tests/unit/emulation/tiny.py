@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from afspm.simulation.emulation.emulator import LOOPBACK, Crashed, Emulator
 
@@ -25,7 +25,7 @@ class Tiny(Emulator):
         return f"{LOOPBACK}:{self._listener.getsockname()[1]}"
 
     def serve(self, timeout_s: float) -> None:
-        sources = [self.woken, self._listener, *([self._client] if self._client else [])]
+        sources: list[Any] = [self.woken, self._listener, *([self._client] if self._client else [])]
         ready, _, _ = select.select(sources, [], [], timeout_s)
         if self._listener in ready:
             self._client = self._listener.accept()[0]

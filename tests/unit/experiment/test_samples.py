@@ -17,7 +17,7 @@ WITHOUT_A_MICROSCOPE = "every_microscope"  # its second file has it
 SECOND_FILES = sorted(p.name for p in (EXPERIMENTS / WITHOUT_A_MICROSCOPE).glob("*.toml") if p.stem != "experiment")
 SECOND_FILES += [str(maker.emulated) for maker in MAKERS.values()]
 NAMES = sorted(folder.name for folder in EXPERIMENTS.iterdir() if (folder / "experiment.toml").exists())
-SAMPLES = [(name,) for name in NAMES if name != WITHOUT_A_MICROSCOPE]
+SAMPLES: list[tuple[str, ...]] = [(name,) for name in NAMES if name != WITHOUT_A_MICROSCOPE]
 SAMPLES += [("best_points", "drift.toml")]
 SAMPLES += [(WITHOUT_A_MICROSCOPE, second) for second in SECOND_FILES]
 

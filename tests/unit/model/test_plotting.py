@@ -5,6 +5,8 @@ from __future__ import annotations
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region, Scan
@@ -25,6 +27,7 @@ def test_scan_is_drawn_at_its_position(kind: str) -> None:
         assert axes.child_axes[0].get_ylabel() == "Height / nm"
         assert axes.texts[0].get_text().endswith("0 nm")
         assert "1000" in [label.get_text() for label in axes.get_xticklabels()]
+    assert isinstance(axes.figure, Figure)
     mpl.pyplot.close(axes.figure)
 
 
@@ -35,10 +38,12 @@ def test_scan_over_another_is_drawn_at_its_position_without_a_second_colour_bar(
     assert len(axes.child_axes) == 1
     assert axes.get_xlabel() == "x / µm"
     survey, zoom = axes.collections
+    assert isinstance(zoom, QuadMesh)
     corners = np.asarray(zoom.get_coordinates()).reshape(-1, 2)
     assert tuple(corners.mean(axis=0)) == pytest.approx(SCAN.region.center_m)
     assert np.ptp(corners[:, 0]) > 3e-7  # it is turned
     assert survey.get_zorder() <= zoom.get_zorder()
+    assert isinstance(axes.figure, Figure)
     mpl.pyplot.close(axes.figure)
 
 
@@ -56,6 +61,7 @@ def test_a_scan_is_drawn_without_a_colour_bar_and_between_given_values() -> None
     axes = SCAN.plot(colorbar=False, vmin=-2e-9, vmax=20e-9)
     assert not axes.child_axes
     assert axes.collections[0].get_clim() == pytest.approx((-2.0, 20.0))
+    assert isinstance(axes.figure, Figure)
     mpl.pyplot.close(axes.figure)
     with pytest.raises(InvalidValue, match="colours from 2e-09 to 1e-09 m"):
         SCAN.plot(vmin=2e-9, vmax=1e-9)

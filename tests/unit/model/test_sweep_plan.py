@@ -57,7 +57,7 @@ def test_another_seed_gives_another_order() -> None:
 @given(low=st.floats(1e-12, 1e3), ratio=st.floats(1.001, 1e6), points=st.integers(2, 50), falls=st.booleans())
 def test_log_spaced_values_have_equal_ratios(low: float, ratio: float, points: int, *, falls: bool) -> None:
     ends = (low * ratio, low) if falls else (low, low * ratio)
-    given = {"from": ends[0], "to": ends[1], "points": points, "spacing": "log"}
+    given: dict[str, Any] = {"from": ends[0], "to": ends[1], "points": points, "spacing": "log"}
     values: Any = SweepAxis.of("x-any", given).values
     assert len(values) == points
     assert (values[0], values[-1]) == pytest.approx(ends)

@@ -84,7 +84,7 @@ class Night:
     def registered_scan(self, number: int, outcome: RegistrationOutcome, sd_m: float) -> list[Given]:
         """Return a scan with its mapping just before it, as a Drift Compensated Scheduler publishes them."""
         scanning = self.state(ScopeState.SCANNING)
-        message = wire.message_type("DriftMapping")(
+        message: Any = wire.message_type("DriftMapping")(
             matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[sd_m**2, 0, 0, sd_m**2], outcome=int(outcome),
             matched=outcome.is_registered, reason="oh", filename=f"scan-{number:04d}.nc",
         )  # fmt: skip

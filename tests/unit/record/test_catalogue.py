@@ -7,6 +7,7 @@ import sqlite3
 from contextlib import closing
 from datetime import date
 from pathlib import Path
+from typing import Any
 
 import pytest
 from tests.unit.record.record_lab import ABOUT, Night
@@ -19,7 +20,12 @@ from afspm.record.catalogue import INDEX_FILE, find_runs
 from afspm.record.run_json import RUN_FILE
 from afspm.record.store import RecordStore
 
-METADATA = {"sample": "Au(111) on mica", "person": "A. Student", "vendor": "SPECS Zurich", "microscope": "Tyto"}
+METADATA: dict[str, Any] = {
+    "sample": "Au(111) on mica",
+    "person": "A. Student",
+    "vendor": "SPECS Zurich",
+    "microscope": "Tyto",
+}
 
 
 def record(folder: Path, problems: tuple[int, ...] = (), **metadata: str) -> Path:

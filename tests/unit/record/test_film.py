@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,10 @@ def ground(x_m: NDArray[np.float64], y_m: NDArray[np.float64]) -> NDArray[np.flo
     """Heights of a sample with no symmetry, in its own coordinates."""
     u, v = x_m / SIDE_M, y_m / SIDE_M
     bumps = [(0.1, 0.2, 0.11), (-0.25, 0.05, 0.08), (0.22, -0.2, 0.09), (-0.1, -0.28, 0.06)]
-    return 1e-9 * sum(math.e ** -((u - a) ** 2 / w**2 + (v - b) ** 2 / w**2) for a, b, w in bumps)
+    height = np.zeros_like(u)
+    for a, b, w in bumps:
+        height += math.e ** -((u - a) ** 2 / w**2 + (v - b) ** 2 / w**2)
+    return 1e-9 * height
 
 
 def scan_of(place: Region, moved_m: tuple[float, float], night: Night, number: int, channel: str = "Height") -> Scan:
@@ -59,6 +63,7 @@ def recorded(folder: Path, frame: Frame, *, with_drift: bool) -> Run:
             scan = replace(scan, region=seen)
         packets = [night.state(ScopeState.SCANNING), night.packet(scan, f"Scan2d_1000.0_{scan.channel}")]
         if with_drift:
+            assert scan.time_ns is not None
             packets.append(drift_packet(night, scan.time_ns, moved, step))
         store.take([*packets, night.state(ScopeState.FREE)])
         night.now_ns += 300_000_000_000
@@ -68,7 +73,7 @@ def recorded(folder: Path, frame: Frame, *, with_drift: bool) -> Run:
 
 def drift_packet(night: Night, time_ns: int, moved_m: tuple[float, float], step: int) -> Given:
     matrix = [1.0, 0.0, -moved_m[0], 0.0, 1.0, -moved_m[1]]
-    message = wire.message_type("DriftMapping")(
+    message: Any = wire.message_type("DriftMapping")(
         matrix=matrix, center=[0.0, 0.0], covariance=[0.0] * 4, matched=True, filename=f"scan-{step:04d}.nc"
     )
     message.timestamp.FromNanoseconds(time_ns)

@@ -296,7 +296,7 @@ def test_scan_rows_have_registration_and_uncertainty(night: Night, store: Record
 
 def test_first_thermal_drift_is_not_among_the_problems(night: Night, store: RecordStore, tmp_path: Path) -> None:
     flagged = night.control("rescanner", (int(Problem.THERMAL_DRIFT),))
-    asked = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
+    asked: Any = wire.message_type("DriftRescan")(kind=int(RescanKind.OPPOSITE))
     asked.timestamp.FromNanoseconds(night.now_ns)
     store.take([flagged, night.packet(asked), *night.whole_scan(1), night.control("series")])
     assert not afspm.open_run(tmp_path).problems

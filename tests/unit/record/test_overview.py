@@ -210,7 +210,7 @@ def test_running_scan_is_none_after_its_end() -> None:
 
 
 def test_drift_is_the_displacement_of_the_sample() -> None:
-    message = wire.message_type("DriftMapping")(
+    message: Any = wire.message_type("DriftMapping")(
         matrix=[1, 0, -2e-9, 0, 1, 3e-9], center=[0, 0], rate=[1e-12, 0], matched=True, lost=False
     )
     message.timestamp.FromNanoseconds(5 * S)
@@ -223,7 +223,7 @@ def test_drift_is_the_displacement_of_the_sample() -> None:
 
 
 def mapping(at_s: int, outcome: RegistrationOutcome, failures: int = 0) -> Any:
-    message = wire.message_type("DriftMapping")(
+    message: Any = wire.message_type("DriftMapping")(
         matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[9e-18, 0, 0, 25e-18], matched=outcome.is_registered,
         outcome=int(outcome), failures=failures, reason="oh", filename=f"{at_s}.nc",
     )  # fmt: skip
@@ -244,7 +244,7 @@ def test_drift_point_has_outcome_and_uncertainty() -> None:
 
 
 def opposite(at_s: int, kind: RescanKind = RescanKind.OPPOSITE) -> Any:
-    message = wire.message_type("DriftRescan")(kind=int(kind))
+    message: Any = wire.message_type("DriftRescan")(kind=int(kind))
     message.timestamp.FromNanoseconds(at_s * S)
     return message
 
@@ -293,7 +293,7 @@ def change(time_s: int, who: str, event: ControlEvent, **codes: Any) -> tuple[st
     return "JournalEntries", model.JournalEntries((entry,)), time_s
 
 
-STORY = [
+STORY: list[tuple[str, Any, int]] = [
     change(2, "series", ControlEvent.CONTROL_GAINED),
     change(22, "classifier", ControlEvent.PROBLEM_FLAGGED, problem=TIP),
     change(23, "series", ControlEvent.CONTROL_LOST),
@@ -327,7 +327,7 @@ def test_journal_of_known_changes_adds_nothing() -> None:
             ),
             41,
         ),
-    )  # type: ignore[attr-defined]
+    )
     assert [list(seen(*states).timelines.control.spans)] == [list(with_journal.timelines.control.spans)]
 
 

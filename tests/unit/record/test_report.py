@@ -7,6 +7,7 @@ import json
 import re
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -345,7 +346,7 @@ def test_time_in_control_is_summed_by_holder(run: Path) -> None:
 def test_selection_of_many_scans_has_the_bad_and_some_between(run: Path) -> None:
     with open_run(run) as opened:
         row = opened.scans[0]
-    many = [type(row)(**{**fields_of(row), "number": k, "time_ns": k}) for k in range(1000)]
+    many = [replace(row, number=k, time_ns=k) for k in range(1000)]
     shown = pictures.chosen(many, kept_ns={777})
     assert len(shown) == pictures.MOST
     assert {0, 777, 999} <= {one.number for one in shown}
@@ -442,7 +443,7 @@ def test_poorly_registered_scans_are_listed_with_their_uncertainty(tmp_path: Pat
     store = RecordStore(tmp_path, RecordSettings({"experiment": "survey", "frame": "sample"}))
     outcomes = (RegistrationOutcome.REGISTERED, RegistrationOutcome.FAILED, RegistrationOutcome.REGISTERED)
     for number, outcome in enumerate(outcomes):
-        message = wire.message_type("DriftMapping")(
+        message: Any = wire.message_type("DriftMapping")(
             matrix=[1, 0, 0, 0, 1, 0], center=[0, 0], covariance=[9e-16, 0, 0, 4e-16], outcome=int(outcome),
             failures=2 * (not outcome.is_registered), matched=outcome.is_registered, reason="<oh>",
         )  # fmt: skip
@@ -471,7 +472,7 @@ def test_poorly_registered_scans_are_listed_with_their_uncertainty(tmp_path: Pat
 
 def test_first_thermal_drift_is_shown_as_routine(tmp_path: Path) -> None:
     store = RecordStore(tmp_path, RecordSettings({"experiment": "survey"}))
-    asked = wire.message_type("DriftRescan")(kind=int(model.RescanKind.OPPOSITE))
+    asked: Any = wire.message_type("DriftRescan")(kind=int(model.RescanKind.OPPOSITE))
     asked.timestamp.FromNanoseconds(START + 10 * S)
     things = [
         (1, ControlState(ControlMode.AUTOMATED, "series")),

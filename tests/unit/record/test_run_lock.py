@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import pytest
 
-from afspm.record import run_lock
 from afspm.record.run_lock import cut_off_message, describe_state, lock_run, resume_command
 
 
@@ -74,6 +74,6 @@ def test_state_of_a_run_is_described_in_words(tmp_path: Path) -> None:
 def test_resume_command_is_quoted_for_the_shell(
     monkeypatch: pytest.MonkeyPatch, system: str, folder: str, said: str
 ) -> None:
-    monkeypatch.setattr(run_lock.sys, "platform", system)
+    monkeypatch.setattr(sys, "platform", system)
     path = PureWindowsPath(folder) if system == "win32" else PurePosixPath(folder)
     assert resume_command(path) == said

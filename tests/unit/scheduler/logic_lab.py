@@ -151,7 +151,7 @@ class Lab:
         payload = b"" if subject is None else self.codec.encode(subject)
         return self.step(RequestIn(connection, name, Request(int(kind), subject, payload, id_), user))
 
-    def says(self, name: str, kind: ControlRequest, subject: Any = None, id_: str = "") -> ControlResponse:
+    def says(self, name: str, kind: int, subject: Any = None, id_: str = "") -> ControlResponse:
         """Send a request, and return the code of its immediate answer."""
         return ControlResponse(replies(self.ask(name, kind, subject, id_))[-1].response.code)
 

@@ -66,7 +66,7 @@ def test_measurement_is_logged_with_its_key_and_time_of_forwarding(lab: Lab) -> 
     lab.ask("stranger", R.ACTION, "start-scan", "stranger/key/tile-2/1")
     control, scan, refused = (entry for entry in lab.entries() if entry.kind == "request")
     assert (scan.key, scan.sent_ns) == ("tile-1", sent_ns)
-    assert scan.sent_ns < scan.time_ns
+    assert sent_ns < scan.time_ns
     assert (control.key, control.sent_ns) == ("", None)
     assert (refused.key, refused.sent_ns) == ("tile-2", None)
 
@@ -136,7 +136,7 @@ def test_request_for_control_that_must_wait_is_no_refusal(lab: Lab, flagged: boo
 
 
 @pytest.mark.parametrize(("code", "refused"), [(C.NOT_FREE, False), (C.NO_RESPONSE, False), (C.PARAM_ERROR, True)])
-def test_refusal_is_recognised_by_its_code(code: C, refused: bool) -> None:
+def test_refusal_is_recognised_by_its_code(code: ControlResponse, refused: bool) -> None:
     assert JournalEntry(0, "request", "series", "start-scan", int(code), request=int(R.ACTION)).refused is refused
 
 

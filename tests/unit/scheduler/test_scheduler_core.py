@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 
 import pytest
 from tests.unit.scheduler.logic_lab import NS, Lab, killed, published, replies
@@ -24,6 +25,7 @@ from afspm.model import (
 from afspm.scheduler.control.arbitration import RoleTable, Rules
 from afspm.scheduler.events import (
     Disconnected,
+    Effect,
     Forward,
     Greeted,
     Kill,
@@ -49,7 +51,7 @@ ACTION, PARAM, SUPPORT = ControlRequest.ACTION, ControlRequest.PARAM, ControlReq
 OK, NOT_IN_CONTROL, NO_RESPONSE = ControlResponse.SUCCESS, ControlResponse.NOT_IN_CONTROL, ControlResponse.NO_RESPONSE
 
 
-def kinds(effects: list[object]) -> list[str]:
+def kinds(effects: Sequence[object]) -> list[str]:
     return [type(effect).__name__ for effect in effects if not isinstance(effect, Log)]
 
 
@@ -83,9 +85,9 @@ def test_others_commands_are_refused_and_their_questions_answered(lab: Lab) -> N
 
 
 def test_requests_of_extensions_are_for_the_holder(lab: Lab) -> None:
-    assert lab.says("experiment", 150) is NOT_IN_CONTROL  # type: ignore[arg-type]
+    assert lab.says("experiment", 150) is NOT_IN_CONTROL
     lab.take_control("experiment")
-    assert kinds(lab.ask("experiment", 150)) == ["Forward"]  # type: ignore[arg-type]
+    assert kinds(lab.ask("experiment", 150)) == ["Forward"]
 
 
 def test_unknown_request_is_not_supported(lab: Lab) -> None:
@@ -529,7 +531,7 @@ def test_failed_stop_is_logged_as_an_error(lab: Lab) -> None:
 
 
 def test_same_events_same_effects() -> None:
-    def story() -> list[object]:
+    def story() -> list[Effect]:
         lab = Lab()
         lab.translator()
         lab.take_control("a")

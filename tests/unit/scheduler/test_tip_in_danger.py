@@ -187,8 +187,9 @@ def test_after_a_retract_no_component_commands_until_a_person_clears_the_malfunc
     lab.give_up("experiment")
     lab.take_control("experiment")
     lab.answer(lab.forwarded[-1], code)
-    assert lab.core.deadline_s() is not None
-    assert lab.core.deadline_s() <= lab.now_s
+    deadline_s = lab.core.deadline_s()
+    assert deadline_s is not None
+    assert deadline_s <= lab.now_s
     again = killed(lab, SchedulerSettings())  # nothing of it is lost with the scheduler
     for one in (lab, again):
         while Problem.DEVICE_MALFUNCTION not in one.core.control.problems:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from tests.unit.scheduler.logic_lab import NS, Lab, in_control, killed, kinds, replies
@@ -30,7 +31,13 @@ STAGE = Region((0.0, 0.0), (6e-6, 6e-6))
 PULSES = SchedulerSettings(limits=ExperimentLimits(actions={"x-pulse": Limit(interval_s=600.0)}))
 
 
-HERE = {"scan_top_left_y": "0", "scan_size_x": "1e-6", "scan_size_y": "1e-6", "scan_angle": "0", "probe_pos_y": "0"}
+HERE: dict[str, Any] = {
+    "scan_top_left_y": "0",
+    "scan_size_x": "1e-6",
+    "scan_size_y": "1e-6",
+    "scan_angle": "0",
+    "probe_pos_y": "0",
+}
 REGION = SchedulerSettings(limits=ExperimentLimits(region=STAGE, region_source="experiment.toml:9"))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import pytest
 
@@ -68,7 +69,8 @@ def test_fault_on_demand_counts_from_now() -> None:
 
 
 def test_faults_that_have_struck_do_not_strike_again_after_a_restart() -> None:
-    given, kept = [Fault("crash", 1.0), Fault("no-reply", 0.0, count=3)], {}
+    given = [Fault("crash", 1.0), Fault("no-reply", 0.0, count=3)]
+    kept: dict[str, Any] = {}
     faults = Faults(given, KNOWN, 100.0, kept)
     assert faults.strikes("crash", 101.0)
     assert faults.strikes("no-reply", 101.0)

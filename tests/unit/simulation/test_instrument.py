@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -165,15 +166,21 @@ def test_tip_moves_forward_and_back_along_a_turned_line(rig: Instrument) -> None
     assert rig.probe_at(1003.75) == pytest.approx((0.5e-6, 3e-6))
 
 
+def last_mark(rig: Instrument, t_s: float) -> dict[str, Any]:
+    truth: dict[str, Any] = rig.world.truth(t_s)
+    mark: dict[str, Any] = truth["marks"][-1]
+    return mark
+
+
 def test_pulses_and_crashes_change_the_world(rig: Instrument, clock: Any) -> None:
     assert rig.pulse(8.0, 0.1, clock.t_s) in ("cured", "worsened", "unchanged")
     clock.t_s = 1001.0
     rig.crash(depth_m=1e-7, speed_m_s=1e-6, now_s=clock.t_s)
     assert rig.next_change_s(1001.0) == pytest.approx(1001.2)
     clock.t_s = 1002.0
-    deep = rig.world.truth(1002.0)["marks"][-1]
+    deep = last_mark(rig, 1002.0)
     rig.crash(depth_m=1e-9, speed_m_s=1e-6, now_s=clock.t_s)
-    shallow = rig.world.truth(1003.0)["marks"][-1]
+    shallow = last_mark(rig, 1003.0)
     assert [mark["kind"] for mark in (deep, shallow)] == ["crash", "crash"]
     assert shallow["depth_m"] < 1e-9 < deep["depth_m"]
 
@@ -186,7 +193,7 @@ def test_scan_computed_in_the_background_is_the_same_and_wakes_the_emulator(cloc
     for rig in (at_once, meanwhile):
         rig.setup.shape = (8, 16)
         heights.append(rig.start_scan(clock.t_s).channels()["Height"][1])
-    assert np.array_equal(*heights)
+    assert np.array_equal(heights[0], heights[1])
     meanwhile.stop_scan(clock.t_s)
     meanwhile.start_scan(clock.t_s).channels()
     assert woken
@@ -412,9 +419,11 @@ def test_feedback_set_during_a_scan_is_in_force_from_the_next_line_on(rig: Instr
 
 def test_events_are_noted_with_the_truth(clock: Any) -> None:
     noted: list[tuple[float, str, bool]] = []
-    rig = Instrument(
-        {}, 3, clock.t_s, note=lambda time_s, event, facts: noted.append((time_s, event, "drift_m" in facts["truth"]))
-    )
+
+    def note(time_s: float, event: str, facts: Mapping[str, Any]) -> None:
+        noted.append((time_s, event, "drift_m" in facts["truth"]))
+
+    rig = Instrument({}, 3, clock.t_s, note=note)
     rig.setup.shape, rig.setup.line_s = (4, 4), 0.5
     rig.start_scan(1000.0)
     rig.stop_scan(1001.0)

@@ -122,8 +122,9 @@ def test_marks_are_made_at_the_rotated_position_of_the_sample() -> None:
     world = hills(drift=TURNS)
     world.compensate((1e-10, 0.0), 1500.0)
     world.crash((2e-6, 1e-6), 10e-9, 1e-6, 3000.0)
-    truth = world.truth(3000.0)
-    x, y = turned(*truth["marks"][0]["sample_xy_m"], 2000.0)
+    truth: dict[str, Any] = world.truth(3000.0)
+    on_sample_x, on_sample_y = truth["marks"][0]["sample_xy_m"]
+    x, y = turned(on_sample_x, on_sample_y, 2000.0)
     np.testing.assert_allclose((x, y), (2e-6 + 150e-9, 1e-6), atol=1e-15)
     assert truth["turn"]["angle_rad"] == pytest.approx(4.0 - 2.0 * np.pi)
     assert truth["turn"]["scale"] == pytest.approx(np.exp(-0.1))

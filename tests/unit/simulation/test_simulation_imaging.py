@@ -27,7 +27,8 @@ def by_definition(height: np.ndarray, shape_m: np.ndarray) -> np.ndarray:
     stack = [
         padded[i : i + ny, j : j + nx] - shape_m[i, j] for i in range(shape_m.shape[0]) for j in range(shape_m.shape[1])
     ]
-    return np.max(stack, axis=0)
+    highest: np.ndarray = np.max(stack, axis=0)
+    return highest
 
 
 def test_parabolic_tip_dilates_as_defined() -> None:

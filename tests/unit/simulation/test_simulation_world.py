@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,10 @@ SHAPE = (48, 48)
 
 def world(seed: int = 3, **settings: Any) -> World:
     return World.from_settings({"surface": "particles", **settings}, seed=seed, start_s=0.0)
+
+
+def truth(w: World, t_s: float) -> dict[str, Any]:
+    return w.truth(t_s)
 
 
 def scan_height(w: World, start_s: float, region: Region = REGION) -> np.ndarray:
@@ -56,7 +61,9 @@ def test_adjustment_during_a_scan_holds_from_the_next_line_on() -> None:
 
 
 def test_restored_world_continues_identically() -> None:
-    settings = {"tip_changes": {"per_hour": 60.0, "schedule": [[70.0, "double"], [150.0, "contaminated"]]}}
+    settings: dict[str, Any] = {
+        "tip_changes": {"per_hour": 60.0, "schedule": [[70.0, "double"], [150.0, "contaminated"]]}
+    }
     w = world(**settings)
     scan_height(w, 0.0)
     w.crash((2e-7, 1e-7), 10e-9, 1e-7, 60.0)
@@ -89,8 +96,8 @@ def test_scheduled_change_happens_in_the_middle_of_a_scan() -> None:
     assert difference[25:].max() > 10e-9
     assert w._tip.at(24.0).is_sharp
     assert w._tip.at(25.0).flaws == ("double",)
-    assert w.truth(10.0)["tip"]["flaws"] == ()
-    assert [c["cause"] for c in w.truth(48.0)["tip_changes"]] == ["start", "schedule"]
+    assert truth(w, 10.0)["tip"]["flaws"] == ()
+    assert [c["cause"] for c in truth(w, 48.0)["tip_changes"]] == ["start", "schedule"]
 
 
 def test_stopped_scan_revokes_predicted_changes() -> None:
@@ -101,7 +108,7 @@ def test_stopped_scan_revokes_predicted_changes() -> None:
     assert w.tip.is_sharp
     scan_height(w, 22.0)  # and now it comes
     assert w.tip.flaws == ("blunt",)
-    assert len([c for c in w.truth(80.0)["tip_changes"] if c["cause"] == "schedule"]) == 1
+    assert len([c for c in truth(w, 80.0)["tip_changes"] if c["cause"] == "schedule"]) == 1
 
 
 def test_scheduled_change_happens_without_a_scan() -> None:
@@ -117,7 +124,7 @@ def changes_by_chance(scans: int, setpoint: float, **settings: Any) -> int:
     w = world(surface="flat", tip_changes=settings)
     for number in range(scans):
         w.scan(REGION, (60, 8), 60.0, number * 3600.0, Feedback(setpoint=setpoint))
-    return sum(c["cause"] == "chance" for c in w.truth(scans * 3600.0)["tip_changes"])
+    return sum(c["cause"] == "chance" for c in truth(w, scans * 3600.0)["tip_changes"])
 
 
 def test_tip_changes_at_the_set_rate_and_more_at_a_hard_setpoint() -> None:
@@ -188,7 +195,7 @@ def test_deeper_crash_leaves_a_deeper_crater_up_to_the_limit_of_the_tip() -> Non
     def crater_m(depth_m: float, condition: str = "sharp") -> float:
         w = world(surface="flat", tip={"condition": condition})
         w.crash((0.0, 0.0), depth_m, 50e-9, 1.0)
-        (mark,) = w.truth(2.0)["marks"]
+        (mark,) = truth(w, 2.0)["marks"]
         assert float(w.sample.surface_m(0.0, 0.0)[()]) < -0.5 * mark["depth_m"]
         return float(mark["depth_m"])
 
@@ -223,12 +230,18 @@ def test_deeper_crashes_and_longer_pulses_cure_more_tips() -> None:
         made = [world(seed, surface="flat", tip={"condition": "blunt"}, tip_changes=settings) for seed in range(200)]
         return [treat(w) for w in made].count("cured")
 
-    by_depth = [cured(lambda w, d=d: w.crash((0.0, 0.0), d, 50e-9, 1.0)) for d in (1e-9, 5e-9, 20e-9)]
+    def crash(w: World, depth_m: float) -> str:
+        return w.crash((0.0, 0.0), depth_m, 50e-9, 1.0)
+
+    def pulse(w: World, voltage_v: float, duration_s: float) -> str:
+        return w.pulse(voltage_v, duration_s, 1.0)
+
+    by_depth = [cured(partial(crash, depth_m=d)) for d in (1e-9, 5e-9, 20e-9)]
     assert by_depth[1] == pytest.approx(80, abs=25)
     assert by_depth[0] < 0.5 * by_depth[1] < 0.7 * by_depth[2]
-    by_duration = [cured(lambda w, t=t: w.pulse(8.0, t, 1.0)) for t in (5e-3, 50e-3, 5.0)]
+    by_duration = [cured(partial(pulse, voltage_v=8.0, duration_s=t)) for t in (5e-3, 50e-3, 5.0)]
     assert by_duration[0] < by_duration[1] < by_duration[2] < 2.5 * by_duration[1]
-    by_voltage = [cured(lambda w, v=v: w.pulse(v, 50e-3, 1.0)) for v in (1.0, 2.2, 8.0)]
+    by_voltage = [cured(partial(pulse, voltage_v=v, duration_s=50e-3)) for v in (1.0, 2.2, 8.0)]
     assert by_voltage[0] == 0 < by_voltage[1] < by_voltage[2]
 
 
@@ -251,7 +264,7 @@ def test_creep_brings_the_tip_to_its_place_slowly() -> None:
 
 
 def test_settings_are_refused_with_place_and_nearest_name() -> None:
-    cases = [
+    cases: list[tuple[dict[str, Any], str]] = [
         ({"drif": {}}, "did you mean 'drift'"),
         ({"noise": {"whit_m": 1.0}}, "did you mean 'white_m'"),
         ({"noise": {"white_m": -1.0}}, "zero or more"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -94,7 +95,7 @@ def gsf() -> bytes:
 
 
 def simulated() -> bytes:
-    attributes = {"scan-speed [m/s]": 1e-8, "x-scan-direction": "down"}
+    attributes: dict[str, str | float] = {"scan-speed [m/s]": 1e-8, "x-scan-direction": "down"}
     channels = {"Height Retrace": ("m", HEIGHT_M), "Phase": ("deg", OTHER)}
     return encode_scan(REGION, channels, FileFacts(END_NS, attributes))
 
@@ -133,6 +134,7 @@ def gxsm_field(stopped: int = 0) -> np.ndarray:
 def gxsm3(path: Path, stopped: int = 0) -> None:
     from scipy.io import netcdf_file
 
+    file: Any
     with netcdf_file(path, "w", version=1) as file:
         file.Creator, file.Version = b"gxsm3", b"1.2.3"
         for name, size in (("time", 1), ("value", 1), ("dimy", NY), ("dimx", NX), ("text", 8), ("name", 24)):

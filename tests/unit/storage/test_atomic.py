@@ -136,7 +136,7 @@ class Reader:
 
         monkeypatch.setattr(Path, "replace", replace)
         monkeypatch.setattr(atomic, "_AGAIN_S", 0.0)
-        monkeypatch.setattr(atomic.sys, "platform", "win32")
+        monkeypatch.setattr(sys, "platform", "win32")
 
 
 def test_file_open_for_a_moment_is_replaced_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

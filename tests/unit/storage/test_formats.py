@@ -6,6 +6,7 @@ import subprocess
 import sys
 from datetime import UTC, timedelta, timezone
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,8 +170,9 @@ def test_unit_of_gxsm_is_the_unit_and_not_its_name_in_gxsms_own_list(tmp_path: P
     with h5py.File(tmp_path / "4.nc", "r+") as file:
         file["FloatField"].attrs.update({"ZSrcUnit": b"mV1", "unit": b"mV1", "var_unit": b"mV", "unit_x_dz": b"mV"})
     gxsm3(tmp_path / "3.nc")
-    with netcdf_file(tmp_path / "3.nc", "a") as file:
-        file.variables["FloatField"].ZSrcUnit, file.variables["FloatField"].unit = b"mV1", b"mV"
+    with netcdf_file(tmp_path / "3.nc", "a") as other:
+        field: Any = other.variables["FloatField"]
+        field.ZSrcUnit, field.unit = b"mV1", b"mV"
     for name in ("4.nc", "3.nc"):
         assert afspm.read(tmp_path / name).scans[0].unit == "mV"
 

@@ -11,6 +11,7 @@ import pytest
 
 from afspm.model import LoggedPacket, Packet
 from afspm.storage import packet_log
+from afspm.storage.disk import SYNCER
 from afspm.storage.packet_log import (
     START,
     LogReader,
@@ -153,7 +154,7 @@ def test_carried_packets_are_synced_before_the_old_copy_is_freed(
     def fails(within_s: float) -> None:
         raise OSError(errno.EIO, "it does not sync")
 
-    monkeypatch.setattr(packet_log.SYNCER, "now", fails)
+    monkeypatch.setattr(SYNCER, "now", fails)
     first = path_of(folder, 1).read_bytes()
     with pytest.raises(OSError, match="does not sync"):
         log.clean([entry(1, 40, "ControlState")])
@@ -229,7 +230,7 @@ def test_without_a_recorder_the_log_stays_small(logging: Logging, folder: Path, 
     for time_ns in range(1, 200):
         log.append(entry(time_ns, 40))
         assert log.clean([])
-    packet_log.SYNCER.now(packet_log.SYNCED_WITHIN_S)  # Windows frees a segment once it is on the disk
+    SYNCER.now(packet_log.SYNCED_WITHIN_S)  # Windows frees a segment once it is on the disk
     assert log.clean([])
     assert len(segments(folder)) <= 6
 

@@ -49,6 +49,7 @@ def test_wave_of_asylum_agrees_with_another_reader() -> None:
         np.testing.assert_array_equal(scan.values, raw[:, :, k].T)
     assert content.scans[0].region.center_m == (-2.5933e-06, -6.07e-06)
     np.testing.assert_allclose(content.scans[0].region.size_m, (5e-6, 5e-6))
+    assert content.scans[0].time is not None
     assert content.scans[0].time.isoformat()[:19] == "2024-08-20T08:30:46"
     assert content.upwards is False
 
@@ -129,6 +130,8 @@ def test_a_turned_scan_of_nanonis() -> None:
     assert region.angle_rad == pytest.approx(-np.radians(135.1))
     assert region.center_m == (1.500662e-07, -1.571085e-07)
     assert region.size_m == pytest.approx((4e-9 * 255 / 256, 4e-9 * 255 / 256))
+    assert content.start_ns is not None
+    assert content.end_ns is not None
     assert (content.end_ns - content.start_ns) / 1e9 == pytest.approx(92.0)
 
 
@@ -162,6 +165,8 @@ def test_scans_of_both_versions_of_gxsm() -> None:
     np.testing.assert_allclose(fourth.region.center_m, (10e-9, -5e-9))
     np.testing.assert_allclose(fourth.region.size_m, (50e-9, 30e-9))
     assert fourth.region.angle_rad == pytest.approx(-np.radians(10.0))
+    assert content.start_ns is not None
+    assert content.end_ns is not None
     assert (content.end_ns - content.start_ns) == 4 * 10**9
     assert content.upwards is False
 

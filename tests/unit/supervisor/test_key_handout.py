@@ -7,6 +7,7 @@ import json
 import stat
 import sys
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,8 @@ def test_each_process_gets_its_own_pair_and_the_public_keys_of_its_peers(tmp_pat
     assert not any(own["everywhere"] for own in keys.values())
     assert found.guest is not None
     assert found.supervisor is not None
-    assert set(found.guest["servers"].values()) == {"scheduler"}
+    servers: Any = found.guest["servers"]
+    assert set(servers.values()) == {"scheduler"}
 
 
 PUBLISHING = """
@@ -92,8 +94,8 @@ publisher = "tcp://127.0.0.1:29104"
 def test_every_port_has_keys_and_of_unix_sockets_those_of_requests(tmp_path: Path) -> None:
     made = experiment(tmp_path, PUBLISHING)
     for scheme, published in (("tcp://127.0.0.1:", {"scheduler", "microscope"}), ("ipc:///x/", set[str]())):
-        numbers = itertools.count(21_000)
-        found = hand_over(made, made.launches(take_address=lambda s=scheme, n=numbers: f"{s}{next(n)}"))
+        addresses = (f"{scheme}{number}" for number in range(21_000, 22_000))
+        found = hand_over(made, made.launches(take_address=partial(next, addresses)))
         for start in found.starts:
             sockets, own = start.launch.sockets, from_launch(start.launch.name, start.launch.keys)
             assert own is not None

@@ -19,7 +19,8 @@ from afspm.supervisor import post_run
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.post_run import EndedRun
 from afspm.supervisor.supervision.run_end import EndReason
-from afspm.supervisor.supervisor import ProcessReport, RunOutcome
+from afspm.supervisor.supervision.supervised_child import ProcessReport
+from afspm.supervisor.supervisor import RunOutcome
 
 
 class Log:

@@ -47,4 +47,5 @@ def test_guest_with_keys_expects_the_scheduler_s_key_on_any_computer(tmp_path: P
     guest = guest_of(tmp_path, "alice")
     assert guest.keys is not None
     assert Path(guest.keys["folder"]) == tmp_path / "keys"
+    assert guest.sockets.control is not None
     assert [guest.keys.get(url) for url in (*guest.sockets.subscribe, guest.sockets.control)] == ["scheduler"] * 2

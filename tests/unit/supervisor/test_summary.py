@@ -11,7 +11,8 @@ from afspm.record.journal import SCHEDULER
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.supervisor.post_run import summary
 from afspm.supervisor.supervision.run_end import EndReason
-from afspm.supervisor.supervisor import ProcessReport, RunOutcome
+from afspm.supervisor.supervision.supervised_child import ProcessReport
+from afspm.supervisor.supervisor import RunOutcome
 
 REPORTS = (
     ProcessReport("scheduler", starts=1, given_up=False, last_exit="the experiment has ended"),

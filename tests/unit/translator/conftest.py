@@ -192,7 +192,7 @@ class Bench:
         self.translator = Translator(self.microscope, self.port, memory, run, log)
         self.translator.look()
 
-    def run_to_the_end(self, *last: Served, after_s: tuple[float, Callable[[], None]] = (math.inf, list)) -> ExitCode:
+    def run_to_the_end(self, *last: Served, after_s: tuple[float, Callable[[], object]] = (math.inf, list)) -> ExitCode:
         """Run until the translator ends; `last` arrives at once, and `after_s` calls a function after a time."""
         at_s, happens = self.clock.t_s + after_s[0], after_s[1]
 

@@ -15,6 +15,7 @@ import pytest
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.exit_codes import ExitCode
+from afspm.basics.file_lock import lock
 from afspm.basics.launch import Launch, Sockets
 from afspm.plugins.asylum import Asylum
 from afspm.plugins.gxsm import Gxsm
@@ -58,7 +59,7 @@ def test_second_run_is_refused_with_the_name_of_the_first(other: str) -> None:
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file can't be removed there")
 def test_lock_file_is_removed_and_a_removed_one_is_never_held(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened: list[Path] = []
-    locked = controller_lock.lock
+    locked = lock
 
     def lock_too_late(file: BinaryIO) -> None:
         # its former holder deletes the file right after it was opened

@@ -65,6 +65,7 @@ def test_the_next_scan_begins_with_its_first_line(live: Any, scan: Any) -> None:
     live.there = 8
     live.look(1.0)
     began_ns = published(live)[0].began_ns
+    assert began_ns is not None
     live.microscope.files["a"], live.microscope.state = [scan()], ScopeState.FREE
     live.look(1.0)
     live.look(1.0)

@@ -19,7 +19,7 @@ FREE, SCANNING, COARSE = ScopeState.FREE, ScopeState.SCANNING, ScopeState.COARSE
 @pytest.fixture
 def scope(request: Any, tmp_path: Path, fake_clock: Any) -> Simulator:
     """A microscope with one fault, whose scans take 4 s."""
-    initial = {"scan-resolution-x": 8, "scan-resolution-y": 4}
+    initial: dict[str, object] = {"scan-resolution-x": 8, "scan-resolution-y": 4}
     made = Simulator(faults=[request.param], initial=initial)
     made.clock, made.log, made.run_dir = fake_clock, logging.getLogger("test"), tmp_path
     made.memory, made.wake = {}, lambda: None

@@ -15,6 +15,10 @@ from afspm.client.dispatch import MessageDispatcher
 from afspm.model import Region, ScanParameters
 from afspm.transport.process.failure import describe
 
+EMPTY: dict[str, str] = {}
+# a user's file is not type-checked
+REGION: Any = Region
+SCAN_PARAMETERS: Any = ScanParameters
 OURS = Path(MessageDispatcher.give.__code__.co_filename).parents[1]
 
 
@@ -52,7 +56,7 @@ def refuse() -> None:
 
 
 def test_error_text_has_the_message_before_the_users_lines() -> None:
-    lines = describe(raised(lambda: {}["sharpness"])).splitlines()
+    lines = describe(raised(lambda: EMPTY["sharpness"])).splitlines()
     assert lines[0] == "KeyError: 'sharpness'"
     assert all("made_up.py" not in line for line in lines[1:])
     assert any("test_failure.py" in line for line in lines[1:])
@@ -90,14 +94,14 @@ def test_error_of_afspm_alone_is_shown_whole() -> None:
 
 def test_refusal_of_an_own_component_is_only_its_message() -> None:
     error = raised(refuse)
-    error.__cause__ = raised(lambda: {}["of a library that we called"])
+    error.__cause__ = raised(lambda: EMPTY["of a library that we called"])
     assert describe(error, "series", package=Path(__file__).parents[3]) == "too far"
 
 
 def test_chained_errors_are_shown() -> None:
     def careless() -> None:
         try:
-            {}["first"]
+            EMPTY["first"]
         except KeyError:
             undefined()  # type: ignore[name-defined]  # noqa: F821
 
@@ -120,12 +124,12 @@ def test_scope_used_too_early_is_shown_at_its_line() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda: Region(([0], 0), ("1 um", "1 um")),
-        lambda: Region(0, 1e-6),
-        lambda: ScanParameters(shape=64),
-        lambda: ScanParameters(shape=(1, 2, 3)),
-        lambda: ScanParameters(shape=(64.0, 64.0)),
-        lambda: ScanParameters(shape=("64", 64)),
+        lambda: REGION(([0], 0), ("1 um", "1 um")),
+        lambda: REGION(0, 1e-6),
+        lambda: SCAN_PARAMETERS(shape=64),
+        lambda: SCAN_PARAMETERS(shape=(1, 2, 3)),
+        lambda: SCAN_PARAMETERS(shape=(64.0, 64.0)),
+        lambda: SCAN_PARAMETERS(shape=("64", 64)),
     ],
 )
 def test_value_of_the_wrong_type_is_refused_with_the_right_one(wrong: Callable[[], object]) -> None:

@@ -45,7 +45,8 @@ def kinds(found: list[Any]) -> set[type]:
 
 
 def test_late_joiner_gets_earlier_packets_in_order_then_live_ones(open_: Any, until: Any) -> None:
-    publisher, found = open_(server()), []
+    publisher = open_(server())
+    found: list[Any] = []
     for n in range(20):
         publisher.publish(f"Scan2d_{n % 3}", b"%d" % n)
     late = open_(component(subscribe=[publisher.publish_address]))
@@ -56,7 +57,9 @@ def test_late_joiner_gets_earlier_packets_in_order_then_live_ones(open_: Any, un
 
 
 def test_replay_reaches_only_the_late_joiner(open_: Any, until: Any) -> None:
-    publisher, early_found, late_found = open_(server()), [], []
+    publisher = open_(server())
+    early_found: list[Any] = []
+    late_found: list[Any] = []
     early = open_(component("Early", subscribe=[publisher.publish_address]))
     until(lambda: CaughtUp in kinds(early_found), (publisher, []), (early, early_found))
     publisher.publish("Scan2d", b"one")
@@ -80,7 +83,8 @@ def test_two_subscribers_to_everything_do_not_see_each_others_replay(open_: Any,
 
 
 def test_only_subscribed_envelopes_arrive(open_: Any, until: Any) -> None:
-    publisher, found = open_(server()), []
+    publisher = open_(server())
+    found: list[Any] = []
     publisher.publish("Scan2d_5.0_Height", b"scan")
     publisher.publish("ScopeStateMsg", b"state")
     port = open_(component(subscribe=[publisher.publish_address], envelopes=["Scan2d", "Spec1d"]))
@@ -92,7 +96,8 @@ def test_only_subscribed_envelopes_arrive(open_: Any, until: Any) -> None:
 
 
 def test_restarted_publisher_is_found_and_packets_do_not_come_twice(open_: Any, until: Any) -> None:
-    publisher, found = server(), []
+    publisher = server()
+    found: list[Any] = []
     address = publisher.publish_address
     port = open_(component(subscribe=[address]))
     until(lambda: CaughtUp in kinds(found), (publisher, []), (port, found))
@@ -109,7 +114,8 @@ def test_restarted_publisher_is_found_and_packets_do_not_come_twice(open_: Any, 
 
 
 def test_large_payloads_arrive_whole_and_are_not_copied(open_: Any, until: Any) -> None:
-    publisher, found = open_(server()), []
+    publisher = open_(server())
+    found: list[Any] = []
     large = bytes(range(256)) * 4096
     port = open_(component(subscribe=[publisher.publish_address]))
     until(lambda: CaughtUp in kinds(found), (publisher, []), (port, found))
@@ -122,7 +128,8 @@ def test_large_payloads_arrive_whole_and_are_not_copied(open_: Any, until: Any) 
 
 
 def test_kill_reaches_a_component_that_subscribes_to_something_else(open_: Any, until: Any) -> None:
-    publisher, found = open_(server()), []
+    publisher = open_(server())
+    found: list[Any] = []
     port = open_(component(subscribe=[publisher.publish_address], envelopes=["Scan2d"]))
     until(lambda: CaughtUp in kinds(found), (publisher, []), (port, found))
     publisher.kill()
@@ -130,7 +137,8 @@ def test_kill_reaches_a_component_that_subscribes_to_something_else(open_: Any, 
 
 
 def test_a_component_publishes_to_others(open_: Any, until: Any) -> None:
-    first, found = open_(component("First", publish=ANY)), []
+    first = open_(component("First", publish=ANY))
+    found: list[Any] = []
     first.publish("Score", b"0.5")
     second = open_(component("Second", subscribe=[first.publish_address]))
     until(lambda: CaughtUp in kinds(found), (first, []), (second, found))
@@ -140,7 +148,9 @@ def test_a_component_publishes_to_others(open_: Any, until: Any) -> None:
 
 
 def test_request_is_answered_and_connections_of_the_server_are_events(open_: Any, until: Any) -> None:
-    translator, found, asked = server(), [], []
+    translator = server()
+    found: list[Any] = []
+    asked: list[Any] = []
     address = translator.serve_address
     port = open_(component(control=address))
     until(lambda: ControlConnected in kinds(found), (port, found))
@@ -162,7 +172,9 @@ def test_request_is_answered_and_connections_of_the_server_are_events(open_: Any
 
 
 def test_a_server_takes_one_request_at_a_time_and_may_leave_one_unanswered(open_: Any, until: Any) -> None:
-    translator, asked, found = open_(server()), [], []
+    translator = open_(server())
+    asked: list[Any] = []
+    found: list[Any] = []
     port = open_(component(control=translator.serve_address))
     until(lambda: ControlConnected in kinds(found), (port, found))
     for n in range(3):
@@ -191,7 +203,7 @@ def test_closing_takes_less_than_half_a_second_without_a_peer() -> None:
         port.send([b"\1"])
     publisher.publish("Scan2d", bytes(10_000_000))
     began_s = time.monotonic()
-    for port in (*ports, publisher):
-        port.close()
-        port.close()
+    for close in (*(port.close for port in ports), publisher.close):
+        close()
+        close()
     assert time.monotonic() - began_s < 0.5 * (len(ports) + 1)

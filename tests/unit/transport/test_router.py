@@ -142,7 +142,8 @@ def test_peers_of_another_protocol_do_no_harm(open_: Any, plain: Any) -> None:
 
 
 def test_probe_disturbs_no_component(open_: Any, until: Any, caplog: pytest.LogCaptureFixture) -> None:
-    listening, found = Listening(open_), []
+    listening = Listening(open_)
+    found: list[Any] = []
     component = open_(ZmqPort(Network(), "A", CLOCK, control=listening.router.address))
     until(lambda: ControlConnected() in found, (component, found))
     component.send([b"\7", b"", b"A/first/1"])

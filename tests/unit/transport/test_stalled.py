@@ -61,7 +61,9 @@ def test_packets_for_a_stalled_subscriber_are_dropped_and_others_miss_nothing(
     stalled.setsockopt(zmq.RCVHWM, 1)
     stalled.subscribe(b"")
     stalled.connect(publisher.address)
-    healthy, got, happened = open_(ZmqPort(Network(), "Healthy", CLOCK, subscribe=[publisher.address])), [], []
+    healthy = open_(ZmqPort(Network(), "Healthy", CLOCK, subscribe=[publisher.address]))
+    got: list[Any] = []
+    happened: list[Any] = []
 
     def both_receive() -> bool:
         publisher.publish(b"for both")
@@ -73,8 +75,10 @@ def test_packets_for_a_stalled_subscriber_are_dropped_and_others_miss_nothing(
     kept = sys.getrefcount(payload)
     for _ in range(SCANS):
         publisher.publisher.socket.send_multipart([b"Scan2d", payload, b""], copy=False)
-    scans = lambda i: isinstance(i, PacketReceived) and len(i.packet.payload) == len(payload)  # noqa: E731
-    received = lambda: sum(map(scans, got))  # noqa: E731
+
+    def received() -> int:
+        return sum(isinstance(i, PacketReceived) and len(i.packet.payload) == len(payload) for i in got)
+
     until(lambda: received() == SCANS, (publisher, happened), (healthy, got))
     waiting = sys.getrefcount(payload) - kept
     assert waiting > SCANS // 2 or DISCONNECTED in happened
@@ -104,6 +108,9 @@ def test_stalled_subscriber_that_continues_gets_everything_once(
         publisher.publish(number.to_bytes() + SCAN)
     happened: list[Any] = []
     until(lambda: DISCONNECTED in happened, (publisher, happened), timeout_s=SOON_S)
-    numbers = lambda: [i.packet.payload[0] for i in got if isinstance(i, PacketReceived)][1:]  # noqa: E731
+
+    def numbers() -> list[int]:
+        return [i.packet.payload[0] for i in got if isinstance(i, PacketReceived)][1:]
+
     until(lambda: len(numbers()) >= SCANS, (publisher, happened), (stalled, got))
     assert numbers() == list(range(SCANS))

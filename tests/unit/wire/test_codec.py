@@ -159,7 +159,7 @@ def test_single_coordinate_or_number_of_pixels_can_be_requested() -> None:
     ],
 )
 def test_invalid_values_are_refused(subject: object) -> None:
-    kind = {Feedback: 4, ProbePosition: 5, ScanParameters: 3}[type(subject)]  # type: ignore[index]
+    kind = {Feedback: 4, ProbePosition: 5, ScanParameters: 3}[type(subject)]
     with pytest.raises(WireError) as refused:
         wire.decode_request([bytes([kind]), encode_subject(subject)])
     assert refused.value.response == ControlResponse.PARAM_ERROR

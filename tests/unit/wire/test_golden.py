@@ -34,7 +34,7 @@ AS_MODEL = {
 }
 
 
-def each(kind: str) -> Any:
+def each(kind: str) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("entry", GOLDEN[kind], ids=lambda entry: entry.get("name") or entry["envelope"])
 
 

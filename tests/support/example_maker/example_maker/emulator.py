@@ -19,7 +19,7 @@ from example_maker.files import packed
 class AcmeProgram(MakerProgram):
     """The maker's program."""
 
-    def __init__(self, *arguments: Any, **times: float) -> None:
+    def __init__(self, *arguments: Any, **times: Any) -> None:
         super().__init__(*arguments, **times)
         self.panel: dict[str, Any] = {
             "x": -5e-7, "y": -5e-7, "width": 1e-6, "height": 1e-6, "angle": 0.0, "columns": 64, "rows": 64,
@@ -87,7 +87,9 @@ class AcmeEmulator(Emulator):
             case "set":
                 return program.panel.update(value)
             case "start":
-                return program.start_scan(now_s)
+                program.start_scan(now_s)
             case "stop":
-                return program.stop_scan(now_s)
-        raise ValueError(f"{what} is no request")
+                program.stop_scan(now_s)
+            case _:
+                raise ValueError(f"{what} is no request")
+        return None

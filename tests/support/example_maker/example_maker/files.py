@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterable, Iterator
 from datetime import tzinfo
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ def packed(scans: Iterable[Scan]) -> bytes:
     """Return the content of a file."""
     content = io.BytesIO()
     for scan in scans:
-        about = [*scan.region.center_m, *scan.region.size_m, scan.region.angle_rad, scan.time_ns]
+        about: list[Any] = [*scan.region.center_m, *scan.region.size_m, scan.region.angle_rad, scan.time_ns]
         np.save(content, np.array([scan.channel, scan.unit, *map(repr, map(float, about))]))
         np.save(content, scan.values)
     return content.getvalue()
