@@ -257,7 +257,7 @@ _FACTS: Final[Mapping[str, Callable[[RunStory], str]]] = {
     "microscope": lambda story: "SIMULATED" if story.simulated else "real",
     "sample": lambda story: story.metadata.get("sample", ABSENT),
     "probe": lambda story: story.metadata.get("probe", ABSENT),
-    "time (UTC)": lambda story: period_text(story.start_ns, story.end_ns, UTC),
+    "time": lambda story: period_text(story.start_ns, story.end_ns, UTC),
     "lasted": lambda story: duration_text(story.lasted_ns / NS_PER_S),
     "scans": _scan_count,
     "spectra": lambda story: str(story.spectra),

@@ -25,7 +25,7 @@ _WIDTH = "220px"
 # the second picture covers the first in turns of 0.7 s: slow enough for people who are sensitive to flashes
 _CSS = """
 main{max-width:1280px}th b{color:var(--problem)}
-.beside{display:flex;flex-wrap:wrap;gap:1rem 1.6rem}.beside figure{margin:0}
+.beside{display:flex;flex-wrap:wrap;gap:1rem 1.6rem}.beside figure{margin:0;width:290px}
 .stack{position:relative}.stack>.over{position:absolute;inset:0;visibility:hidden;background:var(--paper)}
 figure:has(:checked) .over{animation:flicker 1.4s steps(1) infinite}
 @keyframes flicker{50%{visibility:visible}}
