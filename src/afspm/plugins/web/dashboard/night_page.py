@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import math
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from datetime import datetime
@@ -22,13 +21,11 @@ from nicegui import events, ui
 
 from afspm.basics.clock import NS_PER_S, ExperimentClock
 from afspm.basics.errors import AfspmError, InvalidValue
-from afspm.basics.formatting import time_of_day, typeset_area, typeset_position
+from afspm.basics.formatting import time_of_day, typeset_area
 from afspm.basics.plain_data import Plain
-from afspm.model import Region
 from afspm.model.events import PERSON
-from afspm.model.line_levelling import Array, Levelling, levelled
-from afspm.plugins.drift.estimators import estimator
-from afspm.plugins.drift.registration import DriftScan
+from afspm.model.line_levelling import Levelling, levelled
+from afspm.plugins.drift.scan_pair import onto_first
 from afspm.plugins.web.archive import Archive, allowed_region
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Action, ActionResult, Actions, Steering, not_signed_in
@@ -44,7 +41,6 @@ from afspm.record.report import REPORT_FILE, write
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import ScanRow
 
-_ALIKE = 1e-3
 _HEAD = """<link rel="stylesheet" href="/assets/night.css"><script type="module" src="/assets/night.js"></script>"""
 
 
@@ -217,32 +213,8 @@ def difference(first: ChannelFrame, second: ChannelFrame, how: Levelling) -> tup
     if first.unit != second.unit:
         raise InvalidValue(f"values in {first.unit or '1'} and {second.unit or '1'} can't be subtracted")
     before, after = levelled(first.values, how), levelled(second.values, how)
-    moved_m, words = _displacement(first.region, second.region, before, after)
-    change = _moved(after, first.region, moved_m) - before
+    aligned, words = onto_first(before, first.region, after, second.region)
+    change = aligned - before
     if np.isfinite(change).any():
         change -= np.nanmedian(change)
     return replace(first, number=first.number ^ second.number, values=change), words
-
-
-def _displacement(first: Region, second: Region, before: Array, after: Array) -> tuple[tuple[float, float], str]:
-    # within the frame of the first, with a text that explains it
-    unmoved = (0.0, 0.0)
-    if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(first.size_m, second.size_m, strict=True)):
-        return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
-    frame = Region((0.0, 0.0), first.size_m)
-    found = estimator("correlation").register(DriftScan(before, frame, 0.0, 1.0), DriftScan(after, frame, 2.0, 3.0))
-    if not found.accepted:
-        return unmoved, f"not registered ({found.reason}): compared pixel by pixel"
-    x, y = map(float, found.displacement_m)
-    return (x, y), f"registered: the second scan was moved by {typeset_position((-x, -y))}"
-
-
-def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
-    # takes the displacement back; NaN where nothing is known
-    from scipy import ndimage
-
-    if displacement_m == (0.0, 0.0):
-        return values
-    pixels_m = (side / max(n - 1, 1) for side, n in zip(region.size_m[::-1], values.shape, strict=True))
-    shift = [-d / pixel for d, pixel in zip(displacement_m[::-1], pixels_m, strict=True)]
-    return np.asarray(ndimage.shift(values, shift, order=1, cval=np.nan))

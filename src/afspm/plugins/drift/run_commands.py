@@ -1,0 +1,149 @@
+"""`afspm compare` and `afspm find`: runs beside each other, and a sample that was mounted again.
+
+Both register scans of different nights, so they are commands of the package with the estimators.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.basics.formatting import area_text, position_text, quantity
+from afspm.cli.arguments import AFTERWARDS, opt
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from afspm.plugins.drift.remount import Remount
+    from afspm.record.comparison import Comparison
+    from afspm.record.run import Run
+
+compare_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+find_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
+
+
+@compare_app.command()
+def compare(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN RUN…", help="Folders of runs.", show_default=False)],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="The page to write.")] = Path(
+        "compare.html"
+    ),
+) -> None:
+    """Compare runs: settings that differ, problems, times, roughness, and the same regions side by side.
+
+    Regions are the same if their scans have one key, or without keys one place. Prints a table and writes a page with
+    pictures, in which scans of one size flicker and are subtracted.
+    """
+    from afspm.cli.joining import plain_console
+    from afspm.plugins.drift.scan_pair import onto_first
+    from afspm.record.comparison import compare as compared
+    from afspm.record.comparison_page import write
+    from afspm.record.run import open_run
+
+    with ExitStack() as stack:
+        found = compared([stack.enter_context(open_run(folder)) for folder in runs], onto_first)
+    plain_console().print(_compared(found))
+    for reason in found.unread:
+        typer.echo(f"not compared: {reason}", err=True)
+    write(found, output)
+    typer.echo(output)
+
+
+@find_app.command()
+def find(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="The run of today.", show_default=False)],
+    earlier: Annotated[Path, typer.Argument(metavar="IN", help="A run of an earlier night.", show_default=False)],
+    scan: Annotated[int | None, opt("The overview of today, by its number. Default: the largest whole scan.")] = None,
+    in_scan: Annotated[int | None, opt("The overview of the earlier night, in the same way.")] = None,
+    within: Annotated[
+        float, typer.Option(metavar="DEGREES", min=0.1, max=180.0, help="The largest turn of the sample.")
+    ] = 180.0,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs; in metres and radians.")] = False,
+) -> None:
+    """Find a sample that was mounted again: where the places of an earlier night are today.
+
+    Registers the overview of today with the earlier one, at any angle. Prints offset and angle with standard
+    deviations, and the keyed regions of the earlier night in coordinates of today. Exit code 1: not found.
+    """
+    from afspm.plugins.drift import remount
+    from afspm.record.run import open_run
+
+    with open_run(run) as today, open_run(earlier) as night:
+        now_row, now = remount.overview_of(today, scan)
+        row, then = remount.overview_of(night, in_scan)
+        found = remount.find(then, now, math.radians(within))
+        if as_json:
+            _echo_json(found)
+        elif found.found:
+            simulated = " SIMULATED" if today.simulated or night.simulated else ""
+            typer.echo(f"scan {now_row.number} of {today.folder.name} in scan {row.number} of {night.folder.name}")
+            _echo_found(found, simulated)
+            _echo_regions(found, night)
+        else:
+            typer.echo(f"not found: {found.reason}")
+    if not found.found:
+        raise typer.Exit(1)
+
+
+def _compared(found: Comparison) -> Table:
+    from rich import box
+    from rich.table import Table
+
+    from afspm.record.comparison_page import rows_that_differ
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for head in ("", *found.names):
+        table.add_column(head, overflow="fold")
+    for head, texts in rows_that_differ(found):
+        table.add_row(head, *texts)
+    return table
+
+
+def _echo_found(found: Remount, simulated: str) -> None:
+    offset_m = (found.center_now_m[0] - found.center_m[0], found.center_now_m[1] - found.center_m[1])
+    typer.echo(
+        f"found{simulated}: turned by {math.degrees(found.angle_rad):.2f}° ± {math.degrees(found.angle_sd_rad):.2f}° "
+        f"counter-clockwise about {position_text(found.center_m)}, then moved by {position_text(offset_m)} "
+        f"± {quantity(found.sd_m, 'm', 2)}; false with a probability of {_percent(found.wrong)}"
+    )
+
+
+def _percent(share: float) -> str:
+    return f"{share:.1%}" if share >= 0.001 else "less than 0.1%"
+
+
+def _echo_regions(found: Remount, night: Run) -> None:
+    from afspm.cli.joining import plain_console
+
+    keyed = {row.key: row.region for row in night.scans if row.key and row.region is not None}
+    if not keyed:
+        return
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for head in ("key", "centre then", "centre today", "±", "size", "angle today"):
+        table.add_column(head, overflow="fold")
+    for key, region in keyed.items():
+        now = found.region_now(region)
+        table.add_row(
+            key,
+            position_text(region.center_m),
+            position_text(now.center_m),
+            quantity(found.now_sd_m(region.center_m), "m", 2),
+            area_text(now.size_m),
+            f"{math.degrees(math.remainder(now.angle_rad, math.tau)):.2f}°",
+        )
+    plain_console().print(table)
+
+
+def _echo_json(found: Remount) -> None:
+    import json
+    from dataclasses import asdict
+
+    facts = {name: value for name, value in asdict(found).items() if found.found or name == "reason"}
+    typer.echo(json.dumps({"found": found.found, **facts}, indent=2, ensure_ascii=False))

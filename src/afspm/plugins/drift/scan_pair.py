@@ -1,0 +1,50 @@
+"""Two scans of one region, laid over each other for a difference."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.formatting import typeset_position
+from afspm.model import Region
+from afspm.plugins.drift.estimators import estimator
+from afspm.plugins.drift.registration import DriftScan
+
+Array = NDArray[np.float64]
+_ALIKE = 1e-3
+
+
+def onto_first(first: Array, region: Region, second: Array, second_region: Region) -> tuple[Array, str]:
+    """Return the values of the second scan at the features of the first, and a text about their alignment.
+
+    Scans of equal size are registered within their frames, wherever these lie. The result is NaN where only the first
+    was measured. Scans that can't be registered keep their pixels.
+    """
+    moved_m, words = _displacement(first, region, second, second_region)
+    return _moved(second, region, moved_m), words
+
+
+def _displacement(first: Array, region: Region, second: Array, other: Region) -> tuple[tuple[float, float], str]:
+    # within the frame of the first, with a text that explains it
+    unmoved = (0.0, 0.0)
+    if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(region.size_m, other.size_m, strict=True)):
+        return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
+    frame = Region((0.0, 0.0), region.size_m)
+    found = estimator("correlation").register(DriftScan(first, frame, 0.0, 1.0), DriftScan(second, frame, 2.0, 3.0))
+    if not found.accepted:
+        return unmoved, f"not registered ({found.reason}): compared pixel by pixel"
+    x, y = map(float, found.displacement_m)
+    return (x, y), f"registered: the second scan was moved by {typeset_position((-x, -y))}"
+
+
+def _moved(values: Array, region: Region, displacement_m: tuple[float, float]) -> Array:
+    # takes the displacement back; NaN where nothing is known
+    from scipy import ndimage
+
+    if displacement_m == (0.0, 0.0):
+        return values
+    pixels_m = (side / max(n - 1, 1) for side, n in zip(region.size_m[::-1], values.shape, strict=True))
+    shift = [-d / pixel for d, pixel in zip(displacement_m[::-1], pixels_m, strict=True)]
+    return np.asarray(ndimage.shift(values, shift, order=1, cval=np.nan))
