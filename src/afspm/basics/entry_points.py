@@ -1,4 +1,4 @@
-"""The door: entry points, with which installed packages add to afspm, by Python entry points.
+"""The door: entry points, with which installed packages add to afspm.
 
 afspm's own drivers, emulators, components, readers, … are declared in the same groups of its `pyproject.toml` as those
 of any other package, and are found in the same way. A package declares a line for each, and is installed::

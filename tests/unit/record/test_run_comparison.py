@@ -33,7 +33,7 @@ def unmoved(first: Array, region: Region, second: Array, other: Region) -> tuple
 def waves(amplitude_m: float, pixels: int = PX) -> Array:
     """Return a chessboard of `amplitude_m`, which no levelling changes, with a tilt that levelling removes."""
     y, x = np.mgrid[:pixels, :pixels]
-    return np.where((x + y) % 2 == 0, amplitude_m, -amplitude_m) + 1e-9 * x + 3e-9 * y
+    return np.asarray(np.where((x + y) % 2 == 0, amplitude_m, -amplitude_m) + 1e-9 * x + 3e-9 * y, dtype=np.float64)
 
 
 def record(folder: Path, values: list[tuple[Region, Array]], settings: str = "", sample: str = "gold") -> Path:
