@@ -41,8 +41,8 @@ class Remount:
     """The place of a sample now, from its place at an earlier time.
 
     Attributes:
-        reason: why it was not found; empty if it was found. Then only are the numbers meaningful.
-        angle_rad: by which the sample is turned now, counter-clockwise; angle_sd_rad: its standard deviation.
+        reason: the cause of a failure; empty if the place was found. Only then do the numbers mean anything.
+        angle_rad: rotation of the sample since then, counter-clockwise; angle_sd_rad: its standard deviation.
         center_m, center_now_m: a place on the sample, before and now: the middle of the common area.
         sd_m: standard deviation of `center_now_m` along its most uncertain axis.
         wrong: estimated probability of a false match.
