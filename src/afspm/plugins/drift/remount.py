@@ -42,7 +42,7 @@ class Remount:
 
     Attributes:
         reason: why it was not found; empty if it was found. Then only are the numbers meaningful.
-        angle_rad: by which the sample is turned now, counter-clockwise; angle_sd_rad: its standard deviation.
+        angle_rad: turn of the sample since then, counter-clockwise; angle_sd_rad: its standard deviation.
         center_m, center_now_m: a place on the sample, before and now: the middle of the common area.
         sd_m: standard deviation of `center_now_m` along its most uncertain axis.
         wrong: estimated probability of a false match.
