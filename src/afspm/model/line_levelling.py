@@ -11,8 +11,6 @@ Array = NDArray[np.float64]
 # standard deviation of a normal distribution, in median absolute deviations
 _SD_PER_MAD = 1.4826
 _OUTLIERS_SD = 4.0
-# least share of a line's values that gives the line's height
-_LEAST_GROUND = 0.1
 
 
 class Levelling(Enum):
@@ -43,28 +41,16 @@ def levelled(values: Array, how: Levelling) -> Array:
 def flattened(values: Array) -> Array:
     """Return values with all lines at one height and without a plane, as for small pictures.
 
-    Outliers are masked in both steps: neither a scar nor a high particle shifts its lines or tilts its neighbours.
+    Outliers are masked: neither a scar nor a high particle tilts its neighbours.
     """
-    finite = np.isfinite(values)
+    flat = levelled(levelled(values, Levelling.DIFFERENCES), Levelling.PLANE)
+    finite = np.isfinite(flat)
     if not finite.any():
-        return values
-    # a feature over more than half of a line would otherwise pass for the line's height: a dark ghost beside it
-    ground = _ground(values - _plane(values, finite), finite)
-    lines_level = values - _differences(values, _with_whole_lines(ground, finite))
-    flat = lines_level - _plane(lines_level, finite)
-    # at least half of the values are within the limit, so there is always a plane through them
-    return flat - _plane(flat, _ground(flat, finite))
-
-
-def _ground(flat: Array, finite: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        return flat
     from_middle = np.abs(flat - np.median(flat[finite]))
-    return finite & (from_middle <= _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
-
-
-def _with_whole_lines(ground: NDArray[np.bool_], finite: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    # a line that is almost all outlier is a line at another height: its offset is what levelling removes
-    few = ground.sum(axis=1) < _LEAST_GROUND * finite.sum(axis=1)
-    return np.where(few[:, None], finite, ground)
+    near = finite & (from_middle <= _OUTLIERS_SD * _SD_PER_MAD * np.median(from_middle[finite]))
+    # at least half of the values are within this limit, so there is always a plane through them
+    return flat - _plane(flat, near)
 
 
 def _plane(values: Array, finite: NDArray[np.bool_]) -> Array:

@@ -18,7 +18,8 @@ BUMP = np.exp(-((np.arange(40) - 20.0) ** 2) / 8)[:, None] * np.exp(-((np.arange
 
 def tilted(values: np.ndarray) -> np.ndarray:
     rows, columns = (np.arange(n) for n in values.shape)
-    return values + 3.0 + 0.7 * rows[:, None] - 0.2 * columns[None, :]
+    raised: np.ndarray = values + 3.0 + 0.7 * rows[:, None] - 0.2 * columns[None, :]
+    return raised
 
 
 def test_plane_levelling_removes_a_plane_completely() -> None:
