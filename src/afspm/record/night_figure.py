@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from datetime import UTC
 from pathlib import Path
@@ -13,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import counted, period_text, time_of_day
+from afspm.basics.formatting import counted, period_text, scale, time_of_day, typeset_length
 from afspm.model import names
 from afspm.record.bad_scans import BAD
+from afspm.record.drawing.image_html import round_length_m
 from afspm.record.drawing.palette import CATEGORICAL, NEUTRAL, PROBLEM, UNMEASURED, colour_map
+from afspm.record.drawing.raster import ValueRange, indices, pooled_range
 from afspm.record.drawing.timeline import time_ticks
-from afspm.record.night_record import NightMark, NightRecord, Shot
+from afspm.record.night_record import NightMark, NightRecord, Shot, Thumbnail
 from afspm.record.timeline import Span
 
 if TYPE_CHECKING:
@@ -26,15 +29,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH_IN = 7.2  # the width of two columns in a journal
-LANE_IN = 0.2
+LANE_IN = 0.22
 THUMB_PX = 64
 GAP_PX = 6
+SCALES_IN = 0.3
+MOST_SCALES = 3
 BAR_PX = 6
 COLUMNS = 14
 MOST_SHOTS = 98
 MOST_LOOKS = 3
 AROUND_NS = 8 * 60 * 1_000_000_000
 PAPER = (255, 255, 255)
+SMALL_PT, TEXT_PT = 6.0, 7.0
+_SCALE_IN = 2.3
 
 
 def prepare() -> None:
@@ -60,7 +67,7 @@ def draw(
     sheet_in = rows * WIDTH_IN / COLUMNS * (THUMB_PX + GAP_PX + BAR_PX) / (THUMB_PX + GAP_PX)
     bands_in = LANE_IN * lanes + 0.05
     looks_in = bands_in if repairs else 0.0
-    height_in = 0.32 + sheet_in + 0.42 + bands_in + (0.62 + looks_in if repairs else 0.0) + 0.42
+    height_in = 0.32 + sheet_in + SCALES_IN + 0.42 + bands_in + (0.62 + looks_in if repairs else 0.0) + 0.42
     figure = _figure(height_in)
     colours = {holder: CATEGORICAL[i % len(CATEGORICAL)] for i, holder in enumerate(record.holders)}
 
@@ -70,8 +77,13 @@ def draw(
 
     _head(figure, record, title, height_in, simulated=simulated)
     top = 0.32
-    _sheet(axes(0.0, top, WIDTH_IN, sheet_in), record, shots, colours, rows)
-    top += sheet_in + 0.42
+    spans = _spans(shots)
+    _sheet(axes(0.0, top, WIDTH_IN, sheet_in), record, shots, colours, rows, spans)
+    top += sheet_in
+    for number, kind in enumerate(list(spans)[:MOST_SCALES]):
+        left = WIDTH_IN - 0.1 - _SCALE_IN * (number + 1)
+        _height_scale(axes(left + 1.15, top + 0.1, 0.7, 0.1), kind, spans[kind])
+    top += SCALES_IN + 0.42
     label_in = 1.35
     night = axes(label_in, top, WIDTH_IN - label_in - 0.12, bands_in)
     _bands(night, record, problems, colours, (record.start_ns, record.end_ns), names_too=True)
@@ -101,9 +113,9 @@ def _head(figure: Figure, record: NightRecord, title: str, height_in: float, *, 
     what = f"{title}   " if title else ""
     y = 1 - 0.17 / height_in
     about = f"{what}{period_text(record.start_ns, record.end_ns, UTC)}, {counted(record.scans, 'scan')}"
-    figure.text(0.03, y, about, size=7, va="center")
-    legend = "bar: who was in control, as in b" + ("; framed: bad or interrupted" if record.bad_ns() else "")
-    figure.text(0.86, y, legend, size=5.5, va="center", ha="right")
+    figure.text(0.03, y, about, size=TEXT_PT, va="center")
+    legend = "lower bar: in control, as in b" + ("; framed: bad or interrupted" if record.bad_ns() else "")
+    figure.text(0.86, y, legend, size=SMALL_PT, va="center", ha="right")
     _letter(figure, "a", 0.0, y)
     if simulated:
         figure.text(0.995, y, "SIMULATED", size=9, weight="bold", color=PROBLEM, ha="right", va="center")
@@ -113,7 +125,33 @@ def _letter(figure: Figure, letter: str, x: float, y: float) -> None:
     figure.text(x + 0.008, y, letter, size=9, weight="bold", va="center")
 
 
-def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mapping[str, str], rows: int) -> None:
+def _spans(shots: Sequence[Shot]) -> dict[tuple[str, float], ValueRange]:
+    # scans of one size are compared: their colours mean the same heights; the most frequent size first
+    kinds = Counter(shot.picture.kind for shot in shots)
+    return {
+        kind: pooled_range(shot.picture.values for shot in shots if shot.picture.kind == kind)
+        for kind, _ in kinds.most_common()
+    }
+
+
+def _height_scale(ax: Axes, kind: tuple[str, float], span: ValueRange) -> None:
+    unit, width_m = kind
+    factor, shown = scale(max(abs(span.low), abs(span.high)), unit)
+    ax.imshow(colour_map("gold")[None], aspect="auto", extent=(0.0, 1.0, 0.0, 1.0))
+    ax.set_axis_off()
+    low, high = (f"{value * factor:.3g}".replace("-", "−") for value in (span.low, span.high))
+    ax.text(-0.06, 0.45, f"{typeset_length(width_m)} wide:  {low}", size=SMALL_PT, ha="right", va="center")
+    ax.text(1.06, 0.45, f"{high} {shown}", size=SMALL_PT, va="center")
+
+
+def _sheet(
+    ax: Axes,
+    record: NightRecord,
+    shots: Sequence[Shot],
+    colours: Mapping[str, str],
+    rows: int,
+    spans: Mapping[tuple[str, float], ValueRange],
+) -> None:
     # one image for all pictures: drawing an image for each takes much longer
     pitch, tall = THUMB_PX + GAP_PX, THUMB_PX + GAP_PX + BAR_PX
     canvas = np.full((rows * tall, COLUMNS * pitch, 3), PAPER, np.uint8)
@@ -121,8 +159,11 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     palette = np.vstack([colour_map("gold"), [_rgb(NEUTRAL)]])  # the last colour marks unmeasured pixels
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
-        picture = palette[_fitted(shot.picture)[::-1]]  # drawn with y upwards
+        picture = palette[_fitted(indices(shot.picture.values, spans[shot.picture.kind]))[::-1]]  # drawn with y upwards
         canvas[y : y + THUMB_PX, x : x + THUMB_PX] = picture
+        bar_px = _scale_bar_px(shot.picture)[1]
+        canvas[y + THUMB_PX - 8 : y + THUMB_PX - 3, x + 3 : x + 5 + bar_px] = 0
+        canvas[y + THUMB_PX - 7 : y + THUMB_PX - 4, x + 4 : x + 4 + bar_px] = 255
         bar = _rgb(colours.get(record.holder_of(shot) or "", NEUTRAL))
         canvas[y + THUMB_PX + 1 : y + THUMB_PX + BAR_PX, x : x + THUMB_PX] = bar
         if shot.time_ns in bad_ns:
@@ -132,7 +173,17 @@ def _sheet(ax: Axes, record: NightRecord, shots: Sequence[Shot], colours: Mappin
     for i, shot in enumerate(shots):
         y, x = i // COLUMNS * tall, i % COLUMNS * pitch + GAP_PX // 2
         label = time_of_day(shot.time_ns, UTC, seconds=False)
-        ax.text(x + 2, y + 2, label, size=4.5, color="white", va="top", bbox=_LABEL)
+        ax.text(x + 2, y + 2, label, size=SMALL_PT, color="white", va="top", bbox=_LABEL)
+        if i == 0 or shot.picture.width_m != shots[i - 1].picture.width_m:  # the length holds until the next label
+            length = typeset_length(_scale_bar_px(shot.picture)[0])
+            ax.text(x + 4, y + THUMB_PX - 10, length, size=SMALL_PT, color="white", va="bottom", bbox=_LABEL)
+
+
+def _scale_bar_px(picture: Thumbnail) -> tuple[float, int]:
+    # length in m, and in pixels of the sheet
+    ny, nx = picture.levels.shape
+    length_m = round_length_m(picture.width_m / 2.5)
+    return length_m, max(1, round(length_m / picture.width_m * THUMB_PX * nx / max(nx, ny)))
 
 
 _LABEL: dict[str, object] = {"boxstyle": "square,pad=0.12", "facecolor": "black", "alpha": 0.55, "linewidth": 0}
@@ -163,7 +214,7 @@ def _bands(
     ax.axhline(first - 0.5, color="black", linewidth=0.5)
     ax.set_xlim(*limits)
     ax.set_ylim(max(len(labels), 1) - 0.5, -0.5)
-    ax.set_yticks(range(len(labels)), labels if names_too else [""] * len(labels), size=5.5, linespacing=0.95)
+    ax.set_yticks(range(len(labels)), labels if names_too else [""] * len(labels), size=SMALL_PT, linespacing=0.95)
     ax.tick_params(axis="y", length=0)
     ax.set_facecolor("#F4F4F4")
     for side in ("top", "right", "left"):
@@ -200,20 +251,20 @@ def _actions(ax: Axes, record: NightRecord, lanes: Mapping[str, int], limits: tu
 
 def _hours(ax: Axes, record: NightRecord) -> None:
     _times(ax, record.start_ns, record.end_ns, about=10)
-    ax.set_xlabel("time of day, UTC", size=6, labelpad=1)
+    ax.set_xlabel("time of day, UTC", size=TEXT_PT, labelpad=1)
     _legend(ax)
 
 
 def _times(ax: Axes, begin_ns: int, end_ns: int, *, about: int) -> None:
     ticks_ns = [round(tick_s * NS_PER_S) for tick_s in time_ticks(begin_ns / NS_PER_S, end_ns / NS_PER_S, about)]
     seconds = any(tick_ns % (60 * NS_PER_S) for tick_ns in ticks_ns)
-    ax.set_xticks(ticks_ns, [time_of_day(tick_ns, UTC, seconds=seconds) for tick_ns in ticks_ns], size=6)
+    ax.set_xticks(ticks_ns, [time_of_day(tick_ns, UTC, seconds=seconds) for tick_ns in ticks_ns], size=TEXT_PT)
 
 
 def _legend(ax: Axes) -> None:
     if ax.get_legend_handles_labels()[1]:
         ax.legend(
-            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=5.5, frameon=False, handletextpad=0.1,
+            loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, fontsize=SMALL_PT, frameon=False, handletextpad=0.1,
             borderpad=0.1,
         )  # fmt: skip
 

@@ -14,11 +14,39 @@ from afspm.basics.plain_data import Plain
 from afspm.model import ControlMode, ControlState, Problem, Scan
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
-from afspm.record.drawing.raster import indices, reduced, value_range
+from afspm.record.drawing.palette import LEVELS, UNMEASURED
+from afspm.record.drawing.raster import ValueRange, indices, reduced, value_range
 from afspm.record.measurement_history import SOON_NS
 from afspm.record.timeline import Span, Timeline
 
 THUMBNAIL_PX = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A small levelled image of a scan.
+
+    Attributes:
+        levels: [y, x], y upwards: indices into a colour map.
+        span: the values of the first and the last colour, in `unit`.
+        width_m: of the scan.
+    """
+
+    levels: NDArray[np.uint8]
+    span: ValueRange
+    unit: str
+    width_m: float
+
+    @property
+    def kind(self) -> tuple[str, float]:
+        """Unit and width: thumbnails of one kind are compared, so they share a range."""
+        return self.unit, float(f"{self.width_m:.3g}")
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """The levelled values, as exact as the colours; NaN at unmeasured pixels."""
+        step = (self.span.high - self.span.low) / (LEVELS - 1)
+        return np.where(self.levels == UNMEASURED, np.nan, self.span.low + step * self.levels)
 
 
 @dataclass(frozen=True)
@@ -28,7 +56,7 @@ class Shot:
     time_ns: int
     start_ns: int | None
     holder: str | None
-    picture: NDArray[np.uint8]
+    picture: Thumbnail
 
 
 @dataclass(frozen=True)
@@ -79,7 +107,9 @@ class NightRecord:
         if identity in self._known:
             return False
         if kind == "scan":
-            picture = np.frombuffer(base64.b64decode(entry["picture"]), np.uint8).reshape(entry["shape"])
+            levels = np.frombuffer(base64.b64decode(entry["picture"]), np.uint8).reshape(entry["shape"])
+            span = ValueRange(*entry["span"])
+            picture = Thumbnail(levels, span, entry["unit"], entry["width_m"])
             self.shots.append(Shot(time_ns, entry["start_ns"], entry["holder"], picture))
         elif kind == "control":
             state = ControlState(ControlMode(entry["mode"]), entry["holder"], tuple(entry["problems"]))
@@ -154,14 +184,17 @@ def sorted_by_time(control: list[tuple[int, ControlState]]) -> list[tuple[int, C
 
 
 def scan_entry(scan: Scan, time_ns: int, start_ns: int | None, holder: str | None) -> dict[str, object]:
-    picture = thumbnail(scan.values)
+    picture = thumbnail(scan)
     return {
         "kind": "scan",
         "time_ns": time_ns,
         "start_ns": start_ns,
         "holder": holder,
-        "shape": list(picture.shape),
-        "picture": base64.b64encode(picture.tobytes()).decode(),
+        "shape": list(picture.levels.shape),
+        "picture": base64.b64encode(picture.levels.tobytes()).decode(),
+        "span": [picture.span.low, picture.span.high],
+        "unit": picture.unit,
+        "width_m": picture.width_m,
     }
 
 
@@ -182,7 +215,7 @@ def mark_entry(
     return {"kind": "mark", "time_ns": time_ns, "by": by, "what": what, "score": score, "of_ns": of_ns}
 
 
-def thumbnail(values: NDArray[np.float64], largest_px: int = THUMBNAIL_PX) -> NDArray[np.uint8]:
-    """Return a small levelled image of a scan, [y, x], as indices into a colour map."""
-    small = flattened(reduced(values, largest_px))
-    return indices(small, value_range(small))
+def thumbnail(scan: Scan, largest_px: int = THUMBNAIL_PX) -> Thumbnail:
+    small = flattened(reduced(scan.values, largest_px))
+    span = value_range(small)
+    return Thumbnail(indices(small, span), span, scan.unit, scan.region.size_m[0])

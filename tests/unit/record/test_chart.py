@@ -18,7 +18,7 @@ def test_chart_has_ticks_units_and_its_curves_within_the_frame() -> None:
     assert ElementTree.fromstring(drawn).tag == "svg"
     assert "Bias / V" in drawn
     assert "&lt;I&gt; / nA" in drawn
-    assert ">-2</text>" in drawn
+    assert ">−2</text>" in drawn
     points = re.search(r'<polyline[^>]* points="([^"]*)"', drawn)
     assert points is not None
     x, y = np.array([pair.split(",") for pair in points[1].split()], dtype=float).T

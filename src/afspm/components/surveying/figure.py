@@ -33,9 +33,9 @@ Floats = NDArray[np.float64]
 MOST_ZOOMS: Final = 15
 _COLUMNS: Final = 5
 _SURVEY_IN, _ZOOM_IN, _CURVE_IN = 4.6, 1.28, 0.8
-_LEFT_IN, _TOP_IN, _BOTTOM_IN, _RIGHT_IN = 0.15, 0.42, 0.5, 0.75
+_LEFT_IN, _TOP_IN, _BOTTOM_IN, _RIGHT_IN = 0.15, 0.42, 0.55, 0.75
 _BAR_IN, _GAP_IN, _ROW_IN = 0.1, 0.08, 0.22
-_TEXT: Final = 7.5
+_TEXT: Final = 9.0  # readable where the whole picture is shown 800 px wide
 _MARK: Final = CATEGORICAL[3]
 _CURVES: Final = (CATEGORICAL[0], CATEGORICAL[2], CATEGORICAL[1], CATEGORICAL[4])
 _OUTLINE: Final = [withStroke(linewidth=2.0, foreground="black")]
@@ -63,7 +63,7 @@ class _Picture:
         self._columns = columns if self._shown else 0
         self._row_in = _ZOOM_IN + (_GAP_IN + _CURVE_IN if record.curves else 0.0) + _ROW_IN
         body_in = max(_SURVEY_IN, self._rows * self._row_in - _ROW_IN)
-        self._zooms_in = _LEFT_IN + _SURVEY_IN + 1.15  # beside the colour bar of the survey
+        self._zooms_in = _LEFT_IN + _SURVEY_IN + 1.25  # beside the colour bar of the survey
         zooms_in = self._columns * (_ZOOM_IN + _GAP_IN)
         self._width_in = self._zooms_in + (zooms_in + _RIGHT_IN if zooms_in else -0.1)
         self._height_in = _TOP_IN + body_in + _BOTTOM_IN
@@ -144,7 +144,7 @@ class _Picture:
             else:
                 values = flattened(visit.zoom, 1) * factor
                 axes = self._image(visit.zoom, values, colours, place)
-                draw_scale_bar(axes, visit.zoom.region.size_m, (0.0, 0.0), 1e9, font=6.5, named=index == 0)
+                draw_scale_bar(axes, visit.zoom.region.size_m, (0.0, 0.0), 1e9, font=_TEXT, named=index == 0)
                 self._mark_curves(axes, visit)
             self._label(axes, visit)
             if spectra:
@@ -160,7 +160,7 @@ class _Picture:
                   color="white", path_effects=_OUTLINE)  # fmt: skip
         if visit.registration is not None and not visit.registration.is_registered:
             sd = "" if visit.position_sd_m is None else f" ± {typeset_length(float(f'{visit.position_sd_m:.2g}'))}"
-            axes.text(0.96, 0.95, f"dead reckoning{sd}", transform=axes.transAxes, size=6.5, ha="right", va="top",
+            axes.text(0.96, 0.95, f"dead reckoning{sd}", transform=axes.transAxes, size=_TEXT, ha="right", va="top",
                       color="white", path_effects=_OUTLINE)  # fmt: skip
         if said:
             axes.text(0.5, 0.5, said, transform=axes.transAxes, size=_TEXT, ha="center", va="center",
@@ -194,8 +194,8 @@ class _Picture:
     def _legend(self) -> None:
         x = self._zooms_in
         for name, colour in zip(self._record.curves, self._colours(), strict=False):
-            self._figure.text(x / self._width_in, 0.1 / self._height_in, f"● {name}", color=colour, size=_TEXT + 1)
-            x += 0.3 + 0.09 * len(name)
+            self._figure.text(x / self._width_in, 0.1 / self._height_in, f"● {name}", color=colour, size=_TEXT)
+            x += 0.3 + 0.1 * len(name)
 
     def _colours(self) -> list[str]:
         return [_CURVES[index % len(_CURVES)] for index in range(len(self._record.curves))]

@@ -20,12 +20,17 @@ FORWARD, BACKWARD = "#c2571a", "#3f7fc4"
 
 @dataclass(frozen=True)
 class Axis:
-    """A variable with its name, unit and range."""
+    """A variable with its name, unit and range.
+
+    Attributes:
+        largest: the number that gives the prefix of the unit, where two axes share one; 0: this range's.
+    """
 
     name: str
     unit: str
     low: float
     high: float
+    largest: float = 0.0
 
     @classmethod
     def over(cls, name: str, unit: str, values: Array) -> Axis:
@@ -39,8 +44,16 @@ class Axis:
     @property
     def scaled(self) -> tuple[float, str]:
         """Return (factor, label with unit) that give readable numbers."""
-        factor, unit = scale(max(abs(self.low), abs(self.high)), self.unit)
+        factor, unit = scale(self.largest or max(abs(self.low), abs(self.high)), self.unit)
         return factor, f"{self.name} / {unit}" if unit else self.name
+
+    def ticks(self, about: int = 5) -> list[tuple[float, str]]:
+        """Return about `about` round ticks: (place from 0 at the low end to 1, label)."""
+        factor, _ = self.scaled
+        return [
+            (float(self.at(np.array(tick / factor), 0.0, 1.0)), f"{tick:g}".replace("-", "−"))
+            for tick in round_ticks(self.low * factor, self.high * factor, about)
+        ]
 
     def at(self, values: Array, begin: float, end: float) -> Array:
         """Map values linearly to [begin, end]."""
@@ -102,7 +115,7 @@ def _places(x: Axis, y: Axis, across: Array, up: Array, size: Size) -> str:
 
 def _frame(x: Axis, y: Axis, size: Size) -> str:
     right, bottom = size[0] - _RIGHT, size[1] - _BOTTOM
-    (x_factor, x_label), (y_factor, y_label) = x.scaled, y.scaled
+    (_, x_label), (_, y_label) = x.scaled, y.scaled
     made = [
         f'<path d="M{_LEFT},{_TOP}V{bottom}H{right}" fill="none" stroke="currentColor" opacity="0.6"/>',
         f'<text x="{(_LEFT + right) / 2:.0f}" y="{size[1] - 4}" text-anchor="middle" fill="currentColor">'
@@ -110,12 +123,12 @@ def _frame(x: Axis, y: Axis, size: Size) -> str:
         f'<text transform="translate(10,{(_TOP + bottom) / 2:.0f}) rotate(-90)" text-anchor="middle" '
         f'fill="currentColor">{escape(y_label)}</text>',
     ]
-    for tick in round_ticks(x.low * x_factor, x.high * x_factor):
-        at = float(x.at(np.array(tick / x_factor), _LEFT, right))
+    for place, label in x.ticks():
+        at = _LEFT + place * (right - _LEFT)
         made.append(f'<path d="M{at:.1f},{bottom}v3" stroke="currentColor" opacity="0.6"/>')
-        made.append(f'<text x="{at:.1f}" y="{bottom + 14}" text-anchor="middle" fill="currentColor">{tick:g}</text>')
-    for tick in round_ticks(y.low * y_factor, y.high * y_factor, 4):
-        at = float(y.at(np.array(tick / y_factor), bottom, _TOP))
+        made.append(f'<text x="{at:.1f}" y="{bottom + 14}" text-anchor="middle" fill="currentColor">{label}</text>')
+    for place, label in y.ticks(4):
+        at = bottom + place * (_TOP - bottom)
         made.append(f'<path d="M{_LEFT},{at:.1f}h-3" stroke="currentColor" opacity="0.6"/>')
-        made.append(f'<text x="{_LEFT - 5}" y="{at + 3.5:.1f}" text-anchor="end" fill="currentColor">{tick:g}</text>')
+        made.append(f'<text x="{_LEFT - 5}" y="{at + 3.5:.1f}" text-anchor="end" fill="currentColor">{label}</text>')
     return "".join(made)

@@ -30,14 +30,17 @@ class Shown:
     span: ValueRange
 
 
-def shown(values: Array, largest_px: int, palette: str = PALETTES[0], *, small: bool = False) -> Shown:
+def shown(
+    values: Array, largest_px: int, palette: str = PALETTES[0], *, small: bool = False, span: ValueRange | None = None
+) -> Shown:
     """Return values [y, x], y ascending, as an image of at most `largest_px` a side.
 
     Args:
         small: prefer a small file to exact colours.
+        span: the values at the ends of the colour map; None: the robust range of this image.
     """
     some = reduced(values, largest_px, each_side=True)
-    span = value_range(some)
+    span = value_range(some) if span is None else span
     return Shown((webp if small else png)(indices(some, span), palette), span)
 
 

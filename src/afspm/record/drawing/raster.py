@@ -67,6 +67,11 @@ def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST
     return ValueRange(min(span.low for span in spans), max(span.high for span in spans))
 
 
+def pooled_range(pictures: Iterable[Array]) -> ValueRange:
+    """Return one range for a series of images: that of all their values, so that a few odd ones don't widen it."""
+    return value_range(np.concatenate([values.ravel() for values in pictures])[None, :])
+
+
 def indices(values: Array, span: ValueRange) -> NDArray[np.uint8]:
     """Return the index of each value in the colour map; UNMEASURED where it is not finite."""
     with np.errstate(invalid="ignore", over="ignore"):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import io
 import logging
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from afspm.basics import entry_points
 from afspm.basics.errors import AfspmError
@@ -17,7 +16,8 @@ from afspm.model import ControlMode, ControlState, ScanSet, names
 from afspm.model.line_levelling import flattened
 from afspm.record.bad_scans import bad_scans
 from afspm.record.drawing.image_html import Shown, shown
-from afspm.record.night_record import NightMark, NightRecord, Shot, thumbnail
+from afspm.record.drawing.raster import Array, pooled_range, reduced
+from afspm.record.night_record import NightMark, NightRecord, Shot, Thumbnail, thumbnail
 from afspm.record.report.story import RunStory
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow
@@ -39,7 +39,7 @@ class TopographyPicture:
 
     Attributes:
         image: in colour, levelled.
-        grey: for the figure of the night: indices into a colour map, [y, x] with y upwards.
+        thumbnail: for the figure of the night.
         is_bad: drawn with a frame.
     """
 
@@ -47,7 +47,7 @@ class TopographyPicture:
     channel: str = ""
     unit: str = ""
     image: Shown | None = None
-    grey: NDArray[np.uint8] | None = None
+    thumbnail: Thumbnail | None = None
     is_bad: bool = False
 
 
@@ -62,7 +62,20 @@ class FigurePicture:
 
 def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) -> list[TopographyPicture]:
     """Return the scans with pictures; `bad_ns`: the times of the bad scans."""
-    return [replace(one, is_bad=one.row.time_ns in bad_ns) for one in _read(run, rows)]
+    read = [_read(run, row) for row in rows]
+    compared: dict[tuple[str, float], list[Array]] = {}
+    for one, values in read:
+        if one.thumbnail is not None and values is not None:
+            compared.setdefault(one.thumbnail.kind, []).append(values)
+    # scans of one size are compared: their colours mean the same heights
+    spans = {kind: pooled_range(values) for kind, values in compared.items()}
+    pictures = []
+    for one, values in read:
+        image = None
+        if one.thumbnail is not None and values is not None:
+            image = shown(values, LARGEST_PX, small=True, span=spans[one.thumbnail.kind])
+        pictures.append(replace(one, image=image, is_bad=one.row.time_ns in bad_ns))
+    return pictures
 
 
 def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
@@ -82,18 +95,18 @@ def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] =
     return [rows[k] for k in sorted({*odd, *even})]
 
 
-def _read(run: Run, rows: Sequence[ScanRow]) -> Iterator[TopographyPicture]:
-    for row in rows:
-        try:
-            scans = run.scan(row)
-        except AfspmError as error:
-            _log.debug("scan %d has no picture: %s", row.number, error)
-            yield TopographyPicture(row)
-            continue
-        scan = scans[topography(scans)]
-        has_values = bool(np.isfinite(scan.values).any())
-        image = shown(flattened(scan.values), LARGEST_PX, small=True) if has_values else None
-        yield TopographyPicture(row, scan.channel, scan.unit, image, thumbnail(scan.values) if has_values else None)
+def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
+    # without the image, but with its values
+    try:
+        scans = run.scan(row)
+    except AfspmError as error:
+        _log.debug("scan %d has no picture: %s", row.number, error)
+        return TopographyPicture(row), None
+    scan = scans[topography(scans)]
+    if not np.isfinite(scan.values).any():
+        return TopographyPicture(row, scan.channel, scan.unit), None
+    values = reduced(flattened(scan.values), LARGEST_PX, each_side=True)
+    return TopographyPicture(row, scan.channel, scan.unit, thumbnail=thumbnail(scan)), values
 
 
 def topography(scans: ScanSet) -> str:
@@ -103,7 +116,7 @@ def topography(scans: ScanSet) -> str:
 
 def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> None:
     """Draw the night unless a component has, and the figures that packages declare."""
-    if is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.grey is not None for one in pictures):
+    if is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.thumbnail is not None for one in pictures):
         from afspm.record import night_figure
 
         record = night_of(run, story, pictures)
@@ -129,7 +142,9 @@ def night_of(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -
     """Return the data for the picture of the night."""
     record = NightRecord(end_ns=story.end_ns, scans_taken=len(story.scans))
     record.shots = [
-        Shot(one.row.time_ns, one.row.began_ns, one.row.holder, one.grey) for one in pictures if one.grey is not None
+        Shot(one.row.time_ns, one.row.began_ns, one.row.holder, one.thumbnail)
+        for one in pictures
+        if one.thumbnail is not None
     ]
     record.control = [(row.time_ns, row.state) for row in run.control] or [
         (story.start_ns, ControlState(ControlMode.UNDEFINED))

@@ -13,7 +13,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import duration_text, quantity, scale, typeset_area, typeset_position
 from afspm.model import Frame, RegistrationOutcome
 from afspm.model.geometry import XY
-from afspm.record.drawing.curves import round_ticks
+from afspm.record.drawing.chart import Axis
 from afspm.record.drawing.image_html import data_url, scale_bar
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
@@ -24,7 +24,7 @@ from afspm.record.tables import ScanRow
 _LEGEND = (
     "Click a picture to enlarge it. The bar below it has the colour of who was in control; framed: "
     "bad or interrupted; refused, failed, new: its place on the sample is dead reckoning. Topography, rows brought to "
-    "one height, without its plane."
+    "one height, without its plane; scans of one size share one range of heights."
 )
 _MARGIN = 0.04
 _HIDDEN_BEHIND = 40  # most pictures on the map: older ones disappear beneath newer ones
@@ -71,11 +71,12 @@ class _View:
         self.width, self.height = (float(value) for value in 2.0 * half)
 
     def frame(self, content: str) -> str:
-        factor, unit = scale(max(abs(self.left), abs(self.low), self.width, self.height), "m")
-        x_ticks = round_ticks(self.left * factor, (self.left + self.width) * factor)
-        y_ticks = round_ticks(self.low * factor, (self.low + self.height) * factor)
-        ticks = [f'<s class="x" style="left:{self._x(tick / factor):.2f}%">{tick:g}</s>' for tick in x_ticks[:-1]]
-        ticks += [f'<s class="y" style="top:{self._y(tick / factor):.2f}%">{tick:g}</s>' for tick in y_ticks]
+        largest_m = max(abs(self.left), abs(self.low), self.width, self.height)
+        x = Axis("", "m", self.left, self.left + self.width, largest_m)
+        y = Axis("", "m", self.low, self.low + self.height, largest_m)
+        _, unit = scale(largest_m, "m")
+        ticks = [f'<s class="x" style="left:{100 * at:.2f}%">{label}</s>' for at, label in x.ticks()[:-1]]
+        ticks += [f'<s class="y" style="top:{100 - 100 * at:.2f}%">{label}</s>' for at, label in y.ticks()]
         ticks.append(f'<s class="x" style="left:97%">{unit}</s>')
         bar = scale_bar((self.width, self.height))
         ratio = self.width / self.height

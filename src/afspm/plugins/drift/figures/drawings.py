@@ -10,9 +10,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import ConnectionPatch
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import typeset_length
 from afspm.plugins.drift.figures.style import (
     BLUE,
     GREEN,
@@ -25,6 +27,7 @@ from afspm.plugins.drift.figures.style import (
     Array,
     figure,
     letter,
+    shared_span,
     show_scan,
     styled,
     time_axis,
@@ -32,6 +35,7 @@ from afspm.plugins.drift.figures.style import (
 )
 from afspm.plugins.drift.record import DriftRecord
 from afspm.plugins.drift.registration import DriftScan, Matches
+from afspm.record.drawing.image_html import round_length_m
 
 
 def draw_offsets(
@@ -104,8 +108,9 @@ def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
     with styled():
         made = figure(2 * _PAIR_INCHES, (_PAIR_INCHES + 0.15) * len(pairs))
         for row, pair in zip(made.subplots(len(pairs), 2, squeeze=False), pairs, strict=True):
+            span = shared_span((pair.first, pair.second))
             for ax, scan in zip(row, (pair.first, pair.second), strict=True):
-                show_scan(ax, scan)
+                show_scan(ax, scan, span)
                 ax.set(xlabel="x / µm", ylabel="y / µm")
             hours = (pair.second.mid_s - pair.first.mid_s) / HOUR_S
             unit, factor = unit_of(pair.moved_m)
@@ -116,13 +121,24 @@ def draw_pairs(pairs: Sequence[ScanPair]) -> Figure:
 
 
 def _arrow(ax: Axes, pair: ScanPair) -> None:
-    # from the middle of the frame to the feature's place now; a dot below one pixel
-    start = 1e6 * np.asarray(pair.second.region.center_m)
-    end = start + 1e6 * pair.moved_m
-    if np.hypot(*pair.moved_m) > max(pair.second.pixel_m):
-        how = {"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.8, "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0}
-        ax.annotate("", xy=tuple(end), xytext=tuple(start), arrowprops=how)
+    # from the middle of the frame to the feature's place now, magnified if it were too short to see; the key arrow in
+    # the lower right corner has the same magnification
+    region, moved_m = pair.second.region, float(np.hypot(*pair.moved_m))
+    start = 1e6 * np.asarray(region.center_m)
     ax.plot(*start, "o", color=ORANGE, markersize=3.5)
+    if not moved_m > 0.0:
+        return
+    side_m = min(region.size_m)
+    magnified = 1.0 if moved_m > 0.1 * side_m else max(1.0, round_length_m(0.3 * side_m / moved_m))
+    how = {"arrowstyle": "-|>", "color": ORANGE, "linewidth": 1.8, "mutation_scale": 10, "shrinkA": 0, "shrinkB": 0}
+    ax.annotate("", xy=tuple(start + 1e6 * magnified * pair.moved_m), xytext=tuple(start), arrowprops=how)
+    key_m = round_length_m(0.3 * side_m / magnified)
+    left, low = (1e6 * edge for edge in region.top_left_m)
+    right, up = left + 0.95e6 * region.size_m[0], low + 0.06e6 * region.size_m[1]
+    ax.annotate("", xy=(right, up), xytext=(right - 1e6 * key_m * magnified, up), arrowprops=how)
+    often = "" if magnified == 1.0 else f", ×{magnified:.0f}"
+    ax.text(right, up + 0.04e6 * region.size_m[1], f"{typeset_length(key_m)}{often}", size=6.5, color="white",
+            ha="right", va="bottom", bbox={"facecolor": "black", "alpha": 0.5, "pad": 1.5, "linewidth": 0})  # fmt: skip
 
 
 def draw_estimates(record: DriftRecord, *, title: str = "", truth_m: Array | None = None) -> Figure:
@@ -187,7 +203,7 @@ def draw_histogram(record: DriftRecord, *, title: str = "") -> Figure:
             strict=True,
         )  # fmt: skip
         for ax, values, name, colour in columns:
-            _histogram(ax, values * factor, colour)
+            _histogram(ax, values * factor, colour, unit)
             ax.set(xlabel=f"{name} / {unit}", ylabel="scans" if name == "x" else "")
         made.suptitle(title, size=7)
     return made
@@ -208,13 +224,24 @@ def freedman_diaconis(values: Array) -> Array:
     return np.linspace(low, high, min(max(count, 1), _MOST_BINS) + 1)
 
 
-def _histogram(ax: Axes, values: Array, colour: str) -> None:
+def round_bins(values: Array) -> Array:
+    """Return bins with round edges, at most as wide as those of `freedman_diaconis`; at least √n of them."""
+    edges = freedman_diaconis(values)
+    span = float(edges[-1] - edges[0])
+    width = round_length_m(min(float(edges[1] - edges[0]), span / np.sqrt(len(values))))
+    first, last = np.floor(edges[0] / width + 1e-9), np.ceil(edges[-1] / width - 1e-9)
+    return np.asarray(width * np.arange(first, last + 1.0))
+
+
+def _histogram(ax: Axes, values: Array, colour: str, unit: str) -> None:
     if values.size == 0:
         ax.text(0.5, 0.5, "no pair was accepted", ha="center", transform=ax.transAxes)
         return
-    ax.hist(values, freedman_diaconis(values).tolist(), color=colour, edgecolor="white", linewidth=0.5)
+    ax.hist(values, round_bins(values).tolist(), color=colour, edgecolor="white", linewidth=0.5)
     ax.axvline(float(np.median(values)), color="black", linewidth=0.8)
-    ax.set_title(f"median {np.median(values):.2f}, rms {np.sqrt(np.mean(values**2)):.2f}, n = {len(values)}", size=6.5)
+    ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+    median, rms = np.median(values), np.sqrt(np.mean(values**2))
+    ax.set_title(f"median {median:.3g} {unit}, rms {rms:.3g} {unit}, n = {len(values)}", size=6.5)
 
 
 _MOST_LINES = 60
@@ -231,10 +258,10 @@ def draw_features(reference: DriftScan, scan: DriftScan, matches: Matches | None
         raise InvalidValue("this estimator uses no features", hint='e.g. estimator "brief"')
     with styled():
         made = figure(2 * _INCHES, 2 * _INCHES + 0.3)
-        rows = made.subplots(2, 2)
+        rows, span = made.subplots(2, 2), shared_span((reference, scan))
         for row in rows:
             for ax, one in zip(row, (reference, scan), strict=True):
-                show_scan(ax, one)
+                show_scan(ax, one, span)
                 ax.set_xlabel("x / µm")
             row[0].set_ylabel("y / µm")
             row[1].set_yticklabels([])  # the lines between the scans cross them
@@ -317,7 +344,11 @@ def _known(ax: Axes, record: DriftRecord, truth_m: Array, hours: Array) -> None:
     for axis, (name, colour) in enumerate((("x", BLUE), ("y", ORANGE))):
         sd = record.sd_m[1:, axis] * factor  # displacements are counted from the first scan
         ax.fill_between(hours[1:], -2 * sd, 2 * sd, color=colour, alpha=0.15, linewidth=0, label=f"± 2 sd, {name}")
-        ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, believed - true")
+        ax.plot(hours, error_m[:, axis] * factor, color=colour, linewidth=0.9, label=f"{name}, estimated − true")
     ax.axhline(0.0, color=GREY, linewidth=0.4)
     ax.set_ylabel(f"error of the estimate / {unit}")
+    if len(error_m) > 1:
+        mean, rms = error_m[1:].mean(axis=0) * factor, np.sqrt((error_m[1:] ** 2).mean(axis=0)) * factor
+        both = [f"{name} ({x:.3g}, {y:.3g}) {unit}" for name, (x, y) in (("bias", mean), ("rms", rms))]
+        ax.set_title(", ".join(both).replace("-", "−"), loc="right")
     ax.legend(ncols=2, loc="best")

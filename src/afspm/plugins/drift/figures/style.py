@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 from afspm.basics.plain_data import Plain
 from afspm.model.line_levelling import flattened
 from afspm.plugins.drift.registration import DriftScan
-from afspm.record.drawing.raster import value_range
+from afspm.record.drawing.raster import ValueRange, shared_range
+from afspm.record.plotting import draw_scale_bar
 
 Array = NDArray[np.float64]
 
@@ -69,12 +71,16 @@ def time_axis(ax: Axes, *, label: bool = True) -> None:
     ax.margins(x=0.02)
 
 
-def show_scan(ax: Axes, scan: DriftScan) -> None:
-    """Show a scan in grey, levelled line by line, in µm of its own frame (before rotation)."""
+def shared_span(scans: Sequence[DriftScan]) -> ValueRange:
+    """Return one range of heights for scans that are compared."""
+    return shared_range(flattened(scan.values) for scan in scans)
+
+
+def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> None:
+    """Show a scan in grey, levelled line by line, in µm of its own frame (before rotation), with a scale bar."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
     level = flattened(scan.values)
-    span = value_range(level)
     # the first and last pixels lie on the border of the region: half of each reaches over it
     half_x, half_y = (
         size / (count - 1) / 2 for size, count in zip((width, height), scan.values.shape[::-1], strict=True)
@@ -82,6 +88,7 @@ def show_scan(ax: Axes, scan: DriftScan) -> None:
     extent = (left - half_x, left + width + half_x, low - half_y, low + height + half_y)
     ax.imshow(level, cmap="gray", vmin=span.low, vmax=span.high, extent=extent, origin="lower", interpolation="nearest")
     ax.set_aspect("equal")
+    draw_scale_bar(ax, scan.region.size_m, (left, low), 1e6, font=6.5)
 
 
 def letter(ax: Axes, text: str) -> None:

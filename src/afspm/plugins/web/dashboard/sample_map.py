@@ -13,7 +13,8 @@ import numpy as np
 from afspm.basics.formatting import counted, quantity, scale, time_of_day, typeset_area, typeset_position
 from afspm.model import Region
 from afspm.model.geometry import XY
-from afspm.record.drawing.curves import Array, round_ticks
+from afspm.record.drawing.chart import Axis
+from afspm.record.drawing.curves import Array
 from afspm.record.overview import FoundPlace, ScanSummary, SpectrumSummary
 
 MOST_PLACES = 1500
@@ -244,14 +245,12 @@ def _away(view: MapView, probe_m: XY) -> str:
 def _ticks(view: MapView) -> str:
     low = np.array([view.left_m, view.low_m])
     high = low + np.array([view.width, view.height]) / view.per_m
-    factor, unit = scale(float(np.abs(np.concatenate([low, high])).max()), "m")
+    largest_m = float(np.abs(np.concatenate([low, high])).max())
+    _, unit = scale(largest_m, "m")
     parts = []
     for axis, side in ((0, "left"), (1, "bottom")):
-        span = high[axis] - low[axis]
-        for value in round_ticks(float(low[axis]) * factor, float(high[axis]) * factor, 4):
-            at = 100.0 * (value / factor - low[axis]) / span
-            text = f"{value:g}".replace("-", "−")
-            parts.append(f'<span class="tick-{"xy"[axis]}" style="{side}:{at:.2f}%">{text}</span>')
+        for at, text in Axis("", "m", float(low[axis]), float(high[axis]), largest_m).ticks(4):
+            parts.append(f'<span class="tick-{"xy"[axis]}" style="{side}:{100 * at:.2f}%">{text}</span>')
     return f'{"".join(parts)}<span class="map-unit">{unit}</span>'
 
 
