@@ -87,7 +87,7 @@ class ComparedRegion:
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
+class RunComparison:
     """Several runs beside each other.
 
     Attributes:
@@ -107,7 +107,7 @@ class Comparison:
     left_out: int = 0
 
 
-def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> Comparison:
+def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> RunComparison:
     """Return the comparison of runs; scans are compared with those of the first run that has the region.
 
     Raises:
@@ -122,7 +122,7 @@ def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> Comp
     unread: list[str] = []
     places = _common_places([story.scans for story in stories])
     regions = [region for place in places[:most_regions] if (region := _region(runs, place, align, unread)) is not None]
-    return Comparison(
+    return RunComparison(
         names=[run.folder.name for run in runs],
         simulated=[run.simulated for run in runs],
         facts={head: [text(story) for story in stories] for head, text in _FACTS.items()},

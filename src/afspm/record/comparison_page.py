@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
 from afspm.basics.formatting import quantity, typeset_area
-from afspm.record.comparison import ComparedRegion, Comparison, RegionScan, ScanDifference
+from afspm.record.comparison import ComparedRegion, RegionScan, RunComparison, ScanDifference
 from afspm.record.drawing.image_html import Shown, image_html
 from afspm.record.drawing.palette import DIVERGING, PALETTES
 from afspm.record.drawing.raster import ValueRange, indices, png, reduced, shared_range, value_range
@@ -33,7 +33,7 @@ figure:has(:checked) .over{animation:flicker 1.4s steps(1) infinite}
 """
 
 
-def write(comparison: Comparison, target: Path) -> None:
+def write(comparison: RunComparison, target: Path) -> None:
     """Write the page.
 
     Raises:
@@ -45,7 +45,7 @@ def write(comparison: Comparison, target: Path) -> None:
         raise FileError(f"can't be written: {error.strerror or error}", where=str(target)) from error
 
 
-def html(comparison: Comparison) -> str:
+def html(comparison: RunComparison) -> str:
     title = escape(" and ".join(comparison.names))
     badge = '<span class="badge">SIMULATED</span>' if any(comparison.simulated) else ""
     heads = ["", *comparison.names]
@@ -66,7 +66,7 @@ def html(comparison: Comparison) -> str:
     )
 
 
-def roughness_rows(comparison: Comparison) -> list[list[str]]:
+def roughness_rows(comparison: RunComparison) -> list[list[str]]:
     """Return a row for each region: its name, and a text for each run."""
     return [[region.name, *map(_roughness_text, region.scans)] for region in comparison.regions]
 
@@ -79,7 +79,7 @@ def _roughness_text(scan: RegionScan | None) -> str:
     return f"Sq {sq}, Sa {sa} ({columns} × {rows})"
 
 
-def _roughness(comparison: Comparison) -> str:
+def _roughness(comparison: RunComparison) -> str:
     rows = [[escape(cell) for cell in row] for row in roughness_rows(comparison)]
     note = (
         '<p class="note">Root mean square Sq and mean deviation Sa of each region, with its pixels. Lines are levelled '
@@ -89,7 +89,7 @@ def _roughness(comparison: Comparison) -> str:
     return table(["region", *comparison.names], rows) + note if rows else ""
 
 
-def _regions(comparison: Comparison) -> str:
+def _regions(comparison: RunComparison) -> str:
     if not comparison.regions:
         return (
             "<p>None: no two runs have whole scans with the same key, or without a key at the same place. After a "
@@ -100,7 +100,7 @@ def _regions(comparison: Comparison) -> str:
     return shown + more
 
 
-def _region(region: ComparedRegion, comparison: Comparison) -> str:
+def _region(region: ComparedRegion, comparison: RunComparison) -> str:
     seen = [scan for scan in region.scans if scan is not None]
     units = {(scan.scan.channel, scan.scan.unit) for scan in seen}
     # one contrast for all; scans of different channels have none in common
@@ -110,7 +110,7 @@ def _region(region: ComparedRegion, comparison: Comparison) -> str:
     return f"<h3>{escape(region.name)}</h3><p class='note'>{escape(about)}</p><div class='beside'>{figures}</div>"
 
 
-def _figures(region: ComparedRegion, comparison: Comparison, span: ValueRange | None) -> Iterator[str]:
+def _figures(region: ComparedRegion, comparison: RunComparison, span: ValueRange | None) -> Iterator[str]:
     names, marks = comparison.names, [" SIMULATED" if one else "" for one in comparison.simulated]
     for name, mark, scan in zip(names, marks, region.scans, strict=True):
         if scan is not None:
@@ -148,7 +148,7 @@ def _image(values: Array, scan: RegionScan, span: ValueRange | None, palette: st
     return image_html(image, scan.scan.region.size_m, scan.scan.unit, _WIDTH, palette)
 
 
-def rows_that_differ(comparison: Comparison) -> Sequence[tuple[str, Sequence[str]]]:
+def rows_that_differ(comparison: RunComparison) -> Sequence[tuple[str, Sequence[str]]]:
     """Return the rows of the printed table: facts, then settings, then roughness."""
     roughness = [(f"roughness of {name}", texts) for name, *texts in roughness_rows(comparison)]
     return [*comparison.facts.items(), *comparison.settings.items(), *roughness]

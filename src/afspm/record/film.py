@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.basics.formatting import day_and_time, duration_text, quantity, typeset_length
-from afspm.model import Frame, Region
+from afspm.model import Frame, Region, Scan
 from afspm.model.geometry import XY
 from afspm.model.line_levelling import flattened
 from afspm.record.drawing.image_html import round_length_m
@@ -31,7 +31,7 @@ from afspm.record.tables import ScanRow
 if TYPE_CHECKING:
     from PIL import Image, ImageDraw
 
-    from afspm.record.run import Run
+    from afspm.record.overview import DriftPoint
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,20 @@ _TURN_TOLERANCE_RAD: Final = math.radians(1.0)
 _FONT_PX: Final = 15
 _MARGIN_PX: Final = 10
 _UNMEASURED_RGB: Final = (128, 128, 128)
+
+
+class RecordedScans(Protocol):
+    """The part of a `Run` that a film needs."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def simulated(self) -> bool: ...
+    @property
+    def frame(self) -> Frame: ...
+    @property
+    def drift(self) -> Sequence[DriftPoint]: ...
+    def scan(self, which: ScanRow) -> Mapping[str, Scan]: ...
 
 
 @dataclass(frozen=True)
@@ -137,7 +151,7 @@ class Film:
         _write(draw, (width - _MARGIN_PX, low), f"SIMULATED, {shown}" if self.simulated else shown, "rd")
 
 
-def film_of(run: Run, rows: Sequence[ScanRow], channel: str | None = None) -> Film:
+def film_of(run: RecordedScans, rows: Sequence[ScanRow], channel: str | None = None) -> Film:
     """Return the film of scans of one place.
 
     Args:
@@ -176,7 +190,7 @@ def film_of(run: Run, rows: Sequence[ScanRow], channel: str | None = None) -> Fi
     )
 
 
-def places(run: Run, rows: Sequence[ScanRow]) -> list[list[ScanRow]]:
+def places(run: RecordedScans, rows: Sequence[ScanRow]) -> list[list[ScanRow]]:
     """Return the scans of each place that was scanned at least twice, the place with most scans first."""
     drift = _recorded_drift(run)
     groups: list[tuple[Region, list[ScanRow]]] = []
@@ -195,7 +209,7 @@ def places(run: Run, rows: Sequence[ScanRow]) -> list[list[ScanRow]]:
     return sorted((group for _, group in groups if len(group) > 1), key=len, reverse=True)
 
 
-def _recorded_drift(run: Run) -> Mapping[int, XY]:
+def _recorded_drift(run: RecordedScans) -> Mapping[int, XY]:
     # the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates
     if run.frame is Frame.SAMPLE:
         return {}  # regions are in sample coordinates already
@@ -222,7 +236,7 @@ def _is_same_place(first: Region, second: Region) -> bool:
     return max(apart) <= _MOST_OFFSET and max(sizes) <= _SIZE_TOLERANCE and turned <= _TURN_TOLERANCE_RAD
 
 
-def _values(run: Run, row: ScanRow, channel: str) -> Array:
+def _values(run: RecordedScans, row: ScanRow, channel: str) -> Array:
     scans = run.scan(row)
     if channel not in scans:
         raise InvalidValue(f"scan {row.number} has no channel {channel!r}", hint=f"there are {', '.join(scans)}")

@@ -15,7 +15,7 @@ from tests.unit.record.record_lab import ABOUT, REGION, Night
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse, JournalEntries, JournalEntry, Region, Scan, ScopeState
-from afspm.record.comparison import Comparison, compare, differences, flat_settings, roughness, same_region
+from afspm.record.comparison import RunComparison, compare, differences, flat_settings, roughness, same_region
 from afspm.record.comparison_page import html, roughness_rows, write
 from afspm.record.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
@@ -55,13 +55,13 @@ def record(folder: Path, values: list[tuple[Region, Array]], settings: str = "",
     return folder
 
 
-def compared(*folders: Path, **more: Any) -> Comparison:
+def compared(*folders: Path, **more: Any) -> RunComparison:
     with ExitStack() as stack:
         return compare([stack.enter_context(open_run(folder)) for folder in folders], unmoved, **more)
 
 
 @pytest.fixture
-def two(tmp_path: Path) -> Comparison:
+def two(tmp_path: Path) -> RunComparison:
     speed = "[scheduler]\nclass = 'Scheduler'\n[series.limits]\nspeed = {}\n"
     record(tmp_path / "monday", [(REGION, waves(1e-9)), (ELSEWHERE, waves(1e-9))], speed.format("'1 um/s'"))
     nearly = replace(REGION, center_m=(REGION.center_m[0] + 2e-8, REGION.center_m[1]))
@@ -69,7 +69,7 @@ def two(tmp_path: Path) -> Comparison:
     return compared(tmp_path / "monday", tmp_path / "tuesday")
 
 
-def test_only_differing_settings_are_listed_with_absent_keys(two: Comparison) -> None:
+def test_only_differing_settings_are_listed_with_absent_keys(two: RunComparison) -> None:
     assert two.settings == {"series.limits.speed": ['"1 um/s"', '"2 um/s"'], "series.more.scans": ["–", "3"]}
 
 
@@ -78,14 +78,14 @@ def test_numbers_and_texts_are_different_settings() -> None:
     assert found == {"a.b": ['"1"', "1"]}
 
 
-def test_scans_problems_and_repairs_are_counted_beside_each_other(two: Comparison) -> None:
+def test_scans_problems_and_repairs_are_counted_beside_each_other(two: RunComparison) -> None:
     assert list(two.facts["scans"]) == ["2", "1"]
     assert list(two.facts["repairs"]) == ["1 × x-pulse"] * 2
     assert all(text.startswith("1 × ") for text in two.facts["problems"])
     assert list(two.facts["sample"]) == ["gold", "gold"]
 
 
-def test_only_regions_of_both_runs_are_compared_with_their_roughness(two: Comparison) -> None:
+def test_only_regions_of_both_runs_are_compared_with_their_roughness(two: RunComparison) -> None:
     (region,) = two.regions
     first, second = region.scans
     assert first is not None
@@ -107,7 +107,7 @@ def test_root_mean_square_and_mean_deviation_differ_for_a_spike() -> None:
     assert roughness(np.full((2, 2), np.nan)) is None
 
 
-def test_difference_is_the_later_minus_the_first(two: Comparison) -> None:
+def test_difference_is_the_later_minus_the_first(two: RunComparison) -> None:
     (region,) = two.regions
     (change,) = region.differences.values()
     assert change.words == "laid over"
@@ -174,7 +174,7 @@ def test_one_run_or_the_same_run_twice_is_refused(tmp_path: Path) -> None:
         compared(folder, folder)
 
 
-def test_page_shows_one_contrast_flicker_and_simulated(two: Comparison, tmp_path: Path) -> None:
+def test_page_shows_one_contrast_flicker_and_simulated(two: RunComparison, tmp_path: Path) -> None:
     write(two, tmp_path / "compare.html")
     page = (tmp_path / "compare.html").read_text(encoding="utf-8")
     assert "SIMULATED" in page

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from afspm.plugins.drift.remount import Remount
-    from afspm.record.comparison import Comparison
+    from afspm.record.comparison import RunComparison
     from afspm.record.run import Run
 
 compare_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
@@ -89,7 +89,7 @@ def find(
         raise typer.Exit(1)
 
 
-def _compared(found: Comparison) -> Table:
+def _compared(found: RunComparison) -> Table:
     from rich import box
     from rich.table import Table
 
