@@ -68,7 +68,7 @@ def shared_range(pictures: Iterable[Array], contrast: Contrast = Contrast.ROBUST
 
 
 def pooled_range(pictures: Iterable[Array]) -> ValueRange:
-    """Return one range for a series of images: that of all their values, so that a few odd ones don't widen it."""
+    """Return the range of all values of a series of images together: a few odd images don't widen it."""
     return value_range(np.concatenate([values.ravel() for values in pictures])[None, :])
 
 
