@@ -273,3 +273,20 @@ def test_all_times_in_the_picture_are_times_of_day(monkeypatch: pytest.MonkeyPat
     draw(night(), tmp_path / "night.png", {TIP: "tip-shape-changed"})
     assert len(labels) > 5
     assert all(re.fullmatch(r"\d\d:\d\d(:\d\d)?", label) for label in labels), labels
+
+
+def test_scans_of_one_size_share_a_range_that_one_odd_scan_does_not_widen() -> None:
+    noise = np.random.default_rng(1).normal(size=(128, 128))
+    wide = Region((0.0, 0.0), (2e-6, 2e-6))
+    record = NightRecord()
+    for number in range(300):
+        height_m = 1e-6 if number == 0 else 1e-9 * (1 + number % 2)
+        record.add(scan_entry(Scan(REGION, "Height", "m", height_m * noise, number), number, None, None))
+    record.add(scan_entry(Scan(wide, "Height", "m", 1e-7 * noise, 300), 300, None, None))
+    spans = night_figure._spans(record.shots)
+    narrow, other = spans["m", REGION.size_m[0]], spans["m", 2e-6]
+    assert 2e-9 < narrow.high < 1e-8
+    assert other.high > 1e-7
+    low, high = record.shots[1].picture.span.low, record.shots[1].picture.span.high
+    assert np.nanmax(record.shots[1].picture.values) == pytest.approx(high)
+    assert np.nanmin(record.shots[1].picture.values) == pytest.approx(low)
