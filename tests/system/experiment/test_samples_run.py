@@ -72,9 +72,10 @@ def test_a_sample_runs_to_its_end(afspm_run: Run, tmp_path: Path, name: str) -> 
         assert (taken, len(record.spectra)) == (scans, spectra), one.output
 
 
+# at 240 times real time a busy computer takes scans late, and the paper's tracker then errs by more than a pixel
 SHORT_NIGHT = """
 [clock]
-speed = 240.0
+speed = 120.0
 [series]
 every = "5 min"
 scans = 7
@@ -114,6 +115,4 @@ def test_drift_night_runs_and_its_frame_follows_the_sample(
     pixel_m = 2e-6 / 64
     assert np.hypot(*drift_m[-1]) > 3 * pixel_m, "the sample stood still"
     off_m = np.hypot(*(center_m - drift_m).T)  # at a time more, where a busy computer has left scans out
-    # the paper's estimator errs by about a pixel on scans of 64²: 5 to 60 nm in seven runs; the sample moves by six
-    largest_m = (2.0 if "drift_night/paper.toml" in files else 1.0) * pixel_m
-    assert np.median(off_m) < largest_m, "the frame is not where the sample has gone"
+    assert np.median(off_m) < pixel_m, "the frame is not where the sample has gone"
