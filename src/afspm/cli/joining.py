@@ -5,7 +5,7 @@ from __future__ import annotations
 import getpass
 import platform
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
@@ -14,6 +14,7 @@ import typer
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
     from afspm.cli.status_text import RunDescription
     from afspm.client.follower import Follower
@@ -140,6 +141,19 @@ def _only_if_running(folder: Path) -> Iterator[None]:
         if (run_json_or_empty(folder).get("guest") or {}).get("keys"):
             said += f"; perhaps its scheduler lacks the public key of {TERMINAL}"
         say_nothing_runs(said)
+
+
+def plain_table(heads: Iterable[str], rows: Iterable[Iterable[str]]) -> Table:
+    """Return a table with a line below its heads and no other."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for head in heads:
+        table.add_column(head, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
+    return table
 
 
 def plain_console() -> Console:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -13,8 +13,6 @@ from afspm.basics.formatting import counted, day_and_time, quantity
 from afspm.cli.arguments import RUNS
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from afspm.record.probes import ProbeHistory
 
 
@@ -44,21 +42,10 @@ def probes(
     elif not found:
         typer.echo("no run was found")
     else:
-        from afspm.cli.joining import plain_console
+        from afspm.cli.joining import plain_console, plain_table
 
-        plain_console().print(_table(found))
-
-
-def _table(found: Sequence[ProbeHistory]) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for head in _COLUMNS:
-        table.add_column(head, overflow="fold")
-    for probe in found:
-        table.add_row(*(text(probe) for text in _COLUMNS.values()))
-    return table
+        rows = ([text(probe) for text in _COLUMNS.values()] for probe in found)
+        plain_console().print(plain_table(_COLUMNS, rows))
 
 
 def _day(time_ns: int | None) -> str:

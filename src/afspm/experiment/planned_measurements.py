@@ -14,7 +14,7 @@ from afspm.client.parameter_text import to_parameter
 from afspm.experiment.toml_lines import Table
 from afspm.model import ControlRequest, Parameter, ProbePosition, Region, Request, ScanParameters, names
 from afspm.model.geometry import XY
-from afspm.model.planned_work import PlannedWork
+from afspm.model.planned_work import PlannedWork, path_length_m
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.limits import ExperimentLimits
 
@@ -225,7 +225,7 @@ def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
     if not speed_m_s or planned.shape is None or not planned.period_s:
         return ""
     rows = planned.shape[0]
-    round_s = sum(2.0 * rows * region.size_m[0] / speed_m_s for region in planned.regions)
+    round_s = sum(path_length_m(region, rows) / speed_m_s for region in planned.regions)
     if round_s <= planned.period_s:
         return ""
     what = "the scan" if len(planned.regions) == 1 else f"a round of {len(planned.regions)} scans"

@@ -114,6 +114,17 @@ class Region:
         u_m, v_m = np.meshgrid(u * self.size_m[0], v * self.size_m[1])
         return self._in_space(u_m, v_m)
 
+    def pixel_at(self, x_m: Floats, y_m: Floats, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Return the fractional (row, column) of positions in an array of `shape`: the inverse of `pixels_m`."""
+        x, y = x_m - self.center_m[0], y_m - self.center_m[1]
+        cos, sin = math.cos(self.angle_rad), math.sin(self.angle_rad)
+        along, across = (cos * x + sin * y) / self.size_m[0], (cos * y - sin * x) / self.size_m[1]
+        return (across + 0.5) * (shape[0] - 1), (along + 0.5) * (shape[1] - 1)
+
+    def has_size_of(self, other: Region, tolerance: float) -> bool:
+        """Return whether both sizes agree with those of `other` within a relative tolerance."""
+        return all(math.isclose(a, b, rel_tol=tolerance) for a, b in zip(self.size_m, other.size_m, strict=True))
+
     def moved_to(self, center_m: XY) -> Region:
         """Return a region of the same size and angle around another centre."""
         return replace(self, center_m=center_m)

@@ -22,6 +22,7 @@ from afspm.basics.formatting import counted
 from afspm.basics.plain_data import Plain
 from afspm.model import ControlRequest, ControlResponse, JournalEntry
 from afspm.model.names import BASE_ACTIONS
+from afspm.model.planned_work import path_length_m
 from afspm.record.bad_scans import BAD
 from afspm.record.journal import not_a_table
 from afspm.record.run import Run, open_run
@@ -230,6 +231,7 @@ def _summary(folder: Path) -> RunSummary:
 def _read(run: Run) -> RunSummary:
     overview = run.overview((CONTROL_STATE.name, JOURNAL.name, DRIFT_RESCAN.name))
     began = next(iter(overview.timelines.control.spans), None)
+    scans = run.scans
     return RunSummary(
         folder="",
         name=run.name,
@@ -238,11 +240,11 @@ def _read(run: Run) -> RunSummary:
         state=describe_state(run.folder),
         metadata=run.metadata,
         simulated=run.simulated,
-        scans=sum(not scan.interrupted for scan in run.scans),
+        scans=sum(not scan.interrupted for scan in scans),
         spectra=len(run.spectra),
         problems=tuple(sorted({span.label for span in overview.problem_spans})),
         notes=tuple(note.text for note in run.notes),
-        scanned_m=sum(_scanned_m(run, scan) for scan in run.scans),
+        scanned_m=sum(_scanned_m(run, scan) for scan in scans),
         treatments=dict(Counter(entry.what for entry in run.journal if _is_treatment(entry))),
         judged=_judged(run.verdicts()),
     )
@@ -257,7 +259,7 @@ def _scanned_m(run: Run, scan: ScanRow) -> float:
         with suppress(FileError):  # damaged: counted as whole, the most that it can be
             first = next(iter(run.scan(scan).values()))
             rows = int(np.isfinite(first.values).any(axis=1).sum())
-    return 2.0 * rows * scan.region.size_m[0]
+    return path_length_m(scan.region, rows)
 
 
 def _is_treatment(entry: JournalEntry) -> bool:

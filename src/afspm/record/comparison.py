@@ -169,11 +169,7 @@ def same_region(first: ScanRow, second: ScanRow) -> bool:
         return False
     apart_m = math.dist(one.center_m, other.center_m)
     turned_rad = abs(math.remainder(one.angle_rad - other.angle_rad, math.tau))
-    return same_size(one, other) and apart_m <= _CENTRES * max(one.size_m) and turned_rad <= _ANGLE_RAD
-
-
-def same_size(first: Region, second: Region) -> bool:
-    return all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(first.size_m, second.size_m, strict=True))
+    return one.has_size_of(other, _ALIKE) and apart_m <= _CENTRES * max(one.size_m) and turned_rad <= _ANGLE_RAD
 
 
 def _common_places(scans: Sequence[Sequence[ScanRow]]) -> list[list[ScanRow | None]]:
@@ -233,7 +229,7 @@ def _obstacle(first: Scan, later: Scan) -> str:
     if first.shape != later.shape:
         (rows, columns), (others, along) = first.shape, later.shape
         return f"{columns} × {rows} and {along} × {others} pixels"
-    return "" if same_size(first.region, later.region) else "the sizes differ"
+    return "" if first.region.has_size_of(later.region, _ALIKE) else "the sizes differ"
 
 
 def _differing(runs: Sequence[Run], unread: list[str]) -> dict[str, list[str]]:

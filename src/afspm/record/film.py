@@ -24,7 +24,7 @@ from afspm.model import Frame, Region, Scan
 from afspm.model.geometry import XY
 from afspm.model.line_levelling import flattened
 from afspm.record.drawing.image_html import round_length_m
-from afspm.record.drawing.palette import PALETTES, UNMEASURED, colour_map
+from afspm.record.drawing.palette import PALETTES, colour_map
 from afspm.record.drawing.raster import ValueRange, indices, shared_range
 from afspm.record.tables import ScanRow
 
@@ -101,7 +101,7 @@ class Film:
         width = width_px - width_px % 2
         height = 2 * max(1, round(width * self.window.size_m[1] / self.window.size_m[0] / 2.0))
         for index, values in enumerate(self.frames):
-            levels = np.minimum(indices(values, span), UNMEASURED)[::-1]
+            levels = indices(values, span)[::-1]
             picture = Image.fromarray(np.ascontiguousarray(colours[levels])).resize(
                 (width, height), Image.Resampling.NEAREST
             )
@@ -151,12 +151,15 @@ class Film:
         _write(draw, (width - _MARGIN_PX, low), f"SIMULATED, {shown}" if self.simulated else shown, "rd")
 
 
-def film_of(run: RecordedScans, rows: Sequence[ScanRow], channel: str | None = None) -> Film:
+def film_of(
+    run: RecordedScans, rows: Sequence[ScanRow], channel: str | None = None, drift: Mapping[int, XY] | None = None
+) -> Film:
     """Return the film of scans of one place.
 
     Args:
         rows: the scans, in the order of the film; interrupted ones come as far as they were taken.
         channel: None: the first of the first scan.
+        drift: of `recorded_drift`; None: read from the run.
 
     Raises:
         InvalidValue: fewer than two scans, not of one place, or a scan without the channel.
@@ -164,17 +167,16 @@ def film_of(run: RecordedScans, rows: Sequence[ScanRow], channel: str | None = N
     """
     if len(rows) < 2:
         raise InvalidValue(f"a film needs two scans of one place, not {len(rows)}")
-    drift = _recorded_drift(run)
+    drift = recorded_drift(run) if drift is None else drift
     chosen = channel or rows[0].channels[0][0]
     places = [_place(row, drift) for row in rows]
     for row, place in zip(rows, places, strict=True):
         if not _is_same_place(places[0], place):
             raise InvalidValue(f"scans {rows[0].number} and {row.number} are of different places", hint="choose others")
     taken = [_values(run, row, chosen) for row in rows]
-    window, shape = places[0], taken[0].shape
-    frames = np.stack(
-        [_sampled(flattened(values), place, window, shape) for values, place in zip(taken, places, strict=True)]
-    )
+    window, (height, width) = places[0], taken[0].shape
+    pixels_m = window.pixels_m((height, width))
+    frames = np.stack([_sampled(flattened(one), place, pixels_m) for one, place in zip(taken, places, strict=True)])
     moved = np.array([_drift_at(row, drift) for row in rows]) if drift else np.zeros((len(rows), 2))
     return Film(
         frames=frames,
@@ -190,9 +192,8 @@ def film_of(run: RecordedScans, rows: Sequence[ScanRow], channel: str | None = N
     )
 
 
-def places(run: RecordedScans, rows: Sequence[ScanRow]) -> list[list[ScanRow]]:
+def places(rows: Sequence[ScanRow], drift: Mapping[int, XY]) -> list[list[ScanRow]]:
     """Return the scans of each place that was scanned at least twice, the place with most scans first."""
-    drift = _recorded_drift(run)
     groups: list[tuple[Region, list[ScanRow]]] = []
     for row in rows:
         if row.region is None or not row.file:
@@ -209,10 +210,13 @@ def places(run: RecordedScans, rows: Sequence[ScanRow]) -> list[list[ScanRow]]:
     return sorted((group for _, group in groups if len(group) > 1), key=len, reverse=True)
 
 
-def _recorded_drift(run: RecordedScans) -> Mapping[int, XY]:
-    # the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates
+def recorded_drift(run: RecordedScans) -> Mapping[int, XY]:
+    """Return the displacement of the sample at each registered or predicted scan, by its time, in tip coordinates.
+
+    Empty if the regions are in sample coordinates, or if no drift was recorded.
+    """
     if run.frame is Frame.SAMPLE:
-        return {}  # regions are in sample coordinates already
+        return {}
     return {point.time_ns: point.translation_m for point in run.drift if not point.lost}
 
 
@@ -243,19 +247,15 @@ def _values(run: RecordedScans, row: ScanRow, channel: str) -> Array:
     return np.asarray(scans[channel].values, dtype=np.float64)
 
 
-def _sampled(values: Array, place: Region, window: Region, shape: tuple[int, ...]) -> Array:
+def _sampled(values: Array, place: Region, pixels_m: tuple[Array, Array]) -> Array:
     # NaN outside the scan, and beside its unmeasured pixels
     from scipy.ndimage import map_coordinates
 
-    x, y = window.pixels_m((shape[0], shape[1]))
-    x, y = x - place.center_m[0], y - place.center_m[1]
-    cos, sin = math.cos(place.angle_rad), math.sin(place.angle_rad)
-    along, across = (cos * x + sin * y) / place.size_m[0], (cos * y - sin * x) / place.size_m[1]
     rows, columns = values.shape
-    at = ((across + 0.5) * (rows - 1), (along + 0.5) * (columns - 1))
+    at = place.pixel_at(*pixels_m, (rows, columns))
     # a hundredth of a pixel beyond the border is rounding, not another place
-    at = tuple(np.where(np.abs(axis - axis.round()) < 1e-2, axis.round(), axis) for axis in at)
-    return np.asarray(map_coordinates(values, at, order=1, cval=np.nan), dtype=np.float64)
+    near = [np.where(np.abs(axis - axis.round()) < 1e-2, axis.round(), axis) for axis in at]
+    return np.asarray(map_coordinates(values, near, order=1, cval=np.nan), dtype=np.float64)
 
 
 def _aligned_by(row: ScanRow, drift: Mapping[int, XY]) -> str:

@@ -132,14 +132,15 @@ class Run:
             InvalidValue: fewer than two scans, not of one place, or a scan without the channel.
             FileError: a file is missing or damaged.
         """
-        from afspm.record.film import film_of, places
+        from afspm.record.film import film_of, places, recorded_drift
 
+        drift = recorded_drift(self)
         if scans is None:
-            groups = places(self, list(self.scans))
+            groups = places(self.scans, drift)
             if not groups:
                 raise InvalidValue("a film needs two scans of one place, and there are none")
             scans = groups[0]
-        return film_of(self, scans, channel)
+        return film_of(self, scans, channel, drift)
 
     def scan_at(self, time_ns: int, channel: str = "") -> ScanRow | None:
         """Return the scan that ended at a time; None if there is none.

@@ -88,3 +88,11 @@ def test_a_region_takes_text_with_units() -> None:
 def test_text_without_a_length_is_refused(width: str) -> None:
     with pytest.raises(UnitError, match=r"unit|V|number|comma"):
         Region((0.0, 0.0), (width, 1e-6))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (7, 4)])
+def test_pixel_of_a_position_is_the_inverse_of_the_position_of_a_pixel(shape: tuple[int, int]) -> None:
+    region = Region((1.0, -2.0), (4.0, 3.0), 0.7)
+    row, column = region.pixel_at(*region.pixels_m(shape), shape)
+    np.testing.assert_allclose(row, np.indices(shape)[0], atol=1e-12)
+    np.testing.assert_allclose(column, np.indices(shape)[1], atol=1e-12)

@@ -348,7 +348,9 @@ def test_lab_notebook_archive_of_chosen_scans_has_only_their_files(run: Run, tmp
     (path,) = export(run, "eln", tmp_path / "out", "2")
     with zipfile.ZipFile(path) as container:
         scans = [name for name in container.namelist() if name.endswith(".h5")]
+        crate = json.loads(container.read(f"{path.stem}/ro-crate-metadata.json"))
     assert [Path(name).name for name in scans] == [Path(run.scans[1].file).name]
+    assert "1 scan and 0 spectra" in next(node for node in crate["@graph"] if node["@id"] == "./")["description"]
 
 
 def test_lab_notebook_archive_that_cannot_be_written_leaves_nothing(run: Run, tmp_path: Path) -> None:

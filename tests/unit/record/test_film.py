@@ -19,7 +19,7 @@ from afspm import wire
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import Frame, Region, Scan, ScopeState
 from afspm.record.export import export
-from afspm.record.film import FORMATS, Film, places
+from afspm.record.film import FORMATS, Film, places, recorded_drift
 from afspm.record.run import Run
 from afspm.record.store import RecordStore
 
@@ -157,7 +157,7 @@ def test_places_scanned_once_have_no_film(tmp_path: Path) -> None:
         )
     store.close()
     run = afspm.open_run(tmp_path)
-    assert places(run, list(run.scans)) == []
+    assert places(run.scans, recorded_drift(run)) == []
     with pytest.raises(InvalidValue, match="needs two scans of one place"):
         run.film()
     with pytest.raises(InvalidValue, match="scans 1 and 2 are of different places"):

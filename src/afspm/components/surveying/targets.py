@@ -196,9 +196,5 @@ def _at(values: Floats, scan: Scan, x_m: Floats, y_m: Floats) -> Floats:
     # linear between pixels; NaN outside
     from scipy import ndimage
 
-    region, (ny, nx) = scan.region, scan.shape
-    x, y = x_m - region.center_m[0], y_m - region.center_m[1]
-    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
-    along, across = (cos * x + sin * y) / region.size_m[0], (cos * y - sin * x) / region.size_m[1]
-    places = [(across + 0.5) * (ny - 1), (along + 0.5) * (nx - 1)]
+    places = scan.region.pixel_at(x_m, y_m, scan.shape)
     return np.asarray(ndimage.map_coordinates(values, places, order=1, cval=np.nan))

@@ -16,10 +16,8 @@ from afspm.basics.formatting import area_text, position_text, quantity
 from afspm.cli.arguments import AFTERWARDS, opt
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
+    from afspm.model import Region
     from afspm.plugins.drift.remount import Remount
-    from afspm.record.comparison import RunComparison
     from afspm.record.run import Run
 
 compare_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
@@ -38,15 +36,16 @@ def compare(
     Regions are the same if their scans have one key, or without keys one place. Prints a table and writes a page with
     pictures, in which scans of one size flicker and are subtracted.
     """
-    from afspm.cli.joining import plain_console
+    from afspm.cli.joining import plain_console, plain_table
     from afspm.plugins.drift.scan_pair import onto_first
     from afspm.record.comparison import compare as compared
-    from afspm.record.comparison_page import write
+    from afspm.record.comparison_page import rows_that_differ, write
     from afspm.record.run import open_run
 
     with ExitStack() as stack:
         found = compared([stack.enter_context(open_run(folder)) for folder in runs], onto_first)
-    plain_console().print(_compared(found))
+    rows = ([head, *texts] for head, texts in rows_that_differ(found))
+    plain_console().print(plain_table(["", *found.names], rows))
     for reason in found.unread:
         typer.echo(f"not compared: {reason}", err=True)
     write(found, output)
@@ -89,20 +88,6 @@ def find(
         raise typer.Exit(1)
 
 
-def _compared(found: RunComparison) -> Table:
-    from rich import box
-    from rich.table import Table
-
-    from afspm.record.comparison_page import rows_that_differ
-
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for head in ("", *found.names):
-        table.add_column(head, overflow="fold")
-    for head, texts in rows_that_differ(found):
-        table.add_row(head, *texts)
-    return table
-
-
 def _echo_found(found: Remount, simulated: str) -> None:
     offset_m = (found.center_now_m[0] - found.center_m[0], found.center_now_m[1] - found.center_m[1])
     typer.echo(
@@ -117,28 +102,26 @@ def _percent(share: float) -> str:
 
 
 def _echo_regions(found: Remount, night: Run) -> None:
-    from afspm.cli.joining import plain_console
+    from afspm.cli.joining import plain_console, plain_table
 
     keyed = {row.key: row.region for row in night.scans if row.key and row.region is not None}
     if not keyed:
         return
-    from rich import box
-    from rich.table import Table
+    heads = ("key", "centre then", "centre today", "±", "size", "angle today")
+    rows = [_place_cells(found, key, region) for key, region in keyed.items()]
+    plain_console().print(plain_table(heads, rows))
 
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for head in ("key", "centre then", "centre today", "±", "size", "angle today"):
-        table.add_column(head, overflow="fold")
-    for key, region in keyed.items():
-        now = found.region_now(region)
-        table.add_row(
-            key,
-            position_text(region.center_m),
-            position_text(now.center_m),
-            quantity(found.now_sd_m(region.center_m), "m", 2),
-            area_text(now.size_m),
-            f"{math.degrees(math.remainder(now.angle_rad, math.tau)):.2f}°",
-        )
-    plain_console().print(table)
+
+def _place_cells(found: Remount, key: str, region: Region) -> list[str]:
+    now = found.region_now(region)
+    return [
+        key,
+        position_text(region.center_m),
+        position_text(now.center_m),
+        quantity(found.now_sd_m(region.center_m), "m", 2),
+        area_text(now.size_m),
+        f"{math.degrees(math.remainder(now.angle_rad, math.tau)):.2f}°",
+    ]
 
 
 def _echo_json(found: Remount) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +27,7 @@ def onto_first(first: Array, region: Region, second: Array, second_region: Regio
 def _displacement(first: Array, region: Region, second: Array, other: Region) -> tuple[tuple[float, float], str]:
     # within the frame of the first, with a text that explains it
     unmoved = (0.0, 0.0)
-    if not all(math.isclose(a, b, rel_tol=_ALIKE) for a, b in zip(region.size_m, other.size_m, strict=True)):
+    if not region.has_size_of(other, _ALIKE):
         return unmoved, "not registered, because the sizes differ: compared pixel by pixel"
     frame = Region((0.0, 0.0), region.size_m)
     found = estimator("correlation").register(DriftScan(first, frame, 0.0, 1.0), DriftScan(second, frame, 2.0, 3.0))

@@ -81,6 +81,11 @@ def _write_each(
             tell(str(error))
 
 
+def file_word(channel: str) -> str:
+    """Return the name of a channel as a part of a file name."""
+    return re.sub(r"[^\w.-]+", "_", channel).strip("_") or "channel"
+
+
 def _stem(row: ScanRow | SpectrumRow) -> str:
     kind = "spectrum-" if isinstance(row, SpectrumRow) else ""
     key = re.sub(r"[^\w.-]+", "-", row.key).strip("-.")

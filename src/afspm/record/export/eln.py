@@ -60,7 +60,8 @@ def archive(run: Run, scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow], 
     try:
         with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED) as container:
             files = list(_add_files(container, run, name, [*scans, *spectra]))
-            crate = {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": _graph(run, name, files)}
+            graph = _graph(run, name, files, scans, spectra)
+            crate = {"@context": "https://w3id.org/ro/crate/1.1/context", "@graph": graph}
             container.writestr(f"{name}/{DESCRIPTION_FILE}", json.dumps(crate, ensure_ascii=False, indent=1))
         partial.replace(path)
     finally:
@@ -117,10 +118,12 @@ def _file_node(run: Run, file: str, size: int, digest: str, described: str) -> N
     }
 
 
-def _graph(run: Run, name: str, files: Sequence[Node]) -> list[Node]:
+def _graph(
+    run: Run, name: str, files: Sequence[Node], scans: Sequence[ScanRow], spectra: Sequence[SpectrumRow]
+) -> list[Node]:
     metadata = run.metadata
-    began, ended = _began_and_ended(run)
-    description = _description(run)
+    began, ended = _began_and_ended(run, [*scans, *spectra])
+    description = _description(run, len(scans), len(spectra))
     experiment = f"./{run.folder.name}/"
     person = _person(metadata)
     instrument = _instrument(run, metadata)
@@ -180,8 +183,8 @@ def _graph(run: Run, name: str, files: Sequence[Node]) -> list[Node]:
     ]
 
 
-def _began_and_ended(run: Run) -> tuple[str, str]:
-    times_ns = [row.began_ns or row.time_ns for row in (*run.scans, *run.spectra)]
+def _began_and_ended(run: Run, rows: Sequence[ScanRow | SpectrumRow]) -> tuple[str, str]:
+    times_ns = [row.began_ns or row.time_ns for row in rows]
     return iso_utc(min(times_ns, default=run.newest_ns)), iso_utc(run.newest_ns)
 
 
@@ -189,10 +192,10 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def _description(run: Run) -> str:
+def _description(run: Run, scan_count: int, spectrum_count: int) -> str:
     simulated = "SIMULATED: no real microscope took part. " if run.simulated else ""
     sample = f" of {run.metadata['sample']}" if run.metadata.get("sample") else ""
-    scans, spectra = counted(len(run.scans), "scan"), counted(len(run.spectra), "spectrum", "spectra")
+    scans, spectra = counted(scan_count, "scan"), counted(spectrum_count, "spectrum", "spectra")
     return f"{simulated}{scans} and {spectra}{sample}, measured by the experiment {run.name}."
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from afspm.basics.errors import InvalidValue
-from afspm.record.film import film_of, places
+from afspm.record.export import file_word
+from afspm.record.film import film_of, places, recorded_drift
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -25,13 +25,13 @@ class FilmExporter:
             InvalidValue: no place was scanned twice.
             FileError: a file can't be read or written.
         """
-        groups = places(run, scans)
+        drift = recorded_drift(run)
+        groups = places(scans, drift)
         if not groups:
             raise InvalidValue("a film needs two scans of one place, and there are none", where=str(run.folder))
         for number, rows in enumerate(groups, 1):
-            film = film_of(run, rows)
-            channel = re.sub(r"[^\w.-]+", "_", film.channel).strip("_") or "channel"
-            yield film.save(folder / f"film-{number:02}-{channel}{self._suffix}")
+            film = film_of(run, rows, drift=drift)
+            yield film.save(folder / f"film-{number:02}-{file_word(film.channel)}{self._suffix}")
 
 
 GIF = FilmExporter(".gif")

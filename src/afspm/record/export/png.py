@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from afspm.basics.clock import iso_utc
 from afspm.model import Scan, Spectrum
+from afspm.record.export import file_word
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 
@@ -26,8 +26,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
     if isinstance(row, ScanRow):
         for channel, scan in run.scan(row).items():
             title = _title(run, f"{channel}, {time}", row.interrupted)
-            plain = re.sub(r"[^\w.-]+", "_", channel).strip("_") or "channel"
-            yield f"_{plain}.png", _image(scan_figure(scan, title))
+            yield f"_{file_word(channel)}.png", _image(scan_figure(scan, title))
     else:
         title = _title(run, f"{row.kind}, {time}", interrupted=False)
         yield ".png", _image(spectrum_figure(run.spectrum(row), title))
