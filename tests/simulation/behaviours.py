@@ -68,10 +68,11 @@ class Experiment(Client):
             yield from self.sleep(self.some(20.0))
             return
         begun = yield from self.ask(ControlRequest.ACTION, names.START_SCAN)
+        # the place has drifted out of the region that is allowed
         if begun.code in (
             ControlResponse.ACTION_ERROR,
             ControlResponse.PARAM_ERROR,
-        ):  # the place has drifted out of the region that is allowed
+        ):
             yield from self.ask(ControlRequest.SET_SCAN_PARAMS, ScanParameters(_IN_THE_MIDDLE))
         if begun.code != _OK:
             yield from self.sleep(self.some(20.0))

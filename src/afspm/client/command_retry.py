@@ -82,14 +82,12 @@ class CommandRetry:
                 raise
             if response.ok:
                 return response
-            if (
-                response.code != ControlResponse.NO_RESPONSE
-            ):  # after NO_RESPONSE it may have been carried out: keep the id
+            # after NO_RESPONSE it may have been carried out: keep the id
+            if response.code != ControlResponse.NO_RESPONSE:
                 self.get_over(kind, response, states, until_s)
                 request_id = self._link.next_id()
-            elif (
-                kind == ControlRequest.ACTION and self._control.is_unbroken
-            ):  # settings may be repeated, actions may not
+            # settings may be repeated, actions may not
+            elif kind == ControlRequest.ACTION and self._control.is_unbroken:
                 raise NoResponse(
                     f"control was lost before the action was answered: {self._control.why_lost}",
                     where=self._link.name,
@@ -161,9 +159,8 @@ class CommandRetry:
         late_s = link.earlier(CONNECTED_WITHIN_S, give_up_s)
         while True:
             response = link.request(kind, subject, request_id=request_id, until_s=until_s)
-            if (
-                is_repeated and response.code in NOT_IN_CONTROL
-            ):  # refused now; an earlier repetition may have been executed
+            # refused now; an earlier repetition may have been executed
+            if is_repeated and response.code in NOT_IN_CONTROL:
                 self._control.lost(response.reason)
                 return Response(ControlResponse.NO_RESPONSE, reason=response.reason, id=request_id)
             if response.code != ControlResponse.NO_RESPONSE or self._control.was_lost:

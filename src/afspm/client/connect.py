@@ -168,9 +168,8 @@ def _name_in(file: Path) -> str | None:
     import tomllib
 
     try:
-        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get(
-            "name"
-        )  # editors of Windows write a byte-order mark
+        # editors of Windows write a byte-order mark
+        name = tomllib.loads(file.read_text(encoding="utf-8-sig")).get("name")
     except (OSError, ValueError) as error:
         raise FileError(f"can't be read: {error}", where=str(file)) from error
     return name if isinstance(name, str) and name else None

@@ -161,9 +161,8 @@ class ControlHold:
         view, version = self._link.view, self._link.view.count("ControlState")
 
         def may_ask() -> bool:
-            is_solved = bool(solving) and not self._is_flagged(
-                solving
-            )  # then the answer to a request says for certain that it is solved
+            # then the answer to a request says for certain that it is solved
+            is_solved = bool(solving) and not self._is_flagged(solving)
             return view.count("ControlState") != version and (is_solved or not self.obstacle(solving))
 
         return may_ask

@@ -71,9 +71,8 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         format_row = f"INSERT OR IGNORE INTO about VALUES ('format', '{FORMAT}');"
-        connection.executescript(
-            f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;"
-        )  # a reader finds all tables or none
+        # a reader finds all tables or none
+        connection.executescript(f"BEGIN IMMEDIATE; {_TABLES} {format_row} COMMIT;")
         check_format(connection, path)
     except sqlite3.OperationalError:
         connection.close()

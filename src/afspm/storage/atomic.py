@@ -52,9 +52,8 @@ def replace_file(
     """
     aside = aside or path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        path.parent.mkdir(
-            exist_ok=True
-        )  # not its parents: where a drive is not mounted, they would be created on the system disk
+        # not its parents: where a drive is not mounted, they would be created on the system disk
+        path.parent.mkdir(exist_ok=True)
         if mode != _ANYONE:
             aside.unlink(missing_ok=True)  # a file left by a killed process keeps its old mode
         with open(aside, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:

@@ -263,9 +263,8 @@ def sync_data(descriptor: int) -> None:
     Raises:
         OSError: the disk refuses.
     """
-    getattr(os, "fdatasync", os.fsync)(
-        descriptor
-    )  # Windows and macOS have only fsync, which also syncs the times of the file
+    # Windows and macOS have only fsync, which also syncs the times of the file
+    getattr(os, "fdatasync", os.fsync)(descriptor)
 
 
 def sync_file(descriptor: int) -> None:

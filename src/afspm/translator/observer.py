@@ -145,9 +145,8 @@ class Observer:
         published = self._state.sequence.published
         if published.state is not ScopeState.UNDEFINED:
             self.publish(published)
-        if (
-            published.state in MEASURING and self._polled_for not in MEASURING
-        ):  # its start is not known: it may end soon
+        # its start is not known: it may end soon
+        if published.state in MEASURING and self._polled_for not in MEASURING:
             self._polled_for = published.state
             self._polling.began(object(), self._clock.monotonic_s())
 

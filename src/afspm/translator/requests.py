@@ -128,9 +128,8 @@ class RequestHandler:
         finally:
             TRACE.command("")
         if request.kind == ControlRequest.ACTION and done.response.ok and not done.steps:
-            connection.guarded(
-                observer.observe
-            )  # before the answer, so that the peer then knows the settings changed by its action
+            # before the answer, so that the peer then knows the settings changed by its action
+            connection.guarded(observer.observe)
         self._finish(request, done.response)
         observer.play(done.steps)
         if done.response.ok and (done.steps or done.announce):

@@ -107,8 +107,7 @@ def _values_in(subject: object) -> dict[str, Parameter | Value]:
 def _settable(spec: ParameterSpec, value: Value) -> Value:
     if spec.read_only:
         raise Refused(ControlResponse.PARAM_ERROR, f"{spec.name} is read-only")
-    if spec.name in FRAME and isinstance(
-        value, float
-    ):  # the corner of a frame is computed from its centre, so it may miss the bound by its last bits
+    # the corner of a frame is computed from its centre, so it may miss the bound by its last bits
+    if spec.name in FRAME and isinstance(value, float):
         value = next((end for end in spec.range if math.isclose(value, end, rel_tol=1e-12)), value)
     return spec.checked(value)

@@ -179,16 +179,14 @@ def run_translator(driver: DriverBase, context: ProcessContext, make: Callable[.
     """Run a translator (called by the host of processes); end if another run commands the controller."""
     with contextlib.ExitStack() as stack:
         controller = wired_to(context.launch, driver)
-        address = (
-            "" if controller else driver.controller_at
-        )  # a real controller of this address is not touched, so not locked
+        # a real controller of this address is not touched, so not locked
+        address = "" if controller else driver.controller_at
         try:
             stack.enter_context(commanding(address, context.launch.run_dir or ""))
         except ControllerTaken as error:
             context.log.error("%s", error)
-            return (
-                ExitCode.CRASHED
-            )  # CRASHED, so that the supervisor retries a few times: the other run may be just ending
+            # CRASHED, so that the supervisor retries a few times: the other run may be just ending
+            return ExitCode.CRASHED
         if driver.common.trace:
             _begin_trace(driver, context)
             stack.callback(TRACE.end)

@@ -53,9 +53,8 @@ class ControlClient:
         self._send(frames)
 
     def _send(self, frames: Sequence[bytes]) -> None:
-        send_frames(
-            self.socket, [b"", *frames]
-        )  # a full queue drops it: the scheduler has ignored thousands of requests
+        # a full queue drops it: the scheduler has ignored thousands of requests
+        send_frames(self.socket, [b"", *frames])
 
     def _reconnect(self) -> None:
         self._connected, self._unanswered = False, b""

@@ -143,9 +143,8 @@ def test_scans_excluded_from_learning_stay_excluded_after_a_restart(tmp_path: Pa
     lab = Lab("tip_classifier")
     lab.at(50.0, lambda: lab.flag(TIP))
     publish_at(lab, 100.0, channels(1, "double", 5)[5])
-    lab.at(
-        120.0, lambda: lab.does(ArbitrationEvent.REQUEST_CONTROL, "tip_corrector", TIP)
-    )  # the holder of control is published after it
+    # the holder of control is published after it
+    lab.at(120.0, lambda: lab.does(ArbitrationEvent.REQUEST_CONTROL, "tip_corrector", TIP))
     lab.at(200.0, lab.parent_goes)
     run(classifier(), lab, tmp_path)
     lab.restart_component()

@@ -116,9 +116,8 @@ class SharedMemoryLink:
     def _transaction(self, method: str, arguments: tuple[str | int | float, ...]) -> object:
         until_s = self._monotonic_s() + self._timeout_s
         self._see_alive()
-        if (
-            self._status() == _REQUEST
-        ):  # of a caller that has given up waiting: its answer would be taken for the next one's
+        # of a caller that has given up waiting: its answer would be taken for the next one's
+        if self._status() == _REQUEST:
             before = self._memory[:_NAME_BYTES].split(b"\0", 1)[0].decode("latin-1")
             self._wait(until_s, f"GXSM is busy with an earlier call of {before!r} for more than {self._timeout_s:g} s")
         content = pickle.dumps(arguments, 4)

@@ -64,9 +64,8 @@ class StudioActivity(Activity):
         curve = call is not None and call.what == FORCE
         if self._stopping and curve:
             with suppress(Refused):
-                self._session.do(
-                    commands.STOP_CURVE
-                )  # again: the first stop may have overtaken the start, on another connection
+                # again: the first stop may have overtaken the start, on another connection
+                self._session.do(commands.STOP_CURVE)
         self.follow(SCAN if scanning else FORCE if curve else "")
         if scanning:
             return ScopeStatus(ScopeState.SCANNING)

@@ -62,9 +62,8 @@ class SmartScanActivity(Activity):
         scanning = not curve and self._session.scanning()
         if self._stopping and curve:
             with suppress(Refused):
-                self._session.do(
-                    STOP_CURVE
-                )  # again: the first stop may have overtaken the start, on another connection
+                # again: the first stop may have overtaken the start, on another connection
+                self._session.do(STOP_CURVE)
         if scanning:
             self.follow(self._files.what or SCAN)
             return ScopeStatus(ScopeState.SCANNING)

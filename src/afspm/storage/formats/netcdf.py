@@ -67,9 +67,8 @@ def read(path: Path) -> File:
     if content[:4] not in (b"CDF\x01", b"CDF\x02"):
         raise FileError("is not a NetCDF file of the classic format", where=str(path))
     try:
-        file = _netcdf_file(
-            io.BytesIO(content), "r"
-        )  # not the file on disk: for that scipy allocates any size that a damaged header announces
+        # not the file on disk: for that scipy allocates any size that a damaged header announces
+        file = _netcdf_file(io.BytesIO(content), "r")
         return _file(file)
     except FileError:
         raise
