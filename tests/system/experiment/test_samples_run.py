@@ -72,7 +72,7 @@ def test_a_sample_runs_to_its_end(afspm_run: Run, tmp_path: Path, name: str) -> 
         assert (taken, len(record.spectra)) == (scans, spectra), one.output
 
 
-# at 240 times real time a busy computer takes scans late, and the paper's tracker then errs by more than a pixel
+# at 240 times real time a busy computer takes scans late
 SHORT_NIGHT = """
 [clock]
 speed = 120.0
@@ -87,17 +87,19 @@ TABLE = '[drift_table]\ncomponent = true\nclass = "DriftTable"\n'
 SHORT_SERIES = '[experiment]\nevery = "6 min"\nscans = 7\n'
 
 
+# The paper's method extrapolates by the difference of two estimates, each half a pixel uncertain: on an idle computer
+# the frame was up to 1.5 pixels off in one night of three. Without any correction it would be 5 pixels off
 @pytest.mark.parametrize(
-    ("files", "quicker"),
+    ("files", "quicker", "pixels"),
     [
-        (("drift_night/experiment.toml",), SHORT_NIGHT + TABLE),
-        (("drift_night/experiment.toml", "drift_night/paper.toml"), SHORT_NIGHT + TABLE),
-        (("paper_form/drift.toml",), SHORT_SERIES + TABLE),
+        (("drift_night/experiment.toml",), SHORT_NIGHT + TABLE, 1.0),
+        (("drift_night/experiment.toml", "drift_night/paper.toml"), SHORT_NIGHT + TABLE, 2.0),
+        (("paper_form/drift.toml",), SHORT_SERIES + TABLE, 1.0),
     ],
     ids=["drift_night", "drift_night-paper", "published"],
 )
 def test_drift_night_runs_and_its_frame_follows_the_sample(
-    afspm_run: Run, tmp_path: Path, files: tuple[str, ...], quicker: str
+    afspm_run: Run, tmp_path: Path, files: tuple[str, ...], quicker: str, pixels: float
 ) -> None:
     if "drift_night/paper.toml" in files:
         pytest.importorskip("skimage")
@@ -115,4 +117,4 @@ def test_drift_night_runs_and_its_frame_follows_the_sample(
     pixel_m = 2e-6 / 64
     assert np.hypot(*drift_m[-1]) > 3 * pixel_m, "the sample stood still"
     off_m = np.hypot(*(center_m - drift_m).T)  # at a time more, where a busy computer has left scans out
-    assert np.median(off_m) < pixel_m, "the frame is not where the sample has gone"
+    assert np.median(off_m) < pixels * pixel_m, "the frame is not where the sample has gone"
