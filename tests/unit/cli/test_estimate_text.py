@@ -46,7 +46,7 @@ def test_default_speed_of_the_simulator_is_named(tmp_path: Path, speed: str, par
     assert work.why == why
 
 
-def test_line_of_the_end_names_what_is_left_out() -> None:
+def test_line_of_the_end_names_the_parts_left_out() -> None:
     works = {"series": PlannedWork(scans=3, duration_s=600.0, ends_experiment=True)}
     now = datetime(2026, 3, 14, 12, 0, tzinfo=UTC)
     real, fast = (list(estimate_lines(works, speed, now))[-1] for speed in (1.0, 600.0))
