@@ -26,7 +26,7 @@ SLOWLY_S = 2.0  # the same for slow content
 OLD_AFTER_S = 8.0  # a supervisor publishes its processes every 2 s
 NO_REPORT = "no report"
 _STARTING = "starting"
-_DAY_NS = 86_400 * NS_PER_S
+_DAY_NS, _MINUTE_NS = 86_400 * NS_PER_S, 60 * NS_PER_S
 _AS_USUAL = {_STARTING, "alive", "ended"}
 
 
@@ -260,11 +260,13 @@ def status_html(watch: Watch, overview: Overview) -> str:
         _chip(f"{who} is in control<small>{since}</small>", "holder"),
         *_microscope(overview, now_ns),
     ]
+    end_ns = watch.expected_end_ns(overview, now_ns)
     for name, report in overview.progress_reports.items():
         left_ns = report.remaining_ns(now_ns) if report.done < report.of else None
-        end = f"<small>ends {_end_text(now_ns + left_ns, now_ns)}</small>" if left_ns else ""
+        # the component that decides the end needs no end of its own
+        has_end = left_ns and (end_ns is None or abs(now_ns + left_ns - end_ns) > _MINUTE_NS)
+        end = f"<small>ends {_end_text(now_ns + left_ns, now_ns)}</small>" if left_ns and has_end else ""
         parts.append(_chip(f"<b>{escape(name)}</b> {report.done} of {report.of}{end}", "progress"))
-    end_ns = watch.expected_end_ns(overview, now_ns)
     if end_ns is not None and end_ns > now_ns:
         left = duration_text((end_ns - now_ns) / NS_PER_S)
         parts.append(_chip(f"ends about {_end_text(end_ns, now_ns)}<small>{left} left</small>", "end"))
