@@ -116,7 +116,9 @@ impl Launch {
     /// Read a launch line.
     pub fn from_json(line: &str) -> Result<Launch> {
         let read: std::result::Result<Launch, _> = serde_json::from_str(line);
-        let launch = read.map_err(|error| Error::Config(format!("the launch line can't be read: {error}")))?;
+        let mut launch = read.map_err(|error| Error::Config(format!("the launch line can't be read: {error}")))?;
+        // `{"insecure": "true"}`: other computers may be connected without keys
+        launch.keys = launch.keys.filter(|keys| !keys.secret.is_empty());
         if launch.name.is_empty() {
             return Err(Error::Config("the launch line names no process".into()));
         }
