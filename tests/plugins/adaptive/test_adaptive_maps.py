@@ -149,7 +149,7 @@ def test_each_cell_is_new_in_one_level_and_its_parents_are_in_a_coarser_one() ->
     assert corners <= {tuple(np.round(xy, 12)) for xy in lattice.region.corners_m()}
 
 
-def test_optimisers_fit_the_protocol_and_refuse_what_is_no_measurement() -> None:
+def test_optimisers_fit_the_protocol_and_refuse_incomplete_measurements() -> None:
     planned = AdaptiveMap(REGION, "height")
     assert isinstance(planned, Optimizer)
     (point,) = planned.suggest()

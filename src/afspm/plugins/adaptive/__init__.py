@@ -1,7 +1,7 @@
 """Adaptive maps: spectra where a map of a quantity is still uncertain, at the least cost in seconds.
 
 **Theory of operation.** An optimiser suggests positions, the component takes a spectrum at each, evaluates it, and
-returns the value with its time. The optimiser's protocol is that of bluesky-adaptive 1.0 (`suggest`, `ingest`, and if
+returns the value with its time. The protocol of optimisers comes from bluesky-adaptive 1.0 (`suggest`, `ingest`, and if
 there are any `register_failures`, `should_stop`), so its Ax and Xopt backends fit, and any of your own.
 
 | module | content |

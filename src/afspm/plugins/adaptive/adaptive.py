@@ -47,7 +47,7 @@ class Adaptive(Component):
         center: (x, y) of the middle of the region.
         angle: of the region, counter-clockwise.
         unit: of a function of your own.
-        kind: of the spectra; by default that of the quantity, or the present one.
+        kind: of the spectra; by default the kind of the quantity, or the present one.
         optimizer: "adaptive", "nested" (complete lattices), or a function of region and quantity as "module.name" that
             returns an optimiser with `suggest` and `ingest` of bluesky-adaptive, with the parameters `x` and `y`.
         coarsest: positions along the longer side of the first lattice.

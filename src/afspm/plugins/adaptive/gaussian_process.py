@@ -115,7 +115,7 @@ def fitted(
 
     Args:
         shortest_m: lower bound of the length; the upper one is a hundred times that.
-        drifts: whether to search for a velocity, too; otherwise it stays that of `start`.
+        drifts: whether to search for a velocity, too; otherwise `start` has the known one.
         seed: of the choice of measurements where there are many.
     """
     if len(values) > _MOST_FITTED:

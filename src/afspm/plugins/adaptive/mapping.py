@@ -204,7 +204,7 @@ class MapProgress:
 
 
 def optimizer_of(name: str, region: Region, quantity: str, **settings: Any) -> Optimizer:
-    """Return the optimiser "adaptive" or "nested", or that of a function "module.name" of region and quantity.
+    """Return the optimiser "adaptive" or "nested", or the result of a function "module.name" of region and quantity.
 
     Raises:
         ConfigError: there is no such function, or its result has no `suggest` and `ingest`.
