@@ -44,7 +44,7 @@ def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "",
     _panel(right, errors, size_um, "expected error", unit, "viridis", low=0.0)
     x, y = _in_region(found.map.model.positions_m, region).T
     for axes, colour in ((left, CATEGORICAL[0]), (right, "white")):
-        axes.plot(1e6 * x, 1e6 * y, ".", color=colour, markersize=2.6, markeredgewidth=0.0)
+        axes.plot(1e6 * x, 1e6 * y, ".", color=colour, markersize=4.0, markeredgewidth=0.0)
     draw_scale_bar(left, region.size_m, (-size_um[0] / 2, -size_um[1] / 2), 1e6, font=_TEXT)
     head = ", ".join(filter(None, (title, of, counted(len(found.measured), "spectrum", "spectra"))))
     figure.text(0.015, 1.0 - 0.2 / height_in, head, size=10, va="center")
