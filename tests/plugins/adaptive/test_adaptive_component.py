@@ -124,7 +124,7 @@ def test_the_expected_error_ends_a_map(tmp_path: Path, caplog: pytest.LogCapture
     assert 81 <= lab.begun_scans < 200
 
 
-def test_positions_are_requested_before_their_spectra() -> None:
+def test_positions_are_requested_before_their_spectra(tmp_path: Path) -> None:
     lab = Lab("map")
     kinds: list[int] = []
 
@@ -133,7 +133,7 @@ def test_positions_are_requested_before_their_spectra() -> None:
         return "go on"
 
     lab.intercept = note
-    run(adaptive(until={"spectra": 3}), lab)
+    run(adaptive(until={"spectra": 3}), lab, tmp_path / "state", run_dir=str(tmp_path))
     assert kinds.index(ControlRequest.SET_PROBE_POS) < kinds.index(ControlRequest.ACTION)
 
 

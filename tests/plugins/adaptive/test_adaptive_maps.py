@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from benchmarks.adaptive import Case, course
+from benchmarks.adaptive import GOAL, Case, course
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region
@@ -66,8 +66,8 @@ def test_on_a_map_that_is_rough_everywhere_both_take_the_same_positions() -> Non
 
 @pytest.mark.parametrize("moves", ["fast", "slow"])
 def test_a_spotty_map_takes_clearly_less_time_than_a_nested_grid(moves: str) -> None:
-    case = Case("spotty", moves, "off", 0)
-    assert course(AdaptiveMap, case, 0.2).until(0.2) < 0.85 * course(NestedGrid, case, 0.2).until(0.2)
+    case = Case("spotty", moves, "off", 20)
+    assert course(AdaptiveMap, case).until(GOAL) < 0.85 * course(NestedGrid, case).until(GOAL)
 
 
 def test_the_expected_error_is_about_the_true_one() -> None:
