@@ -289,7 +289,8 @@ class Instrument:
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
-        self.note(now_s, "spectrum starts", {"number": number, "kind": kind})
+        truth = self.world.property_truth(self._probe_m, now_s)
+        self.note(now_s, "spectrum starts", {"number": number, "kind": kind, **truth})
         return self.spectrum
 
     def stop_spectrum(self, now_s: float) -> None:
