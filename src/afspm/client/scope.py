@@ -394,6 +394,18 @@ class Scope(ExperimentView):
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
         self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
 
+    def report_readings(self, report: InstrumentReadings) -> InstrumentOrders:
+        """Report the values of this component's instrument, and return the orders for it.
+
+        Raises:
+            Refused: this component is no instrument of the experiment, or the report is not about its own parameters.
+        """
+        with self._call():
+            response = self._link.request(RELAY_REQUEST, RelayedMessage(*wire.encode(report)))
+            if not response.ok:
+                raise refused(RELAY_REQUEST, response, self._link.name)
+            return wire.decode_instrument_orders(response.payload)
+
     # --- leaving ---
 
     def interrupt(self) -> None:
