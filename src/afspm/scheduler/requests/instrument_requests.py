@@ -182,7 +182,10 @@ def _settle(draft: StateDraft, instrument: str, found: OpenOrder, outcome: Order
         draft.limits = draft.limits.carried_out(job.request, draft.now_ns, who=job.client)
         if job.client == draft.control.holder:
             draft.lease = draft.lease.commanded(draft.now_ns, draft.now_s)
-        payload = draft.env.codec.encode(wanted)
+        target = draft.instruments.reading(wanted.name, draft.now_s)
+        # its target in force: controllers round
+        in_force = wanted if target.target is None else Parameter(wanted.name, repr(target.target), target.unit or None)
+        payload = draft.env.codec.encode(in_force)
     answers.finish(draft, job, Response(outcome.response, payload, outcome.reason, job.request.id))
 
 
