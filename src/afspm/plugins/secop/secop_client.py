@@ -333,18 +333,18 @@ class SecopClient:
         if reading.value is None:
             self._finish(order, ControlResponse.PARAM_ERROR, f"{channel.name} is not known: {reading.reason}")
             return []
-        self._ramps.pop(channel.name, None)  # a new target replaces the steps to the one before
         return self._begin(order, channel, number, rate_per_s, now_s)
 
     def _begin(
         self, order: InstrumentOrder, channel: Channel, number: float, rate_per_s: float | None, now_s: float
     ) -> list[str]:
+        before = self._ramps.pop(channel.name, None)  # a new target replaces the steps to the one before
         if rate_per_s is not None and channel.ramp:
             limit = rate_per_s / channel.per_s
             self._progress = OrderInProgress(order, channel, f"changed {channel.ramp}", number, ramp_limit=limit)
             return [lines.change(channel.ramp, limit)]
         if rate_per_s is not None:
-            start = self._start_of_steps(channel, rate_per_s)
+            start = self._start_of_steps(channel, rate_per_s) if before is None else before.sent
             ramp = RampInSteps(number, rate_per_s, start, now_s, start)
             self._progress = OrderInProgress(order, channel, f"changed {channel.target}", start, ramp)
             return [lines.change(channel.target, start)]
