@@ -173,7 +173,7 @@ class RampNight:
         self.budget_k = 0.0
         self.blind_since_s: float | None = None
         self.panel_k: float | None = None
-        self.moved_k = 0.0
+        self.panel_s = self.moved_k = 0.0
         self._new_instrument()
         self._new_scheduler(self.core.start(self.now_s, self.now_ns))
 
@@ -311,7 +311,10 @@ class RampNight:
             if self.now_s >= self.scan_until_s:
                 self.scan_until_s = None
                 self._publish(ScopeState.FREE)
-        assert panel is None or self.cryostat.target_k == panel, "a target set at the panel was undone"
+        if panel is not None and self.cryostat.target_k != panel:
+            # a step may be on its way at the moment of the change
+            assert self.now_s - self.panel_s <= 2 * STEP_S, "a target set at the panel was undone"
+            self.panel_k = None
 
     def _scheduler(self) -> None:
         while (due_s := self.core.deadline_s()) is not None and due_s <= self.now_s:
@@ -339,6 +342,7 @@ class RampNight:
             case "scheduler killed" | "scheduler frozen":
                 self.alive["scheduler"] = False
             case "panel":
+                self.panel_s, self.budget_k = self.now_s, 2.5 * RATE_K_S
                 self.cryostat.target_k = self.panel_k = 4.2 + self.chance.choice((0.0, 0.5))
             case _:
                 self.cryostat.fault = fault

@@ -48,7 +48,7 @@ class Channel:
         asked_s: when the value was asked for that has not come yet; None: none is on its way.
         measured_s: when the newest value was asked for.
         last_answer: the server's own time of the last value that was asked for, and this value.
-        changed_s: when its target was set.
+        changed_s: when its target was set; target_answered_s: when its target was last reported on request.
         fault: why there is no value.
         fault_of_status: why the value is not believed, by the status of the module.
     """
@@ -67,6 +67,7 @@ class Channel:
     measured_s: float = -math.inf
     last_answer: tuple[object, float] | None = None
     changed_s: float = -math.inf
+    target_answered_s: float = -math.inf
     newest: float | None = None
     newest_target: float | None = None
     is_busy: bool = False
@@ -88,6 +89,7 @@ class RampInSteps:
         ideal: the last step before the server rounded it.
         sent_s: its time.
         in_flight: it is not confirmed yet.
+        target_s: when the target was asked for, to see whether it is still the last step.
         is_interrupted: the connection was lost since: the target in force decides how to go on.
     """
 
@@ -98,6 +100,7 @@ class RampInSteps:
     ideal: float
     before: float = math.nan
     in_flight: bool = False
+    target_s: float = -math.inf
     is_interrupted: bool = False
 
 
@@ -202,7 +205,11 @@ class SecopClient:
             return []
         if line.action in ("update", "reply", "changed", "error_update", "error_read"):
             self._take_report(line, now_s)
-        return self._go_on(line, now_s)
+        out = self._go_on(line, now_s)
+        for name, ramp in list(self._ramps.items()):
+            if line.specifier == self.channels[name].target and not ramp.in_flight:
+                out += self._next_step(self.channels[name], ramp, now_s)
+        return out
 
     # --- readings ---
 
@@ -235,6 +242,8 @@ class SecopClient:
                 channel.newest_target = _number(line.value)
                 if line.action == "changed":
                     channel.changed_s = now_s
+                if line.action == "reply":
+                    channel.target_answered_s = now_s
             elif specifier == channel.status and not line.action.startswith("error"):
                 self._take_status(channel, line.value)
 
@@ -421,6 +430,11 @@ class SecopClient:
             return []
         passed_s = now_s - ramp.sent_s
         if passed_s < STEP_S:
+            return []
+        if ramp.target_s < ramp.sent_s:  # the step is sent at the answer, unless another client has set a target
+            ramp.target_s = now_s
+            return [lines.read(channel.target)]
+        if channel.target_answered_s < ramp.target_s:
             return []
         if channel.fault or channel.unit_fault or channel.fault_of_status:
             ramp.sent_s = now_s
