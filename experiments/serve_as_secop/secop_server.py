@@ -68,8 +68,8 @@ class Module:
         number = {"type": "double", "unit": self.unit}
         if self.bounds is not None:
             number.update(min=self.bounds[0], max=self.bounds[1])
-        status = {"type": "tuple", "members": [{"type": "enum", "members": {"IDLE": IDLE, "BUSY": BUSY, "ERROR": ERROR}},
-                                               {"type": "string"}]}  # fmt: skip
+        codes = {"type": "enum", "members": {"IDLE": IDLE, "BUSY": BUSY, "ERROR": ERROR}}
+        status = {"type": "tuple", "members": [codes, {"type": "string"}]}
         found = {"value": ({"type": "double", "unit": self.unit}, True), "status": (status, True)}
         if self.set is not None:
             found["target"] = (number, False)

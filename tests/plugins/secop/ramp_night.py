@@ -385,8 +385,9 @@ class RampNight:
         assert COLD in self.core.control.problems, f"not flagged 5 s after the fault {self.fault}"
 
     def _check_rate(self, before_k: float) -> None:
-        if self.panel_k is not None:
-            return
+        if self.panel_k is not None or 0.0 < self.panel_s > self.now_s - 15.0:
+            self.budget_k = 2.5 * RATE_K_S
+            return  # the set point of a person jumps, and an order begins at the temperature on its way to it
         # a target in steps may move by two steps at once; over any longer time the mean rate counts
         self.budget_k = min(self.budget_k + RATE_K_S * STEP_S, 2.5 * RATE_K_S)
         change_k = abs(self.cryostat.setpoint_k - before_k)

@@ -16,9 +16,3 @@ the answer to a report carries the targets to set.
     `secop_client`  everything else; it knows no socket and no clock
     `instrument`    the component, with its socket
 """
-
-from __future__ import annotations
-
-from afspm.plugins.secop.instrument import Instrument
-
-__all__ = ["Instrument"]
