@@ -247,7 +247,7 @@ def test_band_around_the_target_and_its_time() -> None:
     (started,) = cryo.forwards
     cryo.step(TranslatorReply(started.number, Response(int(ControlResponse.SUCCESS))))
     cryo.report(4.25)
-    assert "more than 20 mK from its target 4.2 K" in cryo.answer_to(ControlRequest.ACTION, START_SCAN)[1]
+    assert "more than 0.02 K from its target 4.2 K" in cryo.answer_to(ControlRequest.ACTION, START_SCAN)[1]
 
 
 def test_problem_is_flagged_while_the_condition_does_not_hold() -> None:
