@@ -23,7 +23,7 @@ from afspm.experiment.findings import nearest
 from afspm.experiment.toml_lines import Table
 from afspm.model import ProblemNames, instrument_of
 from afspm.model.names import BASE_ACTIONS
-from afspm.scheduler.instruments.conditions import Band, InstrumentSettings, MeasuringCondition
+from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
 
 _WHILE, _PROBLEM = "while", "problem"
 _BOUNDS: Final = ("from", "to", "within")
@@ -74,7 +74,7 @@ class ConditionsReader:
             return None
         return MeasuringCondition(bands, actions, problem, str(self.document.place(*path)))
 
-    def _band(self, name: str, parameter: str, table: object) -> Band | None:
+    def _band(self, name: str, parameter: str, table: object) -> AllowedBand | None:
         path = ("conditions", name, parameter)
         known = [one for parameters in self.instruments.values() for one in parameters]
         if parameter not in known:
@@ -93,7 +93,7 @@ class ConditionsReader:
             return None
         return self._numbers(name, parameter, table)
 
-    def _numbers(self, name: str, parameter: str, table: Table) -> Band | None:
+    def _numbers(self, name: str, parameter: str, table: Table) -> AllowedBand | None:
         path = ("conditions", name, parameter)
         unit = _unit_of(table)
         read = dict[str, float]()
@@ -117,7 +117,7 @@ class ConditionsReader:
         if low is not None and high is not None and low >= high:
             self.document.error(f"[conditions.{name}] {parameter}: from must be less than to", *path, "from")
             return None
-        return Band(low, high, read.get("within"), read.get("for", 0.0), unit)
+        return AllowedBand(low, high, read.get("within"), read.get("for", 0.0), unit)
 
     def _actions(self, name: str, table: Table) -> tuple[str, ...] | None:
         path, given = ("conditions", name, _WHILE), table.get(_WHILE, list(MeasuringCondition().actions))

@@ -30,7 +30,7 @@ from afspm.model import (
 )
 from afspm.plugins.secop.secop_client import SecopClient, ServerUnfit
 from afspm.scheduler import events
-from afspm.scheduler.instruments.conditions import Band, InstrumentSettings, MeasuringCondition
+from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import ControlSettings, SchedulerSettings
@@ -52,7 +52,7 @@ BLIND = ("hung", "frozen module", "partition", "unit changed", "nan", "error", "
 def settings() -> SchedulerSettings:
     problems = ProblemNames({"not-at-temperature": COLD})
     control = ControlSettings()
-    cold = MeasuringCondition({"cryo.t": Band(LOW_K, HIGH_K, None, FOR_S, "K")}, problem="not-at-temperature")
+    cold = MeasuringCondition({"cryo.t": AllowedBand(LOW_K, HIGH_K, None, FOR_S, "K")}, problem="not-at-temperature")
     return SchedulerSettings(
         control=control,
         rules=control.rules(problems),

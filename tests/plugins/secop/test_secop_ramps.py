@@ -11,7 +11,8 @@ from collections.abc import Callable
 import pytest
 from tests.plugins.secop.ramp_night import FAULTS, RampNight
 
-from afspm.plugins.secop import secop_client
+from afspm.model import InstrumentOrder
+from afspm.plugins.secop.lines import SecopLine
 from afspm.plugins.secop.secop_client import SecopClient
 from afspm.scheduler.instruments import known_instruments
 from afspm.scheduler.instruments.known_instruments import Instruments
@@ -46,11 +47,11 @@ def _ignore_rates(patch: pytest.MonkeyPatch) -> None:
 
 
 def _believe_repeated_answers(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(secop_client.lines.SecopLine, "time", None)
+    patch.setattr(SecopLine, "time", None)
 
 
-def _unrated(order: secop_client.InstrumentOrder) -> secop_client.InstrumentOrder:
-    return secop_client.InstrumentOrder(order.number, order.id, order.parameter)
+def _unrated(order: InstrumentOrder) -> InstrumentOrder:
+    return InstrumentOrder(order.number, order.id, order.parameter)
 
 
 @pytest.mark.parametrize(

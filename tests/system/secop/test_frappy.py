@@ -20,7 +20,17 @@ from afspm.record.run_json import RUN_FILE
 
 pytest.importorskip("frappy_demo")
 pytestmark = [pytest.mark.timeout(300), not_on_wine("frappy's server needs a POSIX system")]
-HERE = Path(__file__).parent
+SERVER = """
+# frappy's simulated cryostat and magnet, fast enough for a test
+Node("cryomagnet.afspm", "a simulated cryostat and magnet", "tcp://0")
+Mod(
+    "tt", "frappy_demo.cryo.Cryostat", "cryostat",
+    jitter=0.001, T_start=4.2, target=4.2, looptime=0.2, ramp=1, maxpower=20.0, heater=0.0, mode="pid",
+    tolerance=0.1, window=1, timeout=900, p=40, i=10, d=2,
+)
+Mod("sw", "frappy_demo.modules.Switch", "heat switch", switch_on_time=1, switch_off_time=1)
+Mod("mf", "frappy_demo.modules.MagneticField", "magnet", heatswitch="sw")
+"""
 EXPERIMENT = """
 [microscope]
 component = true
@@ -63,13 +73,14 @@ class Server:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        (folder / "cryomagnet_cfg.py").write_text(SERVER, encoding="utf-8")
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.start()
 
     def start(self) -> None:
-        folders = {"FRAPPY_CONFDIR": HERE / "frappy_cfg", "FRAPPY_LOGDIR": self.folder, "FRAPPY_PIDDIR": self.folder}
+        folders = {"FRAPPY_CONFDIR": self.folder, "FRAPPY_LOGDIR": self.folder, "FRAPPY_PIDDIR": self.folder}
         environment = {**os.environ, **{name: str(path) for name, path in folders.items()}}
         program = Path(sys.executable).with_name("frappy-server")
         with (self.folder / "frappy.txt").open("ab") as log:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from afspm.model.snapshot import from_plain
-from afspm.scheduler.instruments.conditions import Band, InstrumentSettings
+from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings
 
 from .conftest import Write, errors, line_of, only_error
 
@@ -34,7 +34,7 @@ def test_condition_reaches_the_scheduler(write: Write) -> None:
     settings = from_plain(InstrumentSettings, start.launch.settings["conditions"])
     assert (settings.instruments, settings.problems) == (("cryo",), {"not-at-temperature": 100})
     cold = settings.conditions["cold"]
-    assert cold.bands == {"cryo.temperature": Band(4.15, 4.25, None, 60.0, "K")}
+    assert cold.bands == {"cryo.temperature": AllowedBand(4.15, 4.25, None, 60.0, "K")}
     assert (cold.actions, cold.problem) == (("start-scan",), "not-at-temperature")
     assert cold.source.endswith(f"night.toml:{line_of(experiment, '[conditions.cold]')}")
 

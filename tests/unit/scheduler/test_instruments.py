@@ -33,7 +33,7 @@ from afspm.scheduler.events import (
     TranslatorReply,
     TranslatorUp,
 )
-from afspm.scheduler.instruments.conditions import Band, InstrumentSettings, MeasuringCondition
+from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 from afspm.scheduler.saved_state import SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
@@ -46,7 +46,7 @@ COLD, T = 100, "cryo.t"
 class Cryo:
     """A scheduler with one instrument `cryo`, and a series in control."""
 
-    def __init__(self, band: Band, *, problem: str = "", saved: SavedState | None = None) -> None:
+    def __init__(self, band: AllowedBand, *, problem: str = "", saved: SavedState | None = None) -> None:
         problems = ProblemNames({"cold": COLD})
         control = ControlSettings()
         limit = Limit(low=1.0, high=300.0, rate_per_s=0.5, only=("series",), unit="K")
@@ -124,7 +124,7 @@ class Cryo:
 
 @pytest.fixture
 def cryo() -> Cryo:
-    made = Cryo(Band(4.15, 4.25, unit="K"))
+    made = Cryo(AllowedBand(4.15, 4.25, unit="K"))
     made.in_control()
     return made
 
@@ -211,7 +211,7 @@ def test_report_that_waited_in_a_queue_is_as_old_as_its_token(cryo: Cryo) -> Non
 
 def test_reading_in_another_unit_is_not_believed_also_after_a_restart(cryo: Cryo) -> None:
     cryo.known()
-    for scheduler in (cryo, Cryo(Band(4.15, 4.25, unit="K"), saved=cryo.core.snapshot())):
+    for scheduler in (cryo, Cryo(AllowedBand(4.15, 4.25, unit="K"), saved=cryo.core.snapshot())):
         scheduler.report(4200.0, "mK")
         scheduler.report(4200.0, "mK")
         assert "unit changed from 'K' to 'mK'" in scheduler.answer_to(ControlRequest.PARAM, Parameter(T))[1]
@@ -236,7 +236,7 @@ def test_scan_is_refused_outside_the_band(cryo: Cryo) -> None:
 
 
 def test_band_around_the_target_and_its_time() -> None:
-    cryo = Cryo(Band(within=0.02, for_s=10.0, unit="K"))
+    cryo = Cryo(AllowedBand(within=0.02, for_s=10.0, unit="K"))
     cryo.in_control()
     cryo.known(4.21)
     assert "has been in its band for" in cryo.answer_to(ControlRequest.ACTION, START_SCAN)[1]
@@ -251,7 +251,7 @@ def test_band_around_the_target_and_its_time() -> None:
 
 
 def test_problem_is_flagged_while_the_condition_does_not_hold() -> None:
-    cryo = Cryo(Band(4.15, 4.25, unit="K"), problem="cold")
+    cryo = Cryo(AllowedBand(4.15, 4.25, unit="K"), problem="cold")
     cryo.later(0.1)
     assert cryo.is_flagged
     cryo.known()
@@ -271,7 +271,7 @@ def test_problem_is_flagged_while_the_condition_does_not_hold() -> None:
 
 
 def test_flag_of_a_component_is_not_cleared_by_a_condition() -> None:
-    cryo = Cryo(Band(4.15, 4.25, unit="K"), problem="cold")
+    cryo = Cryo(AllowedBand(4.15, 4.25, unit="K"), problem="cold")
     cryo.known()
     cryo.later(0.1)
     cryo.ask(ControlRequest.ADD_EXP_PRBLM, COLD, "watch")

@@ -259,12 +259,11 @@ class SecopClient:
         if number is None or not math.isfinite(number):
             channel.fault = f"the server answers {line.value!r}"
             return
-        # the same value of the same time is an old one: the server is alive, its instrument is not
         channel.newest, channel.fault = number, ""
         if asked_s is None:
             return
-        # the same value of the same time as in the answer before: the server is alive, its instrument is not. The time
-        # of a setting may be that of its last change
+        # the same value of the same time as in the answer before: the server is alive, its instrument is not. A
+        # setting may keep the time of its last change
         answer = (line.time, number)
         is_repeated = line.time is not None and answer == channel.last_answer and not channel.accessible
         channel.last_answer = answer

@@ -1,4 +1,4 @@
-"""Other instruments: what is known of them, and the conditions that they set for measuring.
+"""Other instruments: their last readings, and the conditions that they set for measuring.
 
 **Theory of operation.** Each instrument is a component that reports its values about twice a second (request 102). A
 parameter "cryo.temperature" belongs to the component `cryo`: a request for it is answered from the last report, or

@@ -19,7 +19,7 @@ CONDITIONS = "conditions"
 
 
 @dataclass(frozen=True)
-class Band:
+class AllowedBand:
     """The band of one parameter.
 
     Attributes:
@@ -69,7 +69,7 @@ class MeasuringCondition:
         source: where it was set, e.g. "experiment.toml:42".
     """
 
-    bands: Mapping[str, Band] = field(default_factory=dict)
+    bands: Mapping[str, AllowedBand] = field(default_factory=dict)
     actions: tuple[str, ...] = (START_SCAN, START_SPEC)
     problem: str = ""
     source: str = "[conditions]"
