@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
 from afspm import wire
-from afspm.basics.errors import ExperimentEnded, InvalidValue, RequestError
+from afspm.basics.errors import ExperimentEnded, InvalidValue, NoResponse, RequestError
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
@@ -29,6 +30,8 @@ from afspm.model import (
     Feedback,
     Frame,
     HasTime,
+    InstrumentOrders,
+    InstrumentReadings,
     Note,
     Parameter,
     Problem,
@@ -47,6 +50,8 @@ __all__ = ["Events", "PublishedEvent", "Scope"]
 Place = tuple[float | str, float | str]
 SET_BACK_WITHIN_S = 60.0
 """Wait for control after a failed sweep."""
+_LOOK_S = 0.5
+"""Interval between two looks at a value on its way, real."""
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
 
@@ -215,16 +220,53 @@ class Scope(ExperimentView):
 
     # --- setting and getting ---
 
-    def set(self, parameter: str, value: Value, unit: str | None = None, *, timeout_s: float | None = None) -> Value:
+    def set(
+        self,
+        parameter: str,
+        value: Value,
+        unit: str | None = None,
+        *,
+        wait: bool = False,
+        timeout_s: float | None = None,
+    ) -> Value:
         """Set a parameter and return its value in force, in the same unit.
 
         Args:
             value: a number, in `unit` (SI without one), a quantity as text ("0.5 V"), True, "on" …
+            wait: for a parameter of another instrument, such as a temperature: return when it has arrived at `value`,
+                with the value measured then. Control is not needed for the wait.
+
+        Raises:
+            NoResponse: with `wait`, its target was changed on the way, or it has not arrived within the timeout.
         """
         with self._call():
-            asked = to_parameter(parameter, value, unit)
-            response = self._commands.in_control(ControlRequest.PARAM, asked, self._link.until(timeout_s))
-            return value_in(response, asked, asked.unit)
+            asked, until_s = to_parameter(parameter, value, unit), self._link.until(timeout_s)
+            response = self._commands.in_control(ControlRequest.PARAM, asked, until_s)
+            in_force = value_in(response, asked, asked.unit)
+            return self._arrived(asked, float(in_force), until_s) if wait else in_force
+
+    def _arrived(self, asked: Parameter, target: float, until_s: float | None) -> Value:
+        link, name = self._link, asked.name
+        while True:
+            found = {part: self._read_again(f"{name}.{part}", asked.unit, until_s) for part in ("target", "busy")}
+            if found["target"] is not None and not math.isclose(float(found["target"]), target, rel_tol=1e-5):
+                what = f"{name} does not go to {asked.value} {asked.unit or ''} any more"
+                raise NoResponse(what, where=link.name, hint=f"its target is {found['target']:g} now")
+            value = self._read_again(name, asked.unit, until_s)
+            if found["busy"] is False and found["target"] is not None and value is not None:
+                return value
+            link.wait(lambda: False, link.earlier(_LOOK_S, until_s))
+            if until_s is not None and link.clock.monotonic_s() >= until_s:
+                raise NoResponse(f"{name} has not arrived at {asked.value} {asked.unit or ''} in time", where=link.name)
+
+    def _read_again(self, name: str, unit: str | None, until_s: float | None) -> Value | None:
+        # None while the instrument has no recent reading: the wait outlasts a restart of its server
+        response = self._commands.read(ControlRequest.PARAM, Parameter(name), until_s)
+        if response.code == ControlResponse.PARAM_ERROR:
+            return None
+        if not response.ok:
+            raise refused(ControlRequest.PARAM, response, name)
+        return value_in(response, Parameter(name), unit)
 
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
         """Return a parameter's value in `unit`; without one in SI, or as received if it is not a base parameter."""
@@ -393,6 +435,18 @@ class Scope(ExperimentView):
         about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
         self._ask_scheduler(RELAY_REQUEST, RelayedMessage(*wire.encode(note)))
+
+    def report_readings(self, report: InstrumentReadings) -> InstrumentOrders:
+        """Report the values of this component's instrument, and return the orders for it.
+
+        Raises:
+            Refused: this component is no instrument of the experiment, or the report is not about its own parameters.
+        """
+        with self._call():
+            response = self._link.request(RELAY_REQUEST, RelayedMessage(*wire.encode(report)))
+            if not response.ok:
+                raise refused(RELAY_REQUEST, response, self._link.name)
+            return wire.decode_instrument_orders(response.payload)
 
     # --- leaving ---
 

@@ -22,8 +22,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 import pydantic
@@ -36,7 +36,7 @@ from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
-from afspm.model import Parameter, Region, names
+from afspm.model import Parameter, Region, instrument_of, names
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 
 Quantity = str | float
@@ -74,6 +74,7 @@ class LimitsReader:
         parameters: known generic names with their SI units (None: it depends on the operating mode).
         actions: known actions; None if they can't be known before the microscope runs.
         sets: parameters that an action sets, by its name.
+        instruments: the parameters of each other instrument; their units are known only when it runs.
         certain: whether these are all parameters, or only the base parameters and afspm's extensions.
     """
 
@@ -83,6 +84,7 @@ class LimitsReader:
     actions: frozenset[str] | None
     sets: Mapping[str, tuple[Parameter, ...]]
     certain: bool
+    instruments: Mapping[str, Collection[str]] = field(default_factory=dict)
 
     @property
     def _known_actions(self) -> frozenset[str]:
@@ -109,9 +111,10 @@ class LimitsReader:
         return limits
 
     def _parameter(self, name: str, table: object) -> Limit | None:
-        if name not in self.parameters and (self.certain or not name.startswith("x-")):
+        of_instruments = [one for parameters in self.instruments.values() for one in parameters]
+        if name not in (*self.parameters, *of_instruments) and (self.certain or not name.startswith("x-")):
             is_action = name in self._known_actions
-            near = nearest(name, [*self.parameters, *_OWN])
+            near = nearest(name, [*self.parameters, *of_instruments, *_OWN])
             hint = f"it is an action: [limits.actions.{name}]" if is_action else near
             self.document.error(f"[limits] there is no parameter {name!r}", "limits", name, hint=hint)
             return None
@@ -136,7 +139,10 @@ class LimitsReader:
         known = self.parameters.get(name)
         if known is not None or not any(key in given for key in _QUANTITIES):
             return known
-        unit = _unit_given(given)
+        if instrument_of(name) in self.instruments:
+            # as written: an instrument converts it, and refuses values without a unit
+            return _unit_given(given, lambda written: written) or ""
+        unit = _unit_given(given, si_unit)
         if unit is None:
             if name in names.BASE_PARAMETERS:
                 what = f"[limits.{name}] has no unit, and the microscope's own unit is not known before it runs"
@@ -219,13 +225,13 @@ class LimitsReader:
                 self.document.error(what, "limits", name, "min", hint="no scan would be allowed")
 
 
-def _unit_given(given: Table) -> str | None:
+def _unit_given(given: Table, as_unit: Callable[[str], str]) -> str | None:
     for key in _QUANTITIES:
         if isinstance(value := given.get(key), str):
             with contextlib.suppress(AfspmError):  # reported when the value is read
                 written = parse_quantity(value)[1]
                 over, slash, _ = written.rpartition("/")
-                if unit := si_unit(over if key == "rate" and slash else written):
+                if unit := as_unit(over if key == "rate" and slash else written):
                     return unit
     return None
 

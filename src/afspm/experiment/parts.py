@@ -14,6 +14,7 @@ from afspm.experiment.wiring_classes import WIRE_KEYS, wire_of
 
 SECTIONS: Final = (
     "clock", "control", "limits", "problems", "cache", "security", "restart", "record", "metadata", "notify",
+    "conditions",
 )  # fmt: skip
 
 # Keys of a component's table that are afspm's; all others are settings of its class or command.

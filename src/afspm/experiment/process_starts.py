@@ -285,8 +285,10 @@ def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
         operators = resolved.declaring("operates")
         operate = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
         control = replace(control, roles=replace(control.roles, operate=tuple(operate)))
-    return {
+    sections = {
         "control": to_plain(control),
         "limits": to_plain(resolved.limits),
         "cache": to_plain(resolved.caching),
     }
+    # a scheduler of another package need not know instruments
+    return {**sections, "conditions": to_plain(resolved.conditions)} if resolved.conditions.instruments else sections

@@ -10,6 +10,7 @@ from afspm.basics.errors import AfspmError, InvalidValue, individual_errors
 from afspm.experiment import (
     capabilities,
     class_loader,
+    conditions_section,
     implied_parts,
     limits_section,
     planned_measurements,
@@ -30,7 +31,7 @@ from afspm.model import PacketHeader, Parameter, ProblemNames, Role
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
-FROM_SECTIONS = ("control", "limits", "cache")
+FROM_SECTIONS = ("control", "limits", "cache", "conditions")
 """Arguments of a scheduler's constructor, filled from the sections of these names."""
 _EXAMPLE_HEADERS = (
     PacketHeader("Scan2d", "Height", (1e-6, 1e-6)),
@@ -120,12 +121,16 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
     reader = limits_section.LimitsReader(
         document,
         components=resolved.processes.keys(),
-        parameters=capabilities.base() if has is None else {**capabilities.base(), **has.parameters},
+        parameters={**capabilities.base(), **({} if has is None else has.parameters)},
+        instruments=resolved.instruments,
         actions=None if has is None else has.actions,
         sets={} if has is None else has.sets,
         certain=has is not None,
     )
     resolved.limits = reader.read(parts.sections.get("limits", {}))
+    resolved.conditions = conditions_section.ConditionsReader(
+        document, resolved.instruments, reader.actions, resolved.problems
+    ).read(parts.sections.get("conditions", {}))
     for translator in translators:
         for action, reason in planned_measurements.refused_actions(resolved.limits):
             what = f"[{translator.name}] actions: the limits would always refuse {reason}"

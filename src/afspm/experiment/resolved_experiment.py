@@ -17,6 +17,7 @@ from afspm.experiment.sections import ExperimentSections
 from afspm.experiment.toml_lines import Settings
 from afspm.experiment.wiring_classes import BoundSocket, Wiring, WiringKeys
 from afspm.model import ProblemNames, Role
+from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings
 from afspm.scheduler.safety.limits import ExperimentLimits
 
@@ -92,6 +93,7 @@ class ResolvedExperiment:
     net: Wiring = field(default_factory=Wiring)
     listening: list[BoundSocket] = field(default_factory=list)
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    conditions: InstrumentSettings = field(default_factory=InstrumentSettings)
     caching: CacheSettings = field(default_factory=CacheSettings)
     plans: dict[str, PlannedMeasurements] = field(default_factory=dict)
 
@@ -117,6 +119,15 @@ class ResolvedExperiment:
     def declaring(self, attribute: str) -> list[str]:
         """Return the names of the processes with a flag of their class that is true."""
         return [name for name, process in self.processes.items() if process.declares(attribute)]
+
+    @property
+    def instruments(self) -> dict[str, tuple[str, ...]]:
+        """The parameters of each instrument, by component: those with its name and a dot before."""
+        found = {}
+        for name in self.declaring("is_instrument"):
+            given = self.processes[name].settings.get("parameters")
+            found[name] = tuple(given) if isinstance(given, dict) else ()
+        return found
 
     @property
     def keys_folder(self) -> Path | None:

@@ -35,6 +35,14 @@ from afspm.model.events import (
     is_process_name,
 )
 from afspm.model.geometry import Frame, Region, RegionChange
+from afspm.model.instruments import (
+    InstrumentOrder,
+    InstrumentOrders,
+    InstrumentReading,
+    InstrumentReadings,
+    OrderOutcome,
+    instrument_of,
+)
 from afspm.model.packet import LoggedPacket, Packet, PacketHeader
 from afspm.model.problems import Problem, ProblemNames
 from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
@@ -85,6 +93,10 @@ __all__ = [
     "Feedback",
     "Frame",
     "HasTime",
+    "InstrumentOrder",
+    "InstrumentOrders",
+    "InstrumentReading",
+    "InstrumentReadings",
     "JournalEntries",
     "JournalEntry",
     "LogLine",
@@ -92,6 +104,7 @@ __all__ = [
     "LoggedPacket",
     "MeasurementSettings",
     "Note",
+    "OrderOutcome",
     "Packet",
     "PacketHeader",
     "Parameter",
@@ -121,6 +134,7 @@ __all__ = [
     "ShapeChange",
     "Spectrum",
     "component_of",
+    "instrument_of",
     "is_process_name",
     "registration_summary",
     "request_name",

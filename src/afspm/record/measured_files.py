@@ -117,6 +117,7 @@ class MeasuredFiles:
         mapping = provenance.drift(self._journal, published_ns, stood.began_ns, filenames)
         if mapping is not None:
             facts["drift"] = mapping
+        facts |= self._surroundings(published_ns, stood)
         at = FileProvenance(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
         if scans:
             self._batch.write(self._folder / name, nexus_writer.encode_scan(scans, at))
@@ -176,6 +177,7 @@ class MeasuredFiles:
             stood = provenance.control_at_start(self._journal, published_ns, ScopeState.SPEC, time_ns)
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
+            facts |= self._surroundings(published_ns, stood)
             at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
             self._batch.write(self._folder / name, nexus_writer.encode_spectrum(spectrum, at))
             place = (None, None) if spectrum.position_m is None else spectrum.position_m
@@ -199,6 +201,10 @@ class MeasuredFiles:
                 continue
             orphan.unlink()  # written right before a kill; the journal never got its number
         return number, name
+
+    def _surroundings(self, published_ns: int, stood: ControlAtStart) -> dict[str, object]:
+        found = provenance.instruments(self._journal, published_ns, stood.began_ns)
+        return {"instruments": found} if found else {}
 
     def _control(self, stood: ControlAtStart) -> tuple[str | None, str | None, str]:
         facts = stood.facts(self._problems)

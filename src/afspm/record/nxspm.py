@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 _VERSION: Final = "v2024.02"
 """The version of the NeXus definitions."""
+_OF_SAMPLE: Final = {"temperature": "temperature", "field": "magnetic_field", "pressure": "pressure"}
+"""Fields of NXsample, by the last word of a parameter of an instrument."""
 _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
 
 
@@ -44,6 +47,7 @@ def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: s
     _write_texts(entry, texts)
     sample = group(entry, "sample", "NXsample")
     sample["name"] = metadata.get("sample", "")
+    _write_surroundings(sample, about.get("instruments") or [])
     if "person" in metadata or "orcid" in metadata:
         user = group(entry, "user", "NXuser")
         _write_texts(user, {"name": metadata.get("person"), "ORCID": metadata.get("orcid")})
@@ -108,6 +112,26 @@ def _write_pattern(
         if count > 1:
             values(mesh, f"step_size_{axis}", size / (count - 1), "m")
     values(area, "scan_angle_x", 0.0 if region is None else math.degrees(region.angle_rad), "deg")
+
+
+def _write_surroundings(sample: h5py.Group, readings: Sequence[PlainMapping]) -> None:
+    # NXsample has fields of its own for the two quantities that nearly every such experiment has
+    if not readings:
+        return
+    environment = group(sample, "environment", "NXenvironment")
+    for one in readings:
+        name = re.sub(r"\W", "_", str(one["name"]))
+        sensor = group(environment, name, "NXsensor")
+        sensor["name"] = str(one["name"])
+        for key in ("value", "target", "lowest", "highest"):
+            if one.get(key) is not None:
+                values(sensor, key, float(one[key]), str(one["unit"]))
+        if one.get("age_s") is not None:
+            values(sensor, "value_age", float(one["age_s"]), "s")
+        _write_texts(sensor, {"reason": one.get("reason")})
+        quantity = _OF_SAMPLE.get(name.rpartition("_")[2])
+        if quantity is not None and one.get("value") is not None and quantity not in sample:
+            values(sample, quantity, float(one["value"]), str(one["unit"]))
 
 
 def group(parent: h5py.Group, name: str, nexus_class: str) -> h5py.Group:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from afspm.model import (
     ControlRequest,
     ControlState,
     Feedback,
+    InstrumentReadings,
     JournalEntries,
     JournalEntry,
     LogLine,
@@ -47,6 +49,7 @@ from afspm.record.measurement_history import (
     ScanSummary,
     SpectrumSummary,
 )
+from afspm.record.reading_curves import ReadingCurve
 from afspm.record.running_scan import RunningScan
 from afspm.record.timeline import Span, Timeline, Timelines
 
@@ -137,6 +140,7 @@ class Overview:
         self.control: ControlState | None = None
         self.readings = Readings()
         self.processes: dict[str, ProcessState] = {}
+        self.instruments: dict[str, ReadingCurve] = {}
         self.progress_reports: dict[str, Progress] = {}
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
@@ -283,6 +287,12 @@ class Overview:
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         self._measured.add_spectrum(spectrum, time_ns, self._holder)
+
+    def _on_instrument_readings(self, report: InstrumentReadings, time_ns: int) -> None:
+        for one in report.readings:
+            curve = self.instruments.setdefault(one.name, ReadingCurve())
+            curve.unit = one.unit or curve.unit
+            curve.add(time_ns, one.value if one.value is not None and one.is_number else math.nan)
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control

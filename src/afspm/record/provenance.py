@@ -10,11 +10,21 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.basics.plain_data import Plain
-from afspm.model import ControlState, Feedback, ProblemNames, ScopeState, ScopeStatus
+from afspm.model import (
+    ControlState,
+    Feedback,
+    InstrumentReading,
+    InstrumentReadings,
+    ProblemNames,
+    ScopeState,
+    ScopeStatus,
+)
 from afspm.model.drift_mapping import drift_knowledge
 
 _BACK = 20
 """The number of earlier states that are searched for the start of a measurement."""
+_READINGS_NS = 60 * 10**9
+"""Readings of instruments are published every 10 s at least; older ones belong to an instrument that is gone."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +97,37 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
         "registration": outcome.label,
         "sd_m": sd_m,
     }
+
+
+def instruments(journal: sqlite3.Connection, time_ns: int, since_ns: int | None) -> list[Plain]:
+    """Return the last values of other instruments before the end of a measurement, and their ranges during it."""
+    first_ns = time_ns - _READINGS_NS if since_ns is None else min(since_ns, time_ns - _READINGS_NS)
+    rows = journal.execute(
+        "SELECT time_ns, payload FROM packets WHERE message = 'InstrumentReadings' AND time_ns > ? AND time_ns <= ?"
+        " ORDER BY time_ns",
+        (first_ns, time_ns),
+    )
+    newest, seen = dict[str, tuple[int, InstrumentReading]](), dict[str, list[float]]()
+    for at_ns, payload in rows:
+        report = _decoded("InstrumentReadings", payload)
+        for one in report.readings if isinstance(report, InstrumentReadings) else ():
+            newest[one.name] = at_ns, one
+            if since_ns is not None and at_ns >= since_ns and one.value is not None and one.is_number:
+                seen.setdefault(one.name, []).append(one.value)
+    return [
+        {
+            "name": name,
+            "value": one.value if one.is_number else None,
+            "unit": one.unit,
+            "target": one.target,
+            "age_s": None if one.age_s is None else one.age_s + (time_ns - at_ns) * 1e-9,
+            "reason": one.reason,
+            "lowest": min(seen[name]) if name in seen else None,
+            "highest": max(seen[name]) if name in seen else None,
+        }
+        for name, (at_ns, one) in newest.items()
+        if at_ns > time_ns - _READINGS_NS
+    ]
 
 
 def last_state(journal: sqlite3.Connection) -> ScopeState:

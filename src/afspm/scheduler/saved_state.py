@@ -38,6 +38,8 @@ class SavedState:
         last_ns: the time of the newest packet.
         recent: (translator's time, published time) of the last packets.
         frame: `CoordinateFrame.saved()`; read from a file, the same as plain data.
+        instrument_units: the first unit of each parameter of an instrument.
+        instrument_orders: the number of the newest order.
     """
 
     control: ArbitrationState = field(default_factory=ArbitrationState)
@@ -54,6 +56,8 @@ class SavedState:
     last_ns: int = 0
     recent: tuple[tuple[int, int], ...] = ()
     frame: object = None
+    instrument_units: Mapping[str, str] = field(default_factory=dict)
+    instrument_orders: int = 0
 
     def without_holder(self) -> SavedState:
         """Return the state with no holder: an older state does not know the present one."""

@@ -14,6 +14,7 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.model.fencing import Epoch
 from afspm.model.snapshot import from_plain
 from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
+from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import CacheSettings, EnvelopeMapping, Envelopes
 from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.scheduler_core import SchedulerCore
@@ -53,6 +54,7 @@ class Scheduler:
         control: the section [control] of the experiment file: `ControlSettings` as plain data.
         limits: the section [limits]: `ExperimentLimits`.
         cache: the section [cache]: `CacheSettings`.
+        conditions: the section [conditions], and the names of the instruments: `InstrumentSettings`.
 
     Raises:
         ConfigError: a setting is unknown, or can't be used.
@@ -63,10 +65,12 @@ class Scheduler:
         control: Mapping[str, object] | None = None,
         limits: Mapping[str, object] | None = None,
         cache: Mapping[str, object] | None = None,
+        conditions: Mapping[str, object] | None = None,
     ) -> None:
         self._control = _section(ControlSettings, control or {}, "control")
         self._limits = _section(ExperimentLimits, limits or {}, "limits")
         self._cache = _section(CacheSettings, cache or {}, "cache")
+        self._instruments = _section(InstrumentSettings, conditions or {}, "conditions")
 
     def run_process(self, context: ProcessContext) -> int:
         """Run until the experiment ends or the process is stopped; return an exit code.
@@ -119,6 +123,7 @@ class Scheduler:
             rules=rules,
             watchdog=control.watchdog(),
             limits=self._limits,
+            instruments=self._instruments,
             envelopes=Envelopes(cache.rules, _mapping(cache.mapping) if cache.mapping else None, cache.history),
             run=RunFacts(dict(launch.clock), launch.run, launch.simulated, asdict(versions_here())),
         )

@@ -58,7 +58,7 @@ from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.publishing import packet_intake
 from afspm.scheduler.publishing.cache import TIME_STEP_NS, PacketCache
 from afspm.scheduler.publishing.event_log import SCHEDULER, SentStart, start_entry, unreadable_entry
-from afspm.scheduler.requests import answers, request_pipeline
+from afspm.scheduler.requests import answers, instrument_requests, request_pipeline
 from afspm.scheduler.requests.forwarder import AskForFrame
 from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.saved_state import SavedState
@@ -96,6 +96,7 @@ def due_s(state: SchedulerState) -> float | None:
     """Return when a Tick is due at the latest, in real monotonic time; None: no deadline."""
     dues = (
         state.due_s(),
+        _AT_ONCE_S if instrument_requests.flag_is_due(state) else None,
         _malfunction_due(state)[0],
         _entries_due_s(state),
         _holder_dead_at_s(state),
@@ -357,8 +358,9 @@ def _on_tick(draft: StateDraft, event: Tick) -> None:
 
 
 def _handle_deadlines(draft: StateDraft) -> None:
+    instrument_requests.expire(draft)
     # at most one change of control in a step: it is saved and published before the next is decided
-    for see_to in (_open_barrier, _flag_malfunction, _run_watchdog):
+    for see_to in (_open_barrier, _flag_malfunction, instrument_requests.flag, _run_watchdog):
         if see_to(draft):
             return
     if (holder := draft.control.holder) is not None and _is_due(_holder_dead_at_s(draft), draft.now_s):

@@ -23,6 +23,7 @@ from afspm.basics.units import Duration, PositiveDuration
 from afspm.model import ProblemNames
 from afspm.model.events import SUPERVISOR
 from afspm.scheduler.control.arbitration import Cause, RoleTable, Rules
+from afspm.scheduler.instruments.conditions import InstrumentSettings
 from afspm.scheduler.publishing.envelopes import Envelopes
 from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.safety.watchdog import WatchdogSettings
@@ -150,6 +151,7 @@ class SchedulerSettings:
     rules: Rules = field(default_factory=Rules)
     watchdog: WatchdogSettings = field(default_factory=WatchdogSettings)
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    instruments: InstrumentSettings = field(default_factory=InstrumentSettings)
     envelopes: Envelopes = field(default_factory=Envelopes)
     cache_bytes: int = 512 * 2**20
     waits: Waits = field(default_factory=Waits)

@@ -16,6 +16,7 @@ from afspm.scheduler.control.lifecycle import ExperimentEnd, StartupBarrier
 from afspm.scheduler.control.supervisor_registry import SupervisorRegistry
 from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.events import Codec, Effect, FrameAnswered, Log, SaveState
+from afspm.scheduler.instruments.known_instruments import Instruments
 from afspm.scheduler.publishing.cache import PacketCache
 from afspm.scheduler.publishing.event_log import EventLog
 from afspm.scheduler.requests.forwarder import Forwarder
@@ -61,6 +62,7 @@ class SchedulerState:
     pending: PendingRequests
     forwarder: Forwarder
     limits: LimitChecker
+    instruments: Instruments
     microscope: MicroscopeStatus
     watchdog: Watchdog
     event_log: EventLog
@@ -80,7 +82,8 @@ class SchedulerState:
             idempotency=IdempotencyCache(),
             pending=PendingRequests(),
             forwarder=Forwarder(control.request_timeout_s, waits.answer_s, waits.longest_queue),
-            limits=LimitChecker(settings.limits),
+            limits=LimitChecker(settings.instruments.unrated(settings.limits)),
+            instruments=Instruments(settings.instruments),
             microscope=MicroscopeStatus(dog.dangerous, control.malfunction_after_s),
             watchdog=Watchdog(dog),
             event_log=EventLog(),
@@ -94,7 +97,13 @@ class SchedulerState:
     def saved_parts(self) -> tuple[object, ...]:
         """The parts whose changes are saved before they are published."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
-        return *saved, self.limits.state.usage, self.idempotency.sent_actions, self.event_log.starts
+        return (
+            *saved,
+            self.limits.state.usage,
+            self.idempotency.sent_actions,
+            self.event_log.starts,
+            self.instruments.units,
+        )
 
     def due_s(self) -> float | None:
         """Return the earliest deadline, in real monotonic time, of the parts that do not depend on others."""
@@ -104,6 +113,7 @@ class SchedulerState:
             self.end.by_s,
             self.pending.due_s(line_is_free=self.forwarder.is_free),
             self.watchdog.due_s,
+            self.instruments.due_s(),
             self.frame.deadline_s(),
         )
         return min((due_s for due_s in dues if due_s is not None), default=None)
@@ -132,6 +142,7 @@ class StateParts:
     pending: PendingRequests
     forwarder: Forwarder
     limits: LimitChecker
+    instruments: Instruments
     microscope: MicroscopeStatus
     watchdog: Watchdog
     event_log: EventLog
@@ -203,6 +214,8 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         last_ns=env.cache.last_ns,
         recent=tuple(env.cache.recent()),
         frame=state.frame.saved(),
+        instrument_units=state.instruments.units,
+        instrument_orders=state.instruments.number,
     )
 
 
@@ -228,4 +241,5 @@ def restored_state(
         limits=replace(state.limits, state=saved.limits),
         watchdog=state.watchdog.restored(saved.tip),
         microscope=replace(state.microscope, risk=saved.tip_risk),
+        instruments=replace(state.instruments, units=saved.instrument_units, number=saved.instrument_orders),
     )

@@ -32,7 +32,7 @@ from afspm.wire.frames import (
     encode_time,
     id_of,
 )
-from afspm.wire.mapping import decode_orders, encode_orders
+from afspm.wire.mapping import decode_instrument_orders, decode_orders, encode_orders
 from afspm.wire.messages import (
     MessageDeclaration,
     MessageKind,
@@ -63,6 +63,7 @@ __all__ = [
     "declare",
     "declared",
     "decode",
+    "decode_instrument_orders",
     "decode_orders",
     "decode_packet",
     "decode_parameter",

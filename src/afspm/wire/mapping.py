@@ -16,7 +16,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm import model
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
-from afspm.wire.generated import control_pb2, feedback_pb2, journal_pb2
+from afspm.wire.generated import control_pb2, feedback_pb2, instruments_pb2, journal_pb2
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer
 
@@ -229,9 +229,32 @@ _SETTINGS = MessageMapping(
     parameters=_each("parameters", PARAMETER),
     key=FieldMapping("key", sparse=True),
 )
+_READING = MessageMapping(
+    model.InstrumentReading,
+    instruments_pb2.InstrumentReading,
+    *("value", "target", "busy"),
+    name=FieldMapping("parameter", from_wire=_needed("a reading")),
+    unit=FieldMapping("units", sparse=True),
+    age_s="age",
+    reason=FieldMapping("reason", sparse=True),
+)
+_OUTCOME = MessageMapping(
+    model.OrderOutcome, instruments_pb2.OrderOutcome, "number", "response", reason=FieldMapping("reason", sparse=True)
+)
+_ORDER = MessageMapping(
+    model.InstrumentOrder,
+    instruments_pb2.InstrumentOrder,
+    *("number", "id"),
+    parameter=FieldMapping("parameter", PARAMETER.to_wire, PARAMETER.from_wire),
+    rate_per_s="rate",
+    rate_unit=FieldMapping("rate_units", sparse=True),
+)
 # Told is the name on the wire, which must stay compatible  # word: told
 RELAYED = MessageMapping(
     model.RelayedMessage, journal_pb2.Told, "payload", message=FieldMapping("message", from_wire=_needed("a message"))
+)
+INSTRUMENT_ORDERS = MessageMapping(
+    model.InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER)
 )
 MAPPINGS: tuple[MessageMapping[Any], ...] = (
     FEEDBACK,
@@ -251,12 +274,31 @@ MAPPINGS: tuple[MessageMapping[Any], ...] = (
     MessageMapping(model.Progress, journal_pb2.Progress, "name", "done", "of", time_ns=_time(), left_s="remaining"),
     _NOTE,
     _SETTINGS,
+    MessageMapping(
+        model.InstrumentReadings,
+        instruments_pb2.InstrumentReadings,
+        *("instrument", "token"),
+        time_ns=_time(),
+        readings=_each("readings", _READING),
+        outcomes=_each("outcomes", _OUTCOME),
+    ),
+    INSTRUMENT_ORDERS,
 )
 
 
 def encode_orders(restart: Iterable[str]) -> bytes:
     """Return the object in the answer to RELAY_REQUEST."""
     return journal_pb2.Orders(restart=restart).SerializeToString()
+
+
+def decode_instrument_orders(payload: Buffer) -> model.InstrumentOrders:
+    """Return the orders for an instrument.
+
+    Raises:
+        WireError: the bytes are no orders.
+        InvalidValue: a value is invalid.
+    """
+    return INSTRUMENT_ORDERS.decode(payload)
 
 
 def decode_orders(payload: Buffer) -> tuple[str, ...]:

@@ -32,6 +32,7 @@ from afspm.wire.generated import (
     drift_pb2,
     feedback_pb2,
     geometry_pb2,
+    instruments_pb2,
     journal_pb2,
     lines_pb2,
     scan_pb2,
@@ -212,6 +213,15 @@ NOTE: Final = MessageDeclaration(
 MEASUREMENT_SETTINGS: Final = MessageDeclaration(
     type=journal_pb2.MeasurementSettings, kind=MessageKind.EVENT, source=Role.SCHEDULER
 )
+INSTRUMENT_READINGS: Final = MessageDeclaration(
+    type=instruments_pb2.InstrumentReadings,
+    kind=MessageKind.EVENT,
+    source=Role.SCHEDULER,
+    always=False,
+    named=True,
+    event="readings",
+    in_past=True,
+)
 DRIFT_MAPPING: Final = MessageDeclaration(
     type=DriftMapping,
     kind=MessageKind.RESULT,
@@ -240,7 +250,7 @@ FEEDBACK_ANALYSIS: Final = MessageDeclaration(
 )
 
 _MODULES = (
-    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2,
+    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, instruments_pb2,
     journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
 # collected by their class, so that no declaration above can be forgotten

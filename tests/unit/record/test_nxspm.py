@@ -83,3 +83,25 @@ def test_other_spectrum_follows_nxspm_as_a_scan_of_one_point(spectrum: Spectrum,
     entry = opened(encode_spectrum(spectrum, about))
     assert said(entry, "definition", "experiment_technique") == ["NXspm", technique]
     assert said(entry[CONTROL], "scan_region/scan_start_x", "mesh_scan/scan_points_x") == [1e-6, 1]
+
+
+def test_readings_of_other_instruments_are_in_the_sample() -> None:
+    readings = [
+        {
+            "name": "cryo.temperature",
+            "value": 4.2,
+            "unit": "K",
+            "target": 4.2,
+            "age_s": 0.5,
+            "lowest": 4.1,
+            "highest": 4.3,
+        },
+        {"name": "magnet.field", "value": None, "unit": "T", "age_s": None, "reason": "no sensor"},
+    ]  # fmt: skip
+    entry = opened(encode_scan([SCAN], FileProvenance(0, None, {"instruments": readings})))
+    sample = entry["sample"]
+    assert (sample["temperature"][()], sample["temperature"].attrs["units"]) == (4.2, "K")
+    assert "magnetic_field" not in sample
+    sensor = sample["environment/cryo_temperature"]
+    assert said(sensor, "value", "target", "lowest", "highest", "value_age") == [4.2, 4.2, 4.1, 4.3, 0.5]
+    assert said(sample["environment/magnet_field"], "reason") == ["no sensor"]

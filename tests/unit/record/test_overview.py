@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from afspm.model import (
     ScopeState,
 )
 from afspm.record.overview import MOST_LINES, Overview
+from afspm.record.reading_curves import MOST_POINTS
 
 S = 1_000_000_000
 REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))
@@ -345,3 +347,16 @@ def test_summaries_of_a_scan_share_equal_parts() -> None:
         assert (other.filename is first.filename, other.unit is first.unit, other.time_ns is first.time_ns) == (
             True,
         ) * 3
+
+
+def test_readings_of_instruments_become_bounded_curves() -> None:
+    overview = Overview()
+    for i in range(20_000):
+        value = None if i == 19_000 else float(i)
+        reading = model.InstrumentReading("cryo.t", value, "K", 0.1, reason="" if value else "no sensor")
+        overview.take("InstrumentReadings", model.InstrumentReadings(i * S, "cryo", (reading,)), i * S)
+    curve = overview.instruments["cryo.t"]
+    assert curve.unit == "K"
+    assert 1000 < len(curve.times_ns) == len(curve.values) <= MOST_POINTS
+    assert (curve.times_ns[0], curve.times_ns[-1]) == (0, 19_999 * S)
+    assert sum(math.isnan(value) for value in curve.values) == 1

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.record.record_lab import ABOUT, REGION, START_NS, Night, same
+from tests.unit.record.record_lab import ABOUT, REGION, START_NS, Given, Night, same
 
 import afspm
 from afspm import wire
 from afspm.basics.errors import FileError
 from afspm.model import (
     Frame,
+    InstrumentReading,
+    InstrumentReadings,
     JournalEntries,
     JournalEntry,
     LogLine,
@@ -366,3 +368,23 @@ def test_only_one_transaction_is_written_at_a_time_and_readers_never_wait(
 def test_journal_is_synced_before_its_write_ahead_log_is_restarted(store: RecordStore) -> None:
     # SQLite syncs by itself; its pragma reports whether it does: 0 is never
     assert store._journal.execute("PRAGMA synchronous").fetchone()[0] >= 1
+
+
+def readings(night: Night, kelvin: float | None) -> Given:
+    reading = InstrumentReading("cryo.temperature", kelvin, "K", 0.25, 4.2, reason="" if kelvin else "no sensor")
+    return night.packet(InstrumentReadings(night.now_ns, "cryo", (reading,)), "InstrumentReadings_cryo")
+
+
+def test_scan_has_the_readings_of_its_time(night: Night, store: RecordStore, tmp_path: Path) -> None:
+    store.take([night.control(), *night.whole_scan(1)])
+    store.take([readings(night, 4.4), night.state(ScopeState.SCANNING), readings(night, 4.1), readings(night, 4.3)])
+    store.take([*night.scans(2), night.state(ScopeState.FREE)])
+    night.now_ns += 61 * 10**9
+    store.take([*night.whole_scan(3)])
+    store.flush()
+    run = afspm.open_run(tmp_path)
+    found = [(number, one) for number, scan in enumerate(run.scans) for one in run.about(scan).get("instruments", ())]
+    ((number, reading),) = found
+    assert number == 1
+    assert (reading["value"], reading["lowest"], reading["highest"]) == (4.3, 4.1, 4.3)
+    assert 0.25 < reading["age_s"] < 0.3

@@ -4,7 +4,7 @@ import itertools
 import re
 from datetime import UTC
 
-from afspm.record.drawing.timeline import COLUMNS, TimelineRow, stretches, time_ticks, timeline_html
+from afspm.record.drawing.timeline import COLUMNS, TimelineCurve, TimelineRow, stretches, time_ticks, timeline_html
 from afspm.record.timeline import Span
 
 S = 1_000_000_000
@@ -39,3 +39,13 @@ def test_times_at_the_ends_of_a_row_stay_within_it() -> None:
     ticks = re.findall(r'<span style="left:([\d.]+)%(;transform:translateX\((-?\d+)%\))?">', drawn)
     assert [(at, shift) for at, _, shift in ticks][:2] == [("0.00", "0"), ("16.67", "")]
     assert (ticks[-1][0], ticks[-1][2]) == ("100.00", "-100")
+
+
+def test_curve_lies_below_the_rows_with_a_gap_where_it_is_unknown() -> None:
+    row = TimelineRow("control", (Span("series", 0, 60 * S),), lambda _: "")
+    curve = TimelineCurve("cryo.t", "K", [0, 15 * S, 30 * S, 45 * S, 60 * S], [4.0, 5.0, float("nan"), 4.5, 4.0])
+    drawn = timeline_html([row], 0, 60 * S, UTC, curves=[curve])
+    lines = re.findall(r'<polyline points="([^"]+)"', drawn)
+    assert lines == ["0.0,96.0 180.0,4.0", "540.0,50.0 720.0,96.0"]
+    assert "4 K to 5 K, now 4 K" in drawn
+    assert drawn.index("control") < drawn.index("cryo.t") < drawn.index("lane-axis")

@@ -31,6 +31,7 @@ AS_MODEL = {
     "Progress",
     "Note",
     "MeasurementSettings",
+    "InstrumentReadings",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from datetime import tzinfo
@@ -9,7 +10,7 @@ from html import escape
 from typing import Protocol
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import duration_text, time_of_day
+from afspm.basics.formatting import duration_text, quantity, time_of_day
 
 COLUMNS = 720  # resolution of a row: intervals within one column are merged
 MOST_PICTURES = 14
@@ -31,6 +32,10 @@ CSS = """
 .strip>div{height:auto;aspect-ratio:14/1;background:none}
 .strip span{background:none;padding:1px}
 .strip img{width:100%;height:100%;object-fit:cover;display:block;border-radius:2px;cursor:pointer}
+.curve>div{height:46px}
+.curve svg{position:absolute;inset:0;width:100%;height:100%}
+.curve polyline{fill:none;stroke:currentColor;stroke-width:1.2;vector-effect:non-scaling-stroke}
+.curve em{position:absolute;left:4px;top:1px;font-size:11px;font-style:normal;color:var(--quiet)}
 .lane-axis>div{position:relative;height:18px}
 .lane-axis span{position:absolute;top:1px;font-size:11.5px;color:var(--quiet);transform:translateX(-50%)}
 .lanes{font-variant-numeric:tabular-nums}
@@ -60,6 +65,16 @@ class TimelineRow:
     style: Callable[[str], str]
 
 
+@dataclass(frozen=True)
+class TimelineCurve:
+    """A value over time under the rows; NaN where it is unknown."""
+
+    name: str
+    unit: str
+    times_ns: Sequence[int]
+    values: Sequence[float]
+
+
 @dataclass
 class Stretch:
     """Intervals that share columns of the image: the longest, and their number."""
@@ -80,6 +95,7 @@ def timeline_html(
     *,
     local_too: bool = False,
     pictures: Iterable[tuple[int, str]] = (),
+    curves: Iterable[TimelineCurve] = (),
 ) -> str:
     """Return rows from `begin_ns` (None: from the first interval on) to `end_ns`, with an axis of times of day.
 
@@ -87,6 +103,7 @@ def timeline_html(
         zone: of the axis; None: this computer's.
         local_too: add a second axis in this computer's zone.
         pictures: (time, HTML) of each, shown above the rows; of overlapping pictures only the last is shown.
+        curves: shown below the rows, on the same axis of time.
     """
     read = [(row, tuple(row.spans)) for row in rows]
     starts = [spans[0].start_ns for _, spans in read if spans]
@@ -98,8 +115,9 @@ def timeline_html(
     axes = _axis(begin_ns, end_ns, zone, "UTC" if local_too else "")
     axes += _axis(begin_ns, end_ns, None, "local") if local_too else ""
     strip = _pictures(pictures, begin_ns, end_ns)
+    drawn = "".join(_curve(one, begin_ns, end_ns) for one in curves)
     longest = max(len(row.name) for row, _ in read)
-    return f'<div class="lanes" style="--names:min(max(9ch, {longest}ch), 40%)">{strip}{body}{axes}</div>'
+    return f'<div class="lanes" style="--names:min(max(9ch, {longest}ch), 40%)">{strip}{body}{drawn}{axes}</div>'
 
 
 def _axis(begin_ns: int, end_ns: int, zone: tzinfo | None, name: str) -> str:
@@ -174,6 +192,28 @@ def _merge(into: Stretch, one: Stretch) -> None:
         into.label, into.by = one.label, one.by
     into.lasted_ns = max(into.lasted_ns, one.lasted_ns)
     into.count += 1
+
+
+def _curve(curve: TimelineCurve, begin_ns: int, end_ns: int) -> str:
+    # from the lowest value, at the bottom, to the highest; a gap where the value was unknown
+    known = [(t, v) for t, v in zip(curve.times_ns, curve.values, strict=True) if math.isfinite(v)]
+    if not known:
+        return f'<div class="lane"><b>{escape(curve.name)}</b><div></div></div>'
+    low, high = min(v for _, v in known), max(v for _, v in known)
+    lines, line = list[str](), list[str]()
+    for time_ns, value in zip(curve.times_ns, curve.values, strict=True):
+        if not math.isfinite(value):
+            lines, line = [*lines, " ".join(line)], []
+        elif begin_ns <= time_ns <= end_ns:
+            x = COLUMNS * (time_ns - begin_ns) / (end_ns - begin_ns)
+            y = 50.0 if high == low else 96.0 - 92.0 * (value - low) / (high - low)
+            line.append(f"{x:.1f},{y:.1f}")
+    drawn = "".join(f'<polyline points="{points}"/>' for points in (*lines, " ".join(line)) if points)
+    text = f"{quantity(low, curve.unit)} to {quantity(high, curve.unit)}, now {quantity(known[-1][1], curve.unit)}"
+    return (
+        f'<div class="lane curve" title="{escape(f"{curve.name}: {text}")}"><b>{escape(curve.name)}</b><div>'
+        f'<svg viewBox="0 0 {COLUMNS} 100" preserveAspectRatio="none">{drawn}</svg><em>{escape(text)}</em></div></div>'
+    )
 
 
 def _row(row: TimelineRow, shown: Sequence[Stretch], begin_ns: int, end_ns: int, zone: tzinfo | None) -> str:

@@ -52,7 +52,7 @@ from afspm.scheduler.coordinate_frame import MappedRequest
 from afspm.scheduler.events import FrameAnswered, Reply, RequestIn
 from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.publishing.event_log import SCHEDULER
-from afspm.scheduler.requests import answers
+from afspm.scheduler.requests import answers, instrument_requests
 from afspm.scheduler.requests.forwarder import (
     AskForFrame,
     ForwardedRequest,
@@ -166,7 +166,9 @@ def _unknown(request: Request, why: str) -> Response:
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
     """Return whether to forward a request to the translator; if not, it was answered."""
     kind, subject = event.request.kind, event.request.subject
-    if kind == RELAY_REQUEST:  # also after the end: final process states belong in the record
+    if (report := instrument_requests.report_in(draft, event)) is not None and not draft.control.ended:
+        instrument_requests.take_report(draft, event, report, _not_allowed_now)
+    elif kind == RELAY_REQUEST:  # also after the end: final process states belong in the record
         publishing.publish_for_process(draft, event)
     elif draft.control.ended:
         control_change.answer_unless_ending(
@@ -236,6 +238,9 @@ def enqueue(draft: StateDraft, event: RequestIn) -> None:
         return
     is_repeated = draft.idempotency.look_up(name, request) is RequestStatus.UNKNOWN
     job = ForwardedRequest.of(event, command=is_command, is_repeated=is_repeated)
+    if instrument_requests.is_for_instrument(draft, event):
+        instrument_requests.ask(draft, event, job)
+        return
     draft.forwarder, refused = draft.forwarder.ask(job, draft.now_s)
     if refused is None:
         draft.idempotency = draft.idempotency.noted(name, request, RequestStatus.PENDING)
@@ -295,6 +300,10 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
             return
         if (refusal := draft.limits.check_place(job.request)) is not None:
             _refuse(draft, job, refusal)
+            return
+        if why := draft.instruments.refusal(str(job.request.subject), draft.now_s, draft.now_ns):
+            # not free: its client waits, and tries again
+            _answer_unsent(draft, job, Response(int(ControlResponse.NOT_FREE), b"", why, job.request.id))
             return
     _send(draft, job, mapped)
 

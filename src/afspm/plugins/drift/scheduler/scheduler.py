@@ -53,8 +53,9 @@ class DriftCompensatedScheduler(Scheduler):
         control: PlainMapping | None = None,
         limits: PlainMapping | None = None,
         cache: PlainMapping | None = None,
+        conditions: PlainMapping | None = None,
     ) -> None:
-        super().__init__(control, limits, cache)
+        super().__init__(control, limits, cache, conditions)
         self.drift = (
             DriftCompensationSettings.from_table(drift or {})
             if not isinstance(drift, DriftCompensationSettings)

@@ -17,7 +17,7 @@ from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, picture_url
 from afspm.plugins.web.watch import Watch
-from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
+from afspm.record.drawing.timeline import TimelineCurve, TimelineRow, timeline_html, tint_class
 from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
 
@@ -142,7 +142,13 @@ class Contents:
         )
         now_ns = _now_ns(self._watch, overview)
         folded, unfolded = (
-            timeline_html(rows_of(overview, silent, unfolded=unfolded), None, now_ns, pictures=self._strip(overview))
+            timeline_html(
+                rows_of(overview, silent, unfolded=unfolded),
+                None,
+                now_ns,
+                pictures=self._strip(overview),
+                curves=curves_of(overview),
+            )
             for unfolded in (False, True)
         )
         return SlowContent(
@@ -199,6 +205,13 @@ def trouble(watch: Watch) -> str:
         why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
         return f"The experiment has been silent for {duration_text(silent_s)}: this page is that old.{why}"
     return ""
+
+
+def curves_of(overview: Overview) -> list[TimelineCurve]:
+    """Return a curve for each parameter of other instruments."""
+    return [
+        TimelineCurve(name, one.unit, one.times_ns, one.values) for name, one in sorted(overview.instruments.items())
+    ]
 
 
 def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = True) -> Iterator[TimelineRow]:

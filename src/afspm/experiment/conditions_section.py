@@ -1,0 +1,150 @@
+"""[conditions]: the values of other instruments that measuring needs.
+
+The conditions are enforced by `scheduler.instruments`.
+
+[conditions.cold]
+"cryo.temperature" = { from = "4.15 K", to = "4.25 K", for = "60 s" }
+while = ["start-scan", "start-spec"]
+problem = "not-at-temperature"
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from afspm.basics.errors import AfspmError
+from afspm.basics.units import parse_quantity, si
+from afspm.experiment.document import Document
+from afspm.experiment.findings import nearest
+from afspm.experiment.toml_lines import Table
+from afspm.model import ProblemNames, instrument_of
+from afspm.model.names import BASE_ACTIONS
+from afspm.scheduler.instruments.conditions import AllowedBand, InstrumentSettings, MeasuringCondition
+
+_WHILE, _PROBLEM = "while", "problem"
+_BOUNDS: Final = ("from", "to", "within")
+_OF_BAND: Final = (*_BOUNDS, "for")
+
+
+@dataclass(frozen=True)
+class ConditionsReader:
+    """Reads the section.
+
+    Args:
+        instruments: the components that are instruments, each with its parameters.
+        actions: known actions; None if they can't be known before the microscope runs.
+    """
+
+    document: Document
+    instruments: Mapping[str, Collection[str]]
+    actions: frozenset[str] | None
+    problems: ProblemNames
+
+    def read(self, table: Table) -> InstrumentSettings:
+        """Return the settings; errors are reported, and the entries left out."""
+        for instrument, parameters in self.instruments.items():
+            for one in parameters:
+                if instrument_of(one) != instrument:
+                    what = f"[{instrument}] parameters: {one!r} does not begin with {instrument!r} and a dot"
+                    hint = f'"{instrument}.{one.rpartition(".")[2]}"'
+                    self.document.error(what, instrument, "parameters", one, hint=hint)
+        conditions = {name: found for name, one in table.items() if (found := self._condition(name, one)) is not None}
+        flagged = {one.problem for one in conditions.values() if one.problem}
+        numbers = {name: self.problems.number(name) for name in sorted(flagged)}
+        return InstrumentSettings(tuple(self.instruments), conditions, numbers)
+
+    def _condition(self, name: str, table: object) -> MeasuringCondition | None:
+        path = ("conditions", name)
+        if not isinstance(table, Mapping):
+            self.document.error(f"[conditions] {name} is not a table of keys and values", *path)
+            return None
+        bands = {}
+        for key, value in table.items():
+            if key not in (_WHILE, _PROBLEM) and (band := self._band(name, key, value)) is not None:
+                bands[key] = band
+        actions, problem = self._actions(name, table), self._problem(name, table)
+        if not any(key not in (_WHILE, _PROBLEM) for key in table):
+            what = f"[conditions.{name}] names no parameter of an instrument"
+            self.document.error(what, *path, hint='e.g. "cryo.temperature" = { from = "4.15 K", to = "4.25 K" }')
+        if not bands or actions is None or problem is None:
+            return None
+        return MeasuringCondition(bands, actions, problem, str(self.document.place(*path)))
+
+    def _band(self, name: str, parameter: str, table: object) -> AllowedBand | None:
+        path = ("conditions", name, parameter)
+        known = [one for parameters in self.instruments.values() for one in parameters]
+        if parameter not in known:
+            what = f"[conditions.{name}] no instrument has the parameter {parameter!r}"
+            self.document.error(what, *path, hint=nearest(parameter, known) or "see `parameters` of the instrument")
+            return None
+        if not isinstance(table, Mapping):
+            self.document.error(f"[conditions.{name}] {parameter} is not a table", *path, hint="{ from = …, to = … }")
+            return None
+        if unknown := [key for key in table if key not in _OF_BAND]:
+            what = f"[conditions.{name}] {parameter}: {unknown[0]!r} is not a setting"
+            self.document.error(what, *path, unknown[0], hint=nearest(unknown[0], _OF_BAND))
+            return None
+        if not any(key in table for key in _BOUNDS):
+            self.document.error(f"[conditions.{name}] {parameter} has none of: {', '.join(_BOUNDS)}", *path)
+            return None
+        return self._numbers(name, parameter, table)
+
+    def _numbers(self, name: str, parameter: str, table: Table) -> AllowedBand | None:
+        path = ("conditions", name, parameter)
+        unit = _unit_of(table)
+        read = dict[str, float]()
+        for key, value in table.items():
+            wanted = "s" if key == "for" else unit
+            try:
+                if isinstance(value, bool) or not isinstance(value, str | float | int):
+                    raise AfspmError("not a quantity")
+                if key == "for" and not isinstance(value, str):
+                    raise AfspmError("a time without a unit", hint='e.g. "60 s"')
+                read[key] = si(value, wanted)
+                if not math.isfinite(read[key]):
+                    raise AfspmError("not a finite number")
+                if key in ("for", "within") and read[key] < 0:
+                    raise AfspmError("below zero")
+            except AfspmError as error:
+                what = f"[conditions.{name}] {parameter}: {key} = {value!r}: {error.what}"
+                self.document.error(what, *path, key, hint=error.hint)
+                return None
+        low, high = read.get("from"), read.get("to")
+        if low is not None and high is not None and low >= high:
+            self.document.error(f"[conditions.{name}] {parameter}: from must be less than to", *path, "from")
+            return None
+        return AllowedBand(low, high, read.get("within"), read.get("for", 0.0), unit)
+
+    def _actions(self, name: str, table: Table) -> tuple[str, ...] | None:
+        path, given = ("conditions", name, _WHILE), table.get(_WHILE, list(MeasuringCondition().actions))
+        if not isinstance(given, list) or not given or not all(isinstance(one, str) for one in given):
+            self.document.error(f"[conditions.{name}] while is not a list of actions", *path)
+            return None
+        known = BASE_ACTIONS if self.actions is None else self.actions
+        for i, one in enumerate(given):
+            if one not in known and (self.actions is not None or not one.startswith("x-")):
+                what = f"[conditions.{name}] while: there is no action {one!r}"
+                self.document.error(what, *path, i, hint=nearest(one, known))
+                return None
+        return tuple(given)
+
+    def _problem(self, name: str, table: Table) -> str | None:
+        given = table.get(_PROBLEM, "")
+        if given == "" or (isinstance(given, str) and given in self.problems):
+            return str(given)
+        what = f"[conditions.{name}] the experiment knows no problem {given!r}"
+        hint = f"name it, with a number of its own: [problems] {given} = 100"
+        self.document.error(what, "conditions", name, _PROBLEM, hint=hint)
+        return None
+
+
+def _unit_of(table: Table) -> str:
+    for key in _BOUNDS:
+        if isinstance(value := table.get(key), str):
+            with contextlib.suppress(AfspmError):  # reported when the value is read
+                return parse_quantity(value)[1]
+    return ""

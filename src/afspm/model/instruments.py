@@ -1,0 +1,103 @@
+"""Other instruments of an experiment: their readings, and the orders that they get from the scheduler."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from afspm.model.requests import Parameter
+
+SEPARATOR = "."
+"""Separates the component's name from the rest in the name of a parameter: "cryo.temperature"."""
+PARTS = ("target", "busy")
+"""Endings of names that only read: "cryo.temperature.target", "cryo.temperature.busy"."""
+
+
+def instrument_of(parameter: str) -> str:
+    """Return the component that a parameter belongs to; empty: it belongs to the microscope."""
+    owner, separator, _ = parameter.partition(SEPARATOR)
+    return owner if separator else ""
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentReading:
+    """One value of an instrument.
+
+    Attributes:
+        name: of the parameter, such as "cryo.temperature".
+        value: in `unit`; None: unknown, for `reason`.
+        age_s: real time since the instrument measured it; None: never.
+        target: in `unit`; None: it can't be set.
+        busy: whether the value is on its way to the target.
+    """
+
+    name: str
+    value: float | None = None
+    unit: str = ""
+    age_s: float | None = None
+    target: float | None = None
+    busy: bool = False
+    reason: str = ""
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the value is a finite number."""
+        return self.value is not None and math.isfinite(self.value)
+
+
+@dataclass(frozen=True, slots=True)
+class OrderOutcome:
+    """The outcome of an order.
+
+    Attributes:
+        number: of the order.
+        response: a `ControlResponse`.
+    """
+
+    number: int
+    response: int
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentReadings:
+    """A report of an instrument: all of its values, and the outcomes of orders since the last report.
+
+    Attributes:
+        token: of the scheduler's last answer; the report was made after it.
+    """
+
+    time_ns: int
+    instrument: str
+    readings: tuple[InstrumentReading, ...] = ()
+    outcomes: tuple[OrderOutcome, ...] = ()
+    token: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentOrder:
+    """A target for an instrument to set.
+
+    Attributes:
+        number: identifies the order in its outcome.
+        id: of the client's request: an id is carried out once.
+        rate_per_s: the fastest change allowed, in `rate_unit` per real second; None: no limit.
+    """
+
+    number: int
+    id: str
+    parameter: Parameter
+    rate_per_s: float | None = None
+    rate_unit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class InstrumentOrders:
+    """The scheduler's answer to a report.
+
+    Attributes:
+        token: for the next report.
+    """
+
+    token: int
+    orders: tuple[InstrumentOrder, ...] = ()

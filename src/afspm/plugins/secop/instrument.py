@@ -1,0 +1,159 @@
+"""`Instrument`: the component that connects an experiment to one SECoP server."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from typing import ClassVar, Literal
+from urllib.parse import urlsplit
+
+from afspm.basics.errors import ConfigError
+from afspm.client.component import Component
+from afspm.model import InstrumentReadings
+from afspm.plugins.secop.lines import LONGEST
+from afspm.plugins.secop.secop_client import SecopClient, ServerUnfit
+
+PORT = 10767
+AGAIN_S = 2.0
+CONNECT_S = 1.0
+
+
+class Instrument(Component):
+    """Another instrument of the experiment: a cryostat, a magnet, a lock-in amplifier … at a SECoP server.
+
+    Its parameters are set and read as those of the microscope, and [limits] and [conditions] apply to them.
+
+    Args:
+        address: of the server: "secop://cryo-pc:10767".
+        parameters: the parameters of the experiment, each with its module: `"cryo.temperature" = "tt"`, or with one
+            accessible of a module, `"lockin.sensitivity" = "sr830:sensitivity"`. A name begins with the name of this
+            component and a dot.
+    """
+
+    is_instrument: ClassVar[bool] = True
+    listens: ClassVar[tuple[str, ...]] = ("ControlState",)
+    period_s = 0.25
+    period_time: Literal["experiment", "real"] = "real"
+
+    def __init__(self, address: str, parameters: dict[str, str]) -> None:
+        self._host, self._port = _host_and_port(address)
+        if not parameters:
+            raise ConfigError("the instrument has no parameters", where="parameters", hint='"cryo.temperature" = "tt"')
+        self._client = SecopClient(parameters)
+        self._lines: LineSocket | None = None
+        self._again_s = 0.0
+        self._last_fault = ""
+        self._token = 0
+
+    def on_tick(self) -> None:
+        """Exchange lines with the server, then report to the scheduler."""
+        self._serve(self._receive)
+        self._serve(lambda: self._client.tick(self.clock.monotonic_s()))
+        for text in self._client.log:
+            self.log.warning("%s", text)
+        self._client.log.clear()
+        self._report()
+
+    def on_end(self) -> None:
+        """Disconnect; the server keeps its targets."""
+        if self._lines is not None:
+            self._lines.close()
+
+    def _report(self) -> None:
+        client = self._client
+        outcomes = client.outcomes()
+        readings = client.readings(self.clock.monotonic_s())
+        report = InstrumentReadings(self.clock.now_ns(), self.name, readings, outcomes, self._token)
+        answer = self.scope.report_readings(report)
+        client.delivered(outcomes)
+        self._token = answer.token
+        for order in answer.orders:
+            self._serve(lambda order=order: client.order(order, self.clock.monotonic_s()))  # type: ignore[misc]
+
+    def _receive(self) -> list[str]:
+        now_s, out = self.clock.monotonic_s(), list[str]()
+        if self._lines is None:
+            if now_s < self._again_s:
+                return []
+            self._again_s = now_s + AGAIN_S
+            self._lines = LineSocket(self._host, self._port)
+            return self._client.connected(now_s)
+        for line in self._lines.receive():
+            out += self._client.take(line, now_s)
+        if self._client.is_silent(now_s):
+            raise ConnectionError("the server answers nothing")
+        if self._client.is_described and self._last_fault:
+            self.log.info("%s:%d answers again", self._host, self._port)
+            self._last_fault = ""
+        return out
+
+    def _serve(self, step: Callable[[], list[str]]) -> None:
+        try:
+            out = step()
+            if self._lines is not None and out:
+                self._lines.send(out)
+        except (OSError, ServerUnfit) as error:
+            if self._lines is not None:
+                self._lines.close()
+            self._lines = None
+            fault = f"{self._host}:{self._port}: {error}"
+            self._client.lost(fault)
+            if fault != self._last_fault:  # once: it is tried again all the time
+                self.log.warning("%s; trying again", fault)
+            self._last_fault = fault
+
+
+class LineSocket:
+    """A TCP connection that never waits, except for its beginning.
+
+    Raises:
+        OSError: there is no connection; also every method.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        self._socket = socket.create_connection((host, port), CONNECT_S)
+        self._socket.settimeout(0.0)
+        self._in = self._out = b""
+
+    def receive(self) -> list[str]:
+        """Return the whole lines that have come, and send what could not be sent before."""
+        self._flush()
+        while True:
+            try:
+                chunk = self._socket.recv(1 << 16)
+            except BlockingIOError:
+                break
+            if not chunk:
+                raise ConnectionError("the server has closed the connection")
+            self._in += chunk
+            if len(self._in) > LONGEST:
+                raise ConnectionError("a line without end")
+        *whole, self._in = self._in.split(b"\n")
+        return [line.decode("utf-8", "replace") for line in whole if line.strip()]
+
+    def send(self, lines: list[str]) -> None:
+        self._out += "".join(f"{line}\n" for line in lines).encode()
+        if len(self._out) > LONGEST:
+            raise ConnectionError("the server reads nothing")
+        self._flush()
+
+    def close(self) -> None:
+        with suppress(OSError):
+            self._socket.close()
+
+    def _flush(self) -> None:
+        with suppress(BlockingIOError):
+            while self._out:
+                self._out = self._out[self._socket.send(self._out) :]
+
+
+def _host_and_port(address: str) -> tuple[str, int]:
+    try:
+        parts = urlsplit(address)
+        host, port = parts.hostname, parts.port or PORT
+    except ValueError:
+        host = None
+    if host is None or parts.scheme != "secop":
+        raise ConfigError(f"{address!r} is no address of a SECoP server", where="address", hint="secop://cryo-pc:10767")
+    return host, port

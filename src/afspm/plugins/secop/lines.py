@@ -1,0 +1,64 @@
+"""The lines of SECoP: "action specifier data", with data in JSON."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+
+IDENTIFY, DESCRIBE, ACTIVATE = "*IDN?", "describe", "activate"
+LONGEST = 1 << 20
+"""Characters of a line; a longer one is no SECoP."""
+
+
+@dataclass(frozen=True)
+class SecopLine:
+    """One message of a server.
+
+    Attributes:
+        action: such as "update", "reply", "changed", "error_read".
+        specifier: "module:accessible", or the name of a module.
+        data: decoded JSON; None: there is none.
+    """
+
+    action: str
+    specifier: str = ""
+    data: object = None
+
+    @property
+    def value(self) -> object:
+        """The value of a data report, [value, qualifiers]."""
+        return self.data[0] if isinstance(self.data, list) and self.data else None
+
+    @property
+    def time(self) -> object:
+        """The server's own time of the value; None if it gives none."""
+        qualifiers = self.data[1] if isinstance(self.data, list) and len(self.data) > 1 else None
+        return qualifiers.get("t") if isinstance(qualifiers, dict) else None
+
+    @property
+    def error(self) -> str:
+        """The text of an error report, [class, text, details]."""
+        parts = self.data if isinstance(self.data, list) else [self.data]
+        return ": ".join(str(one) for one in parts[:2])[:200]
+
+
+def parse(line: str) -> SecopLine | None:
+    """Return a line of a server; None if it is no SECoP."""
+    action, _, rest = line.strip().partition(" ")
+    specifier, _, text = rest.partition(" ")
+    if not action:
+        return None
+    try:
+        data = json.loads(text) if text else None
+    except ValueError:
+        return None
+    return SecopLine(action, specifier, data)
+
+
+def change(specifier: str, value: float) -> str:
+    """Return the request to set a value."""
+    return f"change {specifier} {json.dumps(value)}"
+
+
+def read(specifier: str) -> str:
+    return f"read {specifier}"

@@ -1,0 +1,224 @@
+"""`Instruments`: all that the scheduler knows of other instruments, and the orders that are open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from afspm.basics.frozen import replace
+from afspm.model import InstrumentOrder, InstrumentReading, InstrumentReadings, OrderOutcome, instrument_of
+from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, InstrumentSettings
+from afspm.scheduler.requests.forwarder import ForwardedRequest
+
+PUBLISH_S = 10.0
+"""Unchanged readings are published at this interval, real."""
+PUBLISH_CHANGED_S = 1.0
+"""Changed numbers are published at this interval, real, at least."""
+_MOST_PARAMETERS = 100  # of one instrument: memory must stay bounded
+_NEVER_S = float("-inf")
+_JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age is still one
+
+
+@dataclass(frozen=True)
+class KnownReading:
+    """A reading, and when it was measured at the latest, real; -inf: unknown."""
+
+    reading: InstrumentReading
+    measured_s: float = _NEVER_S
+
+
+@dataclass(frozen=True)
+class OpenOrder:
+    """A set request for an instrument.
+
+    Attributes:
+        order: as it was handed out; None: it waits.
+    """
+
+    job: ForwardedRequest
+    order: InstrumentOrder | None = None
+
+
+@dataclass(frozen=True)
+class KnownInstrument:
+    """One instrument.
+
+    Attributes:
+        token: of the last answer; given_s: its time, real.
+        published: the readings published last; published_s: their time, real.
+    """
+
+    token: int = 0
+    given_s: float = _NEVER_S
+    readings: Mapping[str, KnownReading] = field(default_factory=dict)
+    open: tuple[OpenOrder, ...] = ()
+    published: tuple[InstrumentReading, ...] = ()
+    published_s: float = _NEVER_S
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """The instruments of an experiment.
+
+    Attributes:
+        units: the first unit of each parameter, kept over a restart: a reading in another unit is not believed.
+        number: of the newest order or token.
+        states: of the conditions, by name.
+    """
+
+    settings: InstrumentSettings = field(default_factory=InstrumentSettings)
+    known: Mapping[str, KnownInstrument] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    number: int = 0
+    states: Mapping[str, ConditionState] = field(default_factory=dict)
+
+    # --- readings ---
+
+    def owns(self, parameter: str) -> bool:
+        """Return whether a parameter belongs to an instrument of this experiment."""
+        return instrument_of(parameter) in self.settings.instruments
+
+    def reading(self, parameter: str, now_s: float) -> InstrumentReading:
+        """Return the reading of a parameter; without a value where none is recent."""
+        known = self._of(instrument_of(parameter)).readings.get(parameter)
+        if known is None:
+            return InstrumentReading(parameter, reason=f"{instrument_of(parameter)} has not reported it")
+        if now_s - known.measured_s <= OLDEST_S:
+            return known.reading
+        why = known.reading.reason or f"its last reading is older than {OLDEST_S:g} s"
+        return replace(known.reading, value=None, reason=why)
+
+    def reported(self, report: InstrumentReadings, now_s: float, now_ns: int) -> Instruments:
+        """Store a report; the outcomes in it are settled by the caller."""
+        before = self._of(report.instrument)
+        # a report waits in queues for an unknown time, and clocks of other computers may lie: it is certain only that
+        # it was made after the answer whose token it repeats
+        made_s = before.given_s if report.token and report.token == before.token else _NEVER_S
+        units, readings = dict(self.units), dict[str, KnownReading]()
+        for reading in report.readings[:_MOST_PARAMETERS]:
+            if reading.value is not None:
+                first = units.setdefault(reading.name, reading.unit)
+                if first != reading.unit:
+                    why = f"its unit changed from {first!r} to {reading.unit!r}"
+                    reading = replace(reading, value=None, target=None, reason=why)
+            age_s = reading.age_s if reading.age_s is not None and reading.age_s >= 0.0 else float("inf")
+            readings[reading.name] = KnownReading(reading, made_s - age_s)
+        changed = self._with(report.instrument, replace(before, readings=readings))
+        return replace(changed, units=units).evaluated(now_s, now_ns)
+
+    def to_publish(self, report: InstrumentReadings, now_s: float) -> Instruments | None:
+        """Return the instruments after a publication of this report; None: it is not due."""
+        known = self._of(report.instrument)
+        passed_s = now_s - known.published_s
+        new = tuple(self.reading(name, now_s) for name in known.readings)
+        if [_state(one) for one in new] == [_state(one) for one in known.published] and passed_s < PUBLISH_S:
+            values = [one.value for one in new], [one.value for one in known.published]
+            if values[0] == values[1] or passed_s < PUBLISH_CHANGED_S:
+                return None
+        return self._with(report.instrument, replace(known, published=new, published_s=now_s))
+
+    def published(self, instrument: str) -> tuple[InstrumentReading, ...]:
+        """Return the readings of an instrument that were published last."""
+        return self._of(instrument).published
+
+    # --- conditions ---
+
+    def evaluated(self, now_s: float, now_ns: int) -> Instruments:
+        """Return the instruments with the conditions decided for this moment."""
+        states = {}
+        for name, condition in self.settings.conditions.items():
+            readings = {parameter: self.reading(parameter, now_s) for parameter in condition.bands}
+            states[name] = self.states.get(name, ConditionState()).updated(condition, readings, now_ns)
+        return self if states == self.states else replace(self, states=states)
+
+    def refusal(self, action: str, now_s: float, now_ns: int) -> str:
+        """Return why an action may not start now; empty: it may."""
+        if not self.settings.conditions:
+            return ""
+        states = self.evaluated(now_s, now_ns).states
+        reasons = [
+            f"the condition {name} does not hold: {states[name].reason} ({condition.source})"
+            for name, condition in self.settings.conditions.items()
+            if action in condition.actions and states[name].reason
+        ]
+        return "; ".join(reasons)
+
+    def problems(self) -> dict[int, str]:
+        """Return the problems of the conditions that do not hold, with their reasons."""
+        wanted = dict[int, str]()
+        for name, condition in self.settings.conditions.items():
+            reason = self.states.get(name, ConditionState()).reason
+            if reason and condition.problem:
+                wanted.setdefault(self.settings.problems[condition.problem], f"{name}: {reason}")
+        return wanted
+
+    # --- orders ---
+
+    def asked(self, job: ForwardedRequest) -> Instruments:
+        """Queue a set request."""
+        owner = instrument_of(job.request.subject.name)
+        number = self.number + 1
+        known = self._of(owner)
+        waiting = replace(known, open=(*known.open, OpenOrder(job._replace(number=number))))
+        return replace(self._with(owner, waiting), number=number)
+
+    def first(self, instrument: str) -> OpenOrder | None:
+        """Return the order of an instrument that is served now: one at a time."""
+        return next(iter(self._of(instrument).open), None)
+
+    def handed_out(self, instrument: str, order: OpenOrder) -> Instruments:
+        """Store that the first order was handed out."""
+        known = self._of(instrument)
+        return self._with(instrument, replace(known, open=(order, *known.open[1:])))
+
+    def settled(self, instrument: str, number: int) -> Instruments:
+        """Remove an order."""
+        known = self._of(instrument)
+        rest = tuple(one for one in known.open if one.job.number != number)
+        return self._with(instrument, replace(known, open=rest))
+
+    def found(self, instrument: str, outcome: OrderOutcome) -> OpenOrder | None:
+        """Return the order of an outcome; None: it was settled before."""
+        for one in self._of(instrument).open:
+            if one.order is not None and one.order.number == outcome.number:
+                return one
+        return None
+
+    def overdue(self, now_s: float) -> list[tuple[str, OpenOrder]]:
+        """Return the orders whose clients have waited too long, each with its instrument."""
+        return [(name, one) for name, known in self.known.items() for one in known.open if now_s >= one.job.deadline_s]
+
+    def answered(self, instrument: str, now_s: float) -> Instruments:
+        """Store that a report is answered now, under a new token."""
+        token = self.number + 1
+        known = replace(self._of(instrument), token=token, given_s=now_s)
+        return replace(self._with(instrument, known), number=token)
+
+    def token(self, instrument: str) -> int:
+        """Return the token of the answer to an instrument's last report."""
+        return self._of(instrument).token
+
+    # --- time ---
+
+    def due_s(self) -> float | None:
+        """Return when the conditions or an order must be looked at again, real; None: no deadline."""
+        dues = [one.job.deadline_s for known in self.known.values() for one in known.open]
+        for name, condition in self.settings.conditions.items():
+            if self.states.get(name, ConditionState()).reason:
+                continue
+            for parameter in condition.bands:
+                known = self._of(instrument_of(parameter)).readings.get(parameter)
+                if known is not None:
+                    dues.append(known.measured_s + OLDEST_S + _JUST_AFTER_S)
+        return min(dues, default=None)
+
+    def _of(self, instrument: str) -> KnownInstrument:
+        return self.known.get(instrument, KnownInstrument())
+
+    def _with(self, instrument: str, known: KnownInstrument) -> Instruments:
+        return replace(self, known={**self.known, instrument: known})
+
+
+def _state(reading: InstrumentReading) -> tuple[object, ...]:
+    # all but the numbers that change all the time
+    return reading.name, reading.value is None, reading.unit, reading.target, reading.busy, reading.reason
