@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import ClassVar, Literal
 
 from afspm.basics.errors import AfspmError, ConfigError, ControlLost, FileError, NoResponse, Refused
@@ -13,15 +15,20 @@ from afspm.client.events import Events
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing
 from afspm.components.planned_scans import pair
-from afspm.components.tip_judge import Opinion, TipJudge
-from afspm.components.tip_treatments import treatments
+from afspm.components.tip_budget import RepairBudget, RepairCost, cost_of
+from afspm.components.tip_experience import CURED, UNCHANGED, UNKNOWN_FLAW, WORSENED, TipExperience
+from afspm.components.tip_experience_file import read_experience, write_experience
+from afspm.components.tip_judge import Opinion, TipJudge, Verdict
+from afspm.components.tip_treatments import Treatment, treatments
 from afspm.components.tip_verdict import read_verdict
 from afspm.components.tip_workshop import DONE_ACTION, TipWorkshop
 from afspm.model import Problem, Region, Scan, ScanSet, names
+from afspm.model.snapshot import from_plain, to_plain
 
 Frame = list[list[float]]
 """Region and pixels in JSON's types: centre, size and angle; rows and columns."""
 LAST_FRAMES = 16  # scans whose verdict may still arrive
+MOVES_SHARE = 1.2  # time of a treatment and its test scans, relative to the test scans alone
 VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected
 
 
@@ -42,6 +49,9 @@ class TipCorrector(Component):
     nor one that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as an
     `ActionMsg`.
 
+    With policy = "learn" it chooses each treatment by what it has learnt of the flaw that the scans show: blunt, double
+    or contaminated. It counts the outcomes, and keeps them in a file for the next nights.
+
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
         test_center: (x, y) of a first test scan, so that a worse tip stays off the experiment's region. The next test
@@ -58,6 +68,13 @@ class TipCorrector(Component):
         channel, retrace_channel: of the heights, for judge = "self".
         reference_scans: for judge = "self".
         problem: the problem to solve.
+        policy: "list" makes the treatments in the order of the lists; "learn" chooses among them, again and again.
+        most_treatments: of one repair, with policy = "learn".
+        experience: file of what was learnt, relative to the folder of the runs, with policy = "learn".
+        night_pulses: most pulses of all repairs of a run, also over restarts; by default no bound.
+        night_depth: largest sum of the depths of its crashes.
+        night_places: most places of treatments, each with an area of `place_spacing` squared.
+        night_time: longest time of its repairs together. No treatment begins whose test scan would end later.
     """
 
     solves: ClassVar = ("tip-shape-changed",)
@@ -81,6 +98,13 @@ class TipCorrector(Component):
         retrace_channel: str = "Height Retrace",
         reference_scans: int = 4,
         problem: str = "tip-shape-changed",
+        policy: Literal["list", "learn"] = "list",
+        most_treatments: int = 12,
+        experience: str = "tip_experience.toml",
+        night_pulses: int | None = None,
+        night_depth: Length | None = None,
+        night_places: int | None = None,
+        night_time: Duration | None = None,
     ) -> None:
         self.workshop_center = pair(workshop_center)
         self.test_center = None if test_center is None else pair(test_center)
@@ -95,10 +119,23 @@ class TipCorrector(Component):
         if place_spacing <= 0.0 or keep_away < 0.0:
             raise ConfigError("`place_spacing` must be above zero, `keep_away` not below")
         self.pairing = ChannelPairing(channel, retrace_channel)
-        self.judge = TipJudge(reference_scans) if judge == "self" else None
+        self.judge = TipJudge(reference_scans) if judge == "self" or policy == "learn" else None
+        self.clears = judge == "self"
+        self.learns = policy == "learn"
+        if most_treatments < 1:
+            raise ConfigError("must be at least 1", where="most_treatments")
+        self.most_treatments = most_treatments if self.learns else len(self.allowed)
+        self.experience_file = experience
+        area_m2 = None if night_places is None else night_places * place_spacing**2
+        self.budget = RepairBudget(night_pulses, night_depth, area_m2, night_time)
 
     def run(self) -> None:
-        self._workshop = TipWorkshop(self, self.problem, self.workshop_center, self.place_spacing, self.keep_away)
+        self._workshop = TipWorkshop(
+            self, self.problem, self.workshop_center, self.place_spacing, self.keep_away, self._charge
+        )
+        self._refused: set[Treatment] = set()
+        self._step_tenure = -1
+        self._restore_experience()
         if self.judge is not None and "judge" in self.memory:
             self.judge.restore(self.memory["judge"])
         frames: dict[int | None, Frame] = {}
@@ -132,12 +169,17 @@ class TipCorrector(Component):
         if not self.scope.is_flagged(self.problem):
             if "region" in self.memory:
                 self._begin_anew()
+            if self.judge is not None:
+                self.judge.trust()
             return
         try:
             with self.scope.control(solving=self.problem):
+                self._spend_time()
                 self._repair()
         except ControlLost as lost:
             self.log.info("the repair is over: %s", lost.what)
+        finally:
+            self._spend_time(ends=True)
 
     def _repair(self) -> None:
         region, shape = self._of_experiment()
@@ -150,21 +192,142 @@ class TipCorrector(Component):
         looks = (test, seen, seen) if self.test_center else (seen,) * 3
         tried = int(self.memory.get("tried", 0))
         self.log.info("repairing the tip%s", f" ({tried} treatments were tried already)" if tried else "")
+        self._refused.clear()
+        self._expect_step(looks, shape)
         with self.scope.events("ControlState", tip_verdict.MESSAGE, timeout_s=VERDICT_WITHIN_S) as answers:
             try:
                 if tried and self._is_cured(looks, shape, answers):  # a kill may have come between treatment and test
                     return
-                for number, treatment in enumerate(self.allowed[tried:], tried + 1):
-                    if self._workshop.treat(number, treatment, (region, seen, test)) and self._is_cured(
-                        looks, shape, answers
-                    ):
+                for number in range(tried + 1, self.most_treatments + 1):
+                    if self._is_treated(number, (region, seen, test)) and self._is_cured(looks, shape, answers):
                         self.log.info("the tip is repaired")
                         return
-                why = f"all {len(self.allowed)} treatments that are allowed were tried"
-            except (FileError, _Blind) as error:
+                why = f"all {self.most_treatments} treatments that are allowed were tried"
+            except (FileError, _Blind, _OverBudget) as error:
                 why = error.what
         self._restore(region)
         self._give_up(why)
+
+    # --- the choice of treatments, and their budget
+
+    def _is_treated(self, number: int, safe: tuple[Region, ...]) -> bool:
+        # False: the treatment could not be done
+        treatment = self._next(number)
+        before = self._spent
+        if self._workshop.treat(number, treatment, safe):
+            return True
+        self._refused.add(treatment)
+        self.memory.pop("pending", None)
+        self._keep_spent(replace(before, time_s=self._spent.time_s))  # it cost time only
+        self.memory.save()
+        return False
+
+    def _next(self, number: int) -> Treatment:
+        choice = self.allowed if self.learns else self.allowed[number - 1 : number]
+        possible = tuple(one for one in choice if one not in self._refused)
+        if not possible:
+            raise _Blind("no treatment of the list can be done")
+        affordable = self.budget.affordable(possible, self._spent, self.place_spacing, self._step_s)
+        if not affordable:
+            raise _OverBudget(self._why_over(possible[0]))
+        return self.experience.choose(self._flaw, affordable) if self.learns else affordable[0]
+
+    def _charge(self, treatment: Treatment) -> None:
+        # before each attempt: after a kill it counts as done, so that the budget holds
+        self._spend_time(saves=False)
+        if not self.budget.affordable((treatment,), self._spent, self.place_spacing, self._step_s):
+            raise _OverBudget(self._why_over(treatment))
+        self._keep_spent(self._spent.plus(cost_of(treatment, self.place_spacing)))
+        self._step_tenure = self.scope.tenures
+        if self.learns:
+            self.memory["pending"] = [self._flaw, self.allowed.index(treatment)]
+
+    def _why_over(self, treatment: Treatment) -> str:
+        over = self.budget.exceeded_by(self._spent.plus(cost_of(treatment, self.place_spacing)).after(self._step_s))
+        return f"the budget of the night is spent: no {treatment} is left in {', '.join(over)}"
+
+    @property
+    def _spent(self) -> RepairCost:
+        return from_plain(RepairCost, self.memory["spent"]) if "spent" in self.memory else RepairCost()
+
+    def _keep_spent(self, cost: RepairCost) -> None:
+        self.memory["spent"] = to_plain(cost)
+
+    @property
+    def _step_s(self) -> float:
+        return float(self.memory.get("longest_step_s", 0.0))
+
+    def _expect_step(self, looks: tuple[Region, ...], shape: tuple[int, int] | None) -> None:
+        # the longest that a treatment and its test scans may take, for the budget of time
+        if self.budget.time_s is None or shape is None:
+            return
+        try:
+            speed_m_s = float(self.scope.get(names.SCAN_SPEED))
+        except (Refused, NoResponse) as error:
+            self.log.warning("the first repair may exceed night_time by a test scan: %s", error.what)
+            return
+        scans_s = sum(2.0 * look.size_m[0] * shape[0] / speed_m_s for look in looks)
+        self.memory["longest_step_s"] = max(self._step_s, MOVES_SHARE * scans_s)
+
+    def _spend_time(self, *, saves: bool = True, ends: bool = False) -> None:
+        # a repair that a kill interrupts goes on in the memory, so the time until the restart counts, too
+        now_s, since_s = self.clock.now_s(), self.memory.get("repairing_since_s")
+        if since_s is not None:
+            self._keep_spent(self._spent.after(now_s - since_s))
+        if ends:
+            self.memory.pop("repairing_since_s", None)
+        else:
+            self.memory["repairing_since_s"] = now_s
+        if saves:
+            self.memory.save()
+
+    # --- what it learns
+
+    @property
+    def _flaw(self) -> str:
+        return str(self.memory.get("flaw", UNKNOWN_FLAW))
+
+    def _restore_experience(self) -> None:
+        self.experience = TipExperience()
+        if not self.learns:
+            return
+        self._path: Path | None = Path(self.run_dir).parent / self.experience_file
+        try:
+            before = read_experience(self._path)
+        except FileError as error:  # a night without experience is better than none
+            self.log.error("%s; this night begins without experience, and leaves the file as it is", error)
+            self._path, before = None, TipExperience()
+        if "experience" in self.memory:
+            self.experience = from_plain(TipExperience, self.memory["experience"])
+            return
+        self.experience = before.for_next_night()
+        self.memory["experience"] = to_plain(self.experience)
+        self.memory.save()
+
+    def _see(self, verdict: Verdict) -> None:
+        if verdict.opinion is Opinion.GOOD:
+            self.memory.pop("flaw", None)
+        elif verdict.opinion is Opinion.BAD and verdict.flaws:
+            self.memory["flaw"] = verdict.flaws[0]
+            self.memory.save()
+
+    def _count_outcome(self, *, cured: bool) -> None:
+        if not self.learns or "pending" not in self.memory:
+            return
+        flaw, number = self.memory.pop("pending")
+        outcome = CURED if cured else UNCHANGED if self._flaw in (flaw, UNKNOWN_FLAW) else WORSENED
+        if self.experience.learn(flaw, self.allowed[number], outcome):
+            self.log.info("the %s tip answers otherwise than before: its experience counts less from now on", flaw)
+        self.memory["experience"] = to_plain(self.experience)
+        self.memory.save()
+        if self._path is None:
+            return
+        try:
+            write_experience(self._path, self.experience)
+        except FileError as error:  # the memory has it, and the next outcome writes it again
+            self.log.warning("what was learnt is not in its file: %s", error)
+
+    # --- test scans
 
     def _of_experiment(self) -> tuple[Region | None, tuple[int, int] | None]:
         if "region" not in self.memory:
@@ -177,6 +340,16 @@ class TipCorrector(Component):
         return _unpacked(self.memory["region"])
 
     def _is_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
+        cured = self._looks_cured(looks, shape, answers)
+        if self._step_tenure == self.scope.tenures:  # otherwise a person had control meanwhile
+            lasted_s = self.clock.now_s() - float(self.memory["repairing_since_s"])
+            self.memory["longest_step_s"] = max(self._step_s, lasted_s)
+        self._spend_time(saves=False)
+        self._count_outcome(cured=cured)
+        self.memory.save()
+        return cured
+
+    def _looks_cured(self, looks: tuple[Region, ...], shape: tuple[int, int] | None, answers: Events) -> bool:
         refused: list[str] = []
         for place in looks:
             try:
@@ -187,26 +360,33 @@ class TipCorrector(Component):
                 if len(refused) == len(looks):
                     raise _Blind(f"no test scan can be taken: {error.what}") from error
                 continue
-            score = self._own_score(scans) if self.judge is not None else self._score_of_others(scans, answers)
+            verdict = self._own_verdict(scans)
+            score = self._own_score(verdict) if self.clears else self._score_of_others(scans, answers)
             if not self.scope.is_flagged(self.problem):
                 return True
             if score == tip_verdict.BAD:
                 return False
         return False
 
-    def _own_score(self, scans: ScanSet) -> float:
+    def _own_verdict(self, scans: ScanSet) -> Verdict | None:
         for scan in scans.values():
             pair = self.pairing.add(scan)
             if pair is not None and self.judge is not None:
                 verdict = pair.judged_by(self.judge, learns=False)
-                self.log.info("test scan: %s (%s)", verdict.opinion.value, verdict.why)
-                if verdict.opinion is Opinion.GOOD:
-                    self._restore(self._of_experiment()[0])
-                    self.scope.clear(self.problem)
-                    self._wait_flag(self.problem, flagged=False)
-                return tip_verdict.BAD if verdict.opinion is Opinion.BAD else tip_verdict.UNCLEAR
-        self.log.warning("the test scan can't be judged: it lacks the channels")
-        return tip_verdict.UNCLEAR
+                self._see(verdict)
+                return verdict
+        return None
+
+    def _own_score(self, verdict: Verdict | None) -> float:
+        if verdict is None:
+            self.log.warning("the test scan can't be judged: it lacks the channels")
+            return tip_verdict.UNCLEAR
+        self.log.info("test scan: %s (%s)", verdict.opinion.value, verdict.why)
+        if verdict.opinion is Opinion.GOOD:
+            self._restore(self._of_experiment()[0])
+            self.scope.clear(self.problem)
+            self._wait_flag(self.problem, flagged=False)
+        return tip_verdict.BAD if verdict.opinion is Opinion.BAD else tip_verdict.UNCLEAR
 
     def _score_of_others(self, scans: ScanSet, answers: Events) -> float:
         times = {scan.time_ns for scan in scans.values()}
@@ -220,10 +400,14 @@ class TipCorrector(Component):
         return tip_verdict.BAD
 
     def _learn(self, scan: Scan, problems: tuple[int, ...]) -> None:
-        if self.judge is None or self.judge.knows(scan.region, scan.shape) or problems:
+        if self.judge is None or problems or (self.judge.knows(scan.region, scan.shape) and not self.learns):
             return
         pair = self.pairing.add(scan)
-        if pair is not None and pair.judged_by(self.judge, learns=True).opinion is Opinion.LEARNING:
+        if pair is None:
+            return
+        verdict = pair.judged_by(self.judge, learns=True)
+        self._see(verdict)
+        if verdict.opinion is Opinion.LEARNING:
             self.memory["judge"] = self.judge.state()
             self.memory.save()
 
@@ -247,7 +431,7 @@ class TipCorrector(Component):
         self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
     def _begin_anew(self) -> None:
-        for key in ("tried", "region", "judged_bad", "given_up"):
+        for key in ("tried", "region", "judged_bad", "given_up", "flaw", "pending"):
             self.memory.pop(key, None)
         self.memory.save()
 
@@ -262,4 +446,8 @@ def _unpacked(frame: Frame) -> tuple[Region, tuple[int, int] | None]:
 
 
 class _Blind(AfspmError):
-    """The state of the tip can't be determined."""
+    """The state of the tip can't be determined, or not changed."""
+
+
+class _OverBudget(AfspmError):
+    """No treatment fits into the rest of the night's budget."""

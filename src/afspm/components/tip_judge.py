@@ -46,6 +46,9 @@ DECIMALS = 4  # of an autocorrelation, to limit the saved state
 MOST_KINDS = 4  # of scans with a reference at the same time
 FOLLOW = 0.25  # least weight of a new good scan in the means of its place
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
+Fault = tuple[float, str, str]
+"""How far on the way to a bad scan (1), the flaw, and the reason."""
+BLUNT, DOUBLE, CONTAMINATED = FLAWS = ("blunt", "double", "contaminated")
 
 
 class Opinion(Enum):
@@ -59,11 +62,16 @@ class Opinion(Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """Opinion on one scan, with a reason for people."""
+    """Opinion on one scan, with a reason for people.
+
+    Attributes:
+        flaws: of a bad tip, as far as the scan shows them, those that hide others first; a subset of `FLAWS`.
+    """
 
     opinion: Opinion
     why: str
     metrics: TipMetrics | None = None
+    flaws: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -302,13 +310,17 @@ class TipJudge:
         faults = self._faults_anywhere(reference, seen)
         if place is not None:
             faults += self._faults_here(reference, place, seen)
-        worst = max(way for way, _ in faults)
+        worst = max(way for way, _, _ in faults)
         if worst >= 1.0:
             reference.suspect = reference.suspect or place is not None
-            return Verdict(Opinion.BAD, "; ".join(why for way, why in faults if way >= 1.0), seen)
+            found = [(flaw, why) for way, flaw, why in faults if way >= 1.0]
+            flaws = tuple(flaw for flaw in FLAWS if flaw in dict(found))
+            return Verdict(Opinion.BAD, "; ".join(why for _, why in found), seen, flaws)
         if worst > self.tolerance.margin:
             return Verdict(
-                Opinion.UNCLEAR, "nearly " + "; ".join(why for way, why in faults if way > self.tolerance.margin), seen
+                Opinion.UNCLEAR,
+                "nearly " + "; ".join(why for way, _, why in faults if way > self.tolerance.margin),
+                seen,
             )
         if place is not None:
             self._clear_suspicion(reference)
@@ -322,27 +334,30 @@ class TipJudge:
         for kind in self._state.kinds:
             kind.suspect = kind.suspect and by.pixel_m > (1.0 + SAME_SIZE) * kind.pixel_m
 
-    def _faults_anywhere(self, reference: TipReference, seen: TipMetrics) -> list[tuple[float, str]]:
+    def _faults_anywhere(self, reference: TipReference, seen: TipMetrics) -> list[Fault]:
         usual, tolerance = reference.usual_anywhere(), self.tolerance
         now = _relative(seen, usual)
         worn = f"worn: {now.detail:.0%} of the first scans' fine detail is left"
-        faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), worn)]
+        faults = [((1.0 - now.detail) / (1.0 - tolerance.worn), BLUNT, worn)]
         if usual.unrest_m > 0.0:  # zero without retrace
             limit = 1.0 + max(tolerance.unrest - 1.0, tolerance.sigmas * reference.spread("unrest_m"))
             what = f"{seen.unrest_m * 1e9:.2f} nm instead of {usual.unrest_m * 1e9:.2f} nm"
-            faults.append(((now.unrest_m - 1.0) / (limit - 1.0), f"unsteady: trace and retrace disagree by {what}"))
+            faults.append(
+                ((now.unrest_m - 1.0) / (limit - 1.0), CONTAMINATED, f"unsteady: trace and retrace disagree by {what}")
+            )
         return faults
 
-    def _faults_here(self, reference: TipReference, place: KnownPlace, seen: TipMetrics) -> list[tuple[float, str]]:
+    def _faults_here(self, reference: TipReference, place: KnownPlace, seen: TipMetrics) -> list[Fault]:
         tolerance, now = self.tolerance, _relative(seen, place.usual)
         loss = max(1.0 - tolerance.detail, tolerance.sigmas * reference.spread("detail"))
         ghost = max(tolerance.ghost, tolerance.sigmas * reference.spread("ghost"))
         blunt = (1.0 - now.detail) / loss
         # a blunt tip widens every feature, which the autocorrelation shows as well: then it is no ghost
         what = "broad features" if blunt >= 1.0 else "double: a ghost image"
+        shadow = max(0.0, now.ghost - place.usual.ghost) / ghost
         return [
-            (blunt, f"blunt: {now.detail:.0%} of the fine detail here is left"),
-            (max(0.0, now.ghost - place.usual.ghost) / ghost, f"{what} with correlation {now.ghost:.2f}"),
+            (blunt, BLUNT, f"blunt: {now.detail:.0%} of the fine detail here is left"),
+            (shadow, BLUNT if blunt >= 1.0 else DOUBLE, f"{what} with correlation {now.ghost:.2f}"),
         ]
 
 

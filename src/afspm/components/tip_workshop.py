@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 from afspm import wire
@@ -23,14 +24,24 @@ class TipWorkshop:
         center: about which the places lie.
         spacing: between the places of two treatments, in m.
         keep_away: least distance of a treatment from scanned regions, in m.
+        charge: called before each attempt, whose save keeps its changes of the memory; it may raise.
     """
 
-    def __init__(self, component: Component, problem: str, center: XY, spacing: float, keep_away: float) -> None:
+    def __init__(
+        self,
+        component: Component,
+        problem: str,
+        center: XY,
+        spacing: float,
+        keep_away: float,
+        charge: Callable[[Treatment], None],
+    ) -> None:
         self._component = component
         self._scope, self._log, self._memory = component.scope, component.log, component.memory
         self._problem = problem
         self._center = center
         self._spacing, self._keep_away = spacing, keep_away
+        self._charge = charge
         self._frame: Region | None = None  # the frame set about a place
 
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
@@ -39,6 +50,7 @@ class TipWorkshop:
         Return whether it was done. Raises FileError if the state can't be saved.
         """
         while True:
+            self._charge(treatment)
             place = self._fresh_place(number)
             try:
                 with self._scope.control(unbroken=True):

@@ -95,6 +95,8 @@ class JournalEntry:
         late: the answer came after the client had received a NO_RESPONSE.
         sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
         key: key of a measurement that is taken exactly once.
+        subject: the action, or the parameter that was to be set; empty for other requests.
+        value, unit: of that parameter, as requested.
     """
 
     time_ns: int
@@ -111,6 +113,9 @@ class JournalEntry:
     late: bool = False
     sent_ns: int | None = None
     key: str = ""
+    subject: str = ""
+    value: str = ""
+    unit: str = ""
 
     @property
     def refused(self) -> bool:

@@ -16,12 +16,14 @@ from afspm.basics.errors import FileError, InvalidValue, NoSuchItem, WireError
 from afspm.basics.formatting import counted
 from afspm.model import (
     ControlState,
+    Feedback,
     Frame,
     JournalEntries,
     JournalEntry,
     LogLine,
     Note,
     Packet,
+    ProbePosition,
     ProblemNames,
     ProcessCondition,
     ScanSet,
@@ -43,6 +45,7 @@ from afspm.record.measured_tables import (
 from afspm.record.packets import packets, without_reading_files
 from afspm.record.run_json import EXPERIMENT_FILE, METADATA, REPLAY_OF, latest_run, run_json_or_empty
 from afspm.record.tables import ControlRow, NoteRow, ProblemRow, ProcessRow, ScanRow, SpectrumRow, Table
+from afspm.record.treatment_ledger import KEEP_AWAY_M, TreatmentLedger, treatment_ledger
 
 if TYPE_CHECKING:
     from afspm.record.film import Film
@@ -250,6 +253,21 @@ class Run:
         from afspm.record.overview import DriftPoint
 
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
+
+    def ledger(self, keep_away_m: float = KEEP_AWAY_M) -> TreatmentLedger:
+        """Return what was done to tip and sample, as far as the record shows it.
+
+        Args:
+            keep_away_m: distance from scanned regions within which a treatment counts as near.
+        """
+        positions, feedback = list[tuple[int, tuple[float, float]]](), list[tuple[int, bool]]()
+        for packet, _, thing in self.messages(("ProbePosition", "ZCtrlParameters")):
+            if isinstance(thing, ProbePosition):
+                positions.append((packet.time_ns or 0, thing.xy_m))
+            elif isinstance(thing, Feedback) and thing.on is not None:
+                feedback.append((packet.time_ns or 0, thing.on))
+        scanned = [(row.began_ns or row.time_ns, row.region) for row in self.scans if row.region is not None]
+        return treatment_ledger(self.journal, positions, scanned, feedback, self.newest_ns, keep_away_m)
 
     def verdicts(self) -> list[tuple[int, float]]:
         """Return (time of the scan, score) of each verdict on a scan, in the order of arrival."""

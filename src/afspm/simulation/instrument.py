@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,6 +32,7 @@ from afspm.model import Feedback, Region
 from afspm.model.snapshot import restored, snapshot
 from afspm.simulation.activities import RETRACE, Move, Occupied, ScanActivity, SpectrumActivity, noise_in_air
 from afspm.simulation.feedback import FeedbackSettings
+from afspm.simulation.ledger import LEDGER_EVENT, DamageLedger, ScannedPlace, distance_m, with_place
 from afspm.simulation.measuring import Adjustment
 from afspm.simulation.scan_drawing import RunWork, ScanDrawing, run_at_once
 from afspm.simulation.world import World
@@ -42,7 +43,7 @@ Note = Callable[[float, str, Mapping[str, object]], None]
 _MOST_AVERAGED = 32  # more sweeps reduce the noise no further
 _FASTEST_DRIFT_M_S = 1e-6
 _FEW = (2, 2)  # pixels: enough to find the channels
-_STATE_VERSION = 1
+_STATE_VERSION = 2
 
 
 class InstrumentBusy(AfspmError):
@@ -86,6 +87,8 @@ class InstrumentState:
     spectrum: SpectrumActivity | None
     move: Move | None
     occupied: Occupied | None
+    ledger: DamageLedger
+    scanned: list[ScannedPlace]
 
 
 class Instrument:
@@ -104,6 +107,7 @@ class Instrument:
         engaged: the tip is at the sample; otherwise all channels show noise.
         scan, spectrum: the last started one, also after its end; None before the first.
         world: the physics, with its ground truth (`world.truth`).
+        ledger: the damage so far, counted up to the last call.
     """
 
     def __init__(
@@ -130,6 +134,9 @@ class Instrument:
         self._noise = np.random.default_rng((seed, 3))
         self._signals: Mapping[str, float] = {}
         self._note = note
+        self.ledger = DamageLedger(start_s)
+        self._uncounted: ScanActivity | SpectrumActivity | None = None
+        self._scanned: list[ScannedPlace] = []
 
     # -- what goes on
 
@@ -165,6 +172,7 @@ class Instrument:
         doing = self._doing
         if doing is None or doing.running(now_s):
             return None
+        self.account(now_s)
         self._doing = None
         return doing
 
@@ -231,6 +239,10 @@ class Instrument:
         self._before, self._counts["scan"] = self.world.state(), number
         self.note(now_s, "scan starts", {"number": number})
         self.scan = self._doing = scan
+        if self.engaged:
+            self._uncounted = scan
+            place = ScannedPlace(scan.region, self.world.sample.under(scan.region.center_m, now_s))
+            self._scanned = with_place(self._scanned, place)
         self.drawing.start(scan, draw)
         return scan
 
@@ -239,6 +251,7 @@ class Instrument:
         if self.scan is not None and self.scan is self._doing and self.scan.running(now_s):
             self.scan.stop(now_s)
             self.note(now_s, "scan stopped", {})
+            self.account(now_s)
 
     def adjust(self, now_s: float) -> None:
         """Continue a running scan with the present feedback and bias."""
@@ -289,6 +302,7 @@ class Instrument:
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
+        self._uncounted = self.spectrum if self.engaged else None
         truth = self.world.property_truth(self._probe_m, now_s)
         self.note(now_s, "spectrum starts", {"number": number, "kind": kind, **truth})
         return self.spectrum
@@ -296,7 +310,7 @@ class Instrument:
     def stop_spectrum(self, now_s: float) -> None:
         """Interrupt and discard a running spectrum."""
         if isinstance(self._doing, SpectrumActivity) and self._doing.running(now_s):
-            self._doing = self.spectrum = None
+            self._doing = self.spectrum = self._uncounted = None
             self.note(now_s, "spectrum stopped", {})
 
     # -- moves
@@ -330,6 +344,8 @@ class Instrument:
         """
         _finite("the way of the stage", *by_m)
         self.occupy("stage", lasts_s, now_s)
+        if self.engaged:
+            self._count(now_s, "stage", replace(self.ledger, stage_moves=self.ledger.stage_moves + 1))
         if lasts_s > 0.0:
             self.world.compensate((by_m[0] / lasts_s, by_m[1] / lasts_s), now_s)
             self.world.compensate((0.0, 0.0), now_s + lasts_s)
@@ -355,6 +371,11 @@ class Instrument:
         self.drawing.wait()
         self.world.hold(z_m)
 
+    def switch_feedback(self, now_s: float, *, on: bool) -> None:
+        """Switch the feedback, and count the time that it was off."""
+        self.account(now_s)
+        self.setup.feedback = replace(self.setup.feedback, on=on)
+
     # -- the tip
 
     def pulse(self, voltage_v: float, duration_s: float, now_s: float) -> str:
@@ -369,10 +390,13 @@ class Instrument:
         self.drawing.wait()
         if not self.engaged or duration_s <= 0.0:
             return "unchanged"
-        position_m = self._probe_m
+        position_m, marks = self._probe_m, len(self.world.sample.marks)
         outcome = self.world.pulse(voltage_v, duration_s, now_s, position_m)
         facts = {"voltage_v": voltage_v, "duration_s": duration_s, "position_m": position_m, "outcome": outcome}
-        self.note(now_s, "pulse", facts)
+        near, clearance_m = self._clearance(position_m, now_s)
+        self.note(now_s, "pulse", {**facts, "clearance_m": clearance_m})
+        ledger = self.ledger.pulsed(voltage_v, duration_s, outcome, self._mark_radius_m(marks), near=near)
+        self._count(now_s, "pulse", ledger)
         return outcome
 
     def crash(self, depth_m: float, speed_m_s: float, now_s: float) -> str:
@@ -382,9 +406,13 @@ class Instrument:
         self._check_free(now_s)
         outcome, position_m = "unchanged", self._probe_m
         if self.engaged:
+            marks = len(self.world.sample.marks)
             outcome = self.world.crash(position_m, depth_m, speed_m_s, now_s)
             facts = {"position_m": position_m, "speed_m_per_s": speed_m_s, "depth_m": depth_m, "outcome": outcome}
-            self.note(now_s, "crash", facts)
+            near, clearance_m = self._clearance(position_m, now_s)
+            self.note(now_s, "crash", {**facts, "clearance_m": clearance_m})
+            ledger = self.ledger.crashed(depth_m, outcome, self._mark_radius_m(marks), near=near)
+            self._count(now_s, "crash", ledger)
         self.occupy("crash", 2.0 * depth_m / speed_m_s, now_s)
         return outcome
 
@@ -398,6 +426,7 @@ class Instrument:
         """End the activity, and withdraw the tip."""
         self.stop_scan(now_s)
         self.stop_spectrum(now_s)
+        self.account(now_s)
         self._doing, self.engaged = None, False
         self.occupy("approach", self.setup.approach_s, now_s)
 
@@ -419,6 +448,52 @@ class Instrument:
         self.stop_scan(now_s)
         self._doing = None
 
+    # -- the damage ledger
+
+    def account(self, now_s: float) -> None:
+        """Count an ended measurement, and the time since the last call, with the feedback as it was.
+
+        Call it before `setup.feedback` or `engaged` is changed, and at any time.
+        """
+        self._count(now_s, "feedback", self.ledger)
+        measured = self._uncounted
+        if measured is None or measured.running(now_s):
+            return
+        if isinstance(measured, ScanActivity):
+            if measured.drawing:  # a stopped one
+                return
+            self._uncounted = None
+            share = min(1.0, measured.lines_done(now_s) / measured.shape[0])
+            truth: Mapping[str, float] = {k: v for k, v in measured.truth.items() if isinstance(v, float)}
+            saturated_s = truth.get("saturated", 0.0) * share * measured.shape[0] * measured.line_s
+            pressed_m = truth.get("pressed_m", 0.0) if share else 0.0
+            self._count(measured.end_s, "scan", self.ledger.scanned(pressed_m, saturated_s))
+            return
+        self._uncounted = None
+        currents = [i for i, unit in enumerate(measured.units) if unit == "A"]
+        if currents:
+            share = self.world.saturated(measured.values[:, currents], measured.kind)
+            self._count(now_s, "spectrum", self.ledger.scanned(0.0, share * (measured.end_s - measured.start_s)))
+
+    def _count(self, now_s: float, cause: str, ledger: DamageLedger) -> None:
+        feedback_off = self.engaged and self.setup.feedback.on is False
+        before, self.ledger = self.ledger, ledger.at(now_s, feedback_off=feedback_off)
+        if self._note is not None and not self.ledger.same_totals(before):
+            self._note(now_s, LEDGER_EVENT, {"cause": cause, **self.ledger.line()})
+
+    def _clearance(self, position_m: tuple[float, float], now_s: float) -> tuple[bool, float | None]:
+        # whether it is too near to a scanned place, and the distance of the nearest one
+        sample, distances = self.world.sample, list[float]()
+        for place in self._scanned:
+            x, y = sample.to_tip(place.sample_xy_m, now_s) - sample.compensation.at(now_s)[:2]
+            distances.append(distance_m(position_m, place.region.moved_to((float(x), float(y)))))
+        clearance_m = min(distances, default=None)
+        return clearance_m is not None and clearance_m < self.world.settings.tip_changes.keep_away_m, clearance_m
+
+    def _mark_radius_m(self, marks_before: int) -> float:
+        marks = self.world.sample.marks
+        return marks[-1].radius_m if len(marks) > marks_before else 0.0
+
     # -- after a kill
 
     def state(self) -> Plain:
@@ -434,6 +509,8 @@ class Instrument:
             spectrum=doing if isinstance(doing, SpectrumActivity) else None,
             move=doing if isinstance(doing, Move) else None,
             occupied=doing if isinstance(doing, Occupied) and not isinstance(doing, Move) else None,
+            ledger=self.ledger,
+            scanned=self._scanned,
         )
         return {"world": world, "instrument": snapshot(state, "instrument", _STATE_VERSION, lists=True)}
 
@@ -449,6 +526,8 @@ class Instrument:
         self._counts = {"scan": found.last_scan, "spectrum": found.spectra}
         self.scan, self.spectrum = found.scan, found.spectrum
         self._doing = found.scan or found.spectrum or found.move or found.occupied
+        self.ledger, self._scanned = found.ledger, found.scanned
+        self._uncounted = (found.scan or found.spectrum) if found.engaged else None
         if self.scan is not None:
             self._redraw(self.scan.adjusted)
 
@@ -465,6 +544,7 @@ class Instrument:
         if doing:
             raise InstrumentBusy(f"the instrument is busy with a {doing}")
         self.drawing.wait()
+        self.account(now_s)
 
 
 def _finite(what: str, *values: float) -> None:

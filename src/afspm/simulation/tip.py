@@ -10,6 +10,7 @@ import numpy as np
 
 from afspm.simulation import chance
 from afspm.simulation.settings import check, one_of
+from afspm.simulation.tip_answers import ANSWER_KINDS, TipAnswers, answers_of
 
 if TYPE_CHECKING:
     from afspm.simulation.feedback import Loop
@@ -85,6 +86,11 @@ class TipRepairSettings:
         crash_cures, crash_worsens: probability for a crash `crash_depth_m` deep.
         crash_depth_m: an n times deeper crash has n chances of an effect.
         crash_speed_m_per_s: slower crashes are less likely to have an effect, in proportion.
+        answers: "even": every flaw answers alike, by the probabilities above; "public", "sealed": it answers by flaw,
+            polarity, voltage and depth, drawn for each seed from the prior of that name (`tip_answers`).
+        answers_seed: of that draw, for several nights with the same answers; by default the seed of the world.
+        answers_turn_s: the time after the start at which the answers turn round; 0: never.
+        keep_away_m: a treatment nearer to a place scanned before counts in the damage ledger.
     """
 
     pulse_threshold_v: float = 2.0
@@ -95,8 +101,14 @@ class TipRepairSettings:
     crash_worsens: float = 0.1
     crash_depth_m: float = 5e-9
     crash_speed_m_per_s: float = 50e-9
+    answers: str = "even"
+    answers_seed: int | None = None
+    answers_turn_s: float = 0.0
+    keep_away_m: float = 500e-9
 
     def __post_init__(self) -> None:
+        one_of(self.answers, ANSWER_KINDS, "answers")
+        check(self, from_zero="answers_turn_s keep_away_m")
         check(self, from_zero="pulse_threshold_v", above_zero="pulse_duration_s crash_depth_m crash_speed_m_per_s")
         check(self, fraction="pulse_cures pulse_worsens crash_cures crash_worsens")
 
@@ -264,6 +276,8 @@ class SimulatedTip:
     def __init__(self, settings: TipSettings, changes: TipChangeSettings, seed: int, start_s: float) -> None:
         self._settings, self._seed, self._start_s = changes, seed, start_s
         self._maker = TipMaker(settings)
+        own_seed = changes.answers_seed
+        self._answers = answers_of(changes.answers, seed if own_seed is None else own_seed)
         self.history = [TipChange(start_s, "start", self._maker.first(chance.generator(seed, 0)))]
         self.scheduled_until_s = start_s
         self.advance(start_s)
@@ -313,9 +327,18 @@ class SimulatedTip:
             worn_m = s.wear_m_per_m * course.length_m * loop.force**s.hardness_exponent
             self._add(TipChange(course.end_s, "wear", replace(tip, radius_m=tip.radius_m + worn_m)))
 
+    def answers(self, t_s: float) -> TipAnswers | None:
+        """Return the hidden answers in force at a time; None if every flaw answers alike."""
+        turn_s = self._settings.answers_turn_s
+        turned = self._answers is not None and 0.0 < turn_s <= t_s - self._start_s
+        return self._answers.turned() if self._answers is not None and turned else self._answers
+
     def pulse(self, voltage_v: float, duration_s: float, t_s: float, random: np.random.Generator) -> str:
         """Return the effect of a bias pulse, which depends mostly on the voltage; see `_treat`."""
-        s = self._settings
+        s, answers = self._settings, self.answers(t_s)
+        if answers is not None:
+            once = Chances(*answers.of(self.at(t_s).flaws).pulse(voltage_v))
+            return self._treat("pulse", t_s, once.of_times(pulse_times(s, duration_s)), random)
         strength = max(0.0, abs(voltage_v) / s.pulse_threshold_v - 1.0) if s.pulse_threshold_v else 1.0
         if strength == 0.0:
             return "unchanged"
@@ -325,8 +348,11 @@ class SimulatedTip:
 
     def crash(self, depth_m: float, speed_m_s: float, t_s: float, random: np.random.Generator) -> str:
         """Return the effect of a crash; see `_treat`."""
-        s = self._settings
+        s, answers = self._settings, self.answers(t_s)
         effect = min(1.0, speed_m_s / s.crash_speed_m_per_s)
+        if answers is not None:
+            once = Chances(*answers.of(self.at(t_s).flaws).crash(depth_m))
+            return self._treat("crash", t_s, once.weakened(effect), random)
         chances = Chances(s.crash_cures, s.crash_worsens).of_times(crash_times(s, depth_m)).weakened(effect)
         return self._treat("crash", t_s, chances, random)
 

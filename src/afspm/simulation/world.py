@@ -191,7 +191,11 @@ class World:
         self._held_z_m = measured.last_z_m
         self._tip.wear(course, loop)
         drift = self.sample.drift.at(course.row_times_s(0.25))
-        truth = {**_truth_of_scan(self.sample, course, tips), "pressed_m": measured.pressed_m}
+        truth = {
+            **_truth_of_scan(self.sample, course, tips),
+            "pressed_m": measured.pressed_m,
+            "saturated": self.saturated(measured.channels["Current"][1]),
+        }
         return SimulatedScan(course, drift, truth, measured.channels)
 
     def at_rest(
@@ -275,6 +279,13 @@ class World:
         value, quantity = float(self.property_map.at(x, y)), self.property_map.quantity
         return {"property": {"quantity": quantity, "value": value, "unit": self.property_map.unit, "sample_m": [x, y]}}
 
+    def saturated(self, current_a: Array, kind: str = "") -> float:
+        """Return the share of the values at which the preamplifier is saturated, in a scan or in a kind of spectrum."""
+        s = self.settings
+        # the noise of a scan's current is added behind the amplifier, that of a spectrum's before it
+        limit_a = s.iv.preamplifier_a if kind else s.signals.preamplifier_a - 4.0 * s.noise.current_a
+        return float((np.abs(current_a) >= limit_a).mean())
+
     def spectrum_s(self, kind: str) -> float:
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
 
@@ -356,7 +367,9 @@ class World:
 
     def truth(self, t_s: float) -> dict[str, object]:
         """Return the ground truth, which is never published, JSON-able: drift, tip, its changes, marks."""
+        answers = self._tip.answers(t_s)
         return {
+            **({} if answers is None else {"tip_answers": answers.truth()}),
             "t_s": t_s,
             "seed": self.seed,
             "surface": dict(self.sample.table),

@@ -203,6 +203,9 @@ _JOURNAL_ENTRY = MessageMapping(
     late=FieldMapping("late", sparse=True),
     sent_ns=_time("sent"),
     key=FieldMapping("key", sparse=True),
+    subject=FieldMapping("subject", sparse=True),
+    value=FieldMapping("value", sparse=True),
+    unit=FieldMapping("unit", sparse=True),
 )
 _PROCESS_STATE = MessageMapping(
     model.ProcessState,

@@ -246,9 +246,9 @@ def test_feedback_is_switched_on_after_its_other_settings(bench: Make, monkeypat
     controller, engaged_with = made.emulator.controller, []
     plain = controller.engage
 
-    def engage() -> None:
+    def engage(now_s: float) -> None:
         engaged_with.append(controller.values.get("AmplitudeSetpointVolts"))
-        plain()
+        plain(now_s)
 
     monkeypatch.setattr(controller, "engage", engage)
     assert peer.ask(ControlRequest.SET_ZCTRL_PARAMS, Feedback(True, 0.5, 20.0, 0.625)).ok

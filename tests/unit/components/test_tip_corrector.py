@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.client.client_lab import REGION, Kill9, Lab, LabPort, context_of, run
+from tests.unit.client.client_lab import REGION, SCAN_S, Kill9, Lab, LabPort, context_of, run
 from tests.unit.components.tip_scans_lab import HOME, channels
 
 from afspm import wire
@@ -472,3 +472,134 @@ def test_tip_is_repaired_once_the_disk_has_room_and_a_person_cleared_the_flag(
     run(corrector(), lab, tmp_path)
     assert len(lab.actions) == 2
     assert lab.problems == ()
+
+
+def learner(**settings: Any) -> TipCorrector:
+    return corrector(policy="learn", **settings)
+
+
+def life(lab: Repairs, folder: Path, until_s: float = 5000.0, **settings: Any) -> TipCorrector:
+    """Run a learning corrector in a run folder until a time."""
+    folder.mkdir(parents=True)
+    context = context_of(lab, folder, run_dir=str(folder))
+    lab.at(until_s, lab.kill)
+    repairing = learner(**settings)
+    assert repairing.run_process(context) == ExitCode.ENDED
+    return repairing
+
+
+def test_learning_repair_tries_again_beyond_the_list_until_the_tip_is_good(tmp_path: Path) -> None:
+    lab = Repairs([BAD] * 5 + [GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    repairing = life(lab, tmp_path / "runs" / "night")
+    assert len(lab.actions) == 6
+    assert lab.problems == ()
+    outcomes = [repairing.experience.of("unknown", one) for one in repairing.allowed]
+    assert sum(one.cured for one in outcomes) == 1.0
+    assert sum(one.unchanged for one in outcomes) == 5.0
+
+
+def test_what_was_learnt_is_kept_for_the_next_night(tmp_path: Path) -> None:
+    for number, night in enumerate(("first", "second")):
+        lab = Repairs([GOOD])
+        lab.at(10.0, partial(lab.flag, TIP))
+        repairing = life(lab, tmp_path / "runs" / night)
+        assert repairing.experience.nights == number + 1
+    assert (tmp_path / "runs" / "tip_experience.toml").exists()
+    assert sum(repairing.experience.of("unknown", one).cured for one in repairing.allowed) == 2.0
+
+
+def test_unreadable_experience_is_left_as_it_is(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "runs").mkdir(parents=True)
+    file = tmp_path / "runs" / "tip_experience.toml"
+    file.write_text("[double", encoding="utf-8")
+    lab = Repairs([GOOD])
+    lab.at(10.0, lambda: lab.flag(TIP))
+    life(lab, tmp_path / "runs" / "night")
+    assert lab.problems == ()
+    assert file.read_text(encoding="utf-8") == "[double"
+    assert "begins without experience" in caplog.text
+
+
+def test_learning_repair_gives_up_after_its_most_treatments(tmp_path: Path) -> None:
+    lab = Repairs([BAD] * 40)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    life(lab, tmp_path / "runs" / "night", 20_000.0, most_treatments=5)
+    assert len(lab.actions) == 5
+    assert lab.problems == (TIP, MALFUNCTION)
+
+
+@pytest.mark.parametrize(
+    ("budget", "most"),
+    [
+        ({"night_pulses": 2, "night_depth": 0.0}, 2),
+        ({"night_depth": 10e-9, "night_pulses": 0}, 2),
+        ({"night_places": 3}, 3),
+    ],
+)
+def test_budget_of_the_night_holds_over_several_repairs(
+    budget: dict[str, Any], most: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Repairs([BAD, GOOD] + [BAD] * 40)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    lab.at(6000.0, lambda: lab.flag(TIP))
+    life(lab, tmp_path / "runs" / "night", 30_000.0, **budget)
+    assert len(lab.actions) == most
+    assert lab.problems == (TIP, MALFUNCTION)
+    assert "the budget of the night is spent" in caplog.text
+
+
+@pytest.mark.parametrize("policy", ["list", "learn"])
+def test_budget_holds_after_a_kill_anywhere(policy: str, tmp_path: Path) -> None:
+    for call in range(1, 110, 9):
+        lab = Repairs([BAD] * 30)
+        lab.at(10.0, partial(lab.flag, TIP))
+        lab.at(30_000.0, lab.kill)
+        (tmp_path / f"{call}").mkdir()
+        context = context_of(lab, tmp_path / f"{call}" / "night", run_dir=str(tmp_path / f"{call}" / "night"))
+        context.open_port = partial(LabPort, lab, call)
+        settings: dict[str, Any] = {"policy": policy, "night_pulses": 2, "night_depth": 5e-9}
+        try:
+            corrector(**settings).run_process(context)
+        except Kill9:
+            lab.restart_component()
+            lab.at(30_000.0, lab.kill)
+            second_life = context_of(lab, tmp_path / f"{call}" / "night", run_dir=str(tmp_path / f"{call}" / "night"))
+            second_life.session = "1"
+            corrector(**settings).run_process(second_life)
+        done = [action for action, _ in lab.actions]
+        assert done.count("x-pulse") <= 2, f"killed at call {call}"
+        assert done.count("x-crash") <= 1, f"killed at call {call}"
+        assert lab.problems == (TIP, MALFUNCTION), f"killed at call {call}"
+
+
+def test_refused_treatment_costs_no_budget(tmp_path: Path) -> None:
+    lab = Repairs([BAD] * 40)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    refused = 0
+
+    def limit(request: Request) -> Response | str:
+        nonlocal refused
+        subject = request.subject
+        too_much = isinstance(subject, Parameter) and subject.name == "x-pulse-voltage" and subject.value == "-4.0"
+        refused += too_much
+        return Response(ControlResponse.PARAM_ERROR, reason="below the limit") if too_much else "go on"
+
+    lab.intercept = limit
+    life(lab, tmp_path / "runs" / "night", 30_000.0, crash_depths=(), night_pulses=4)
+    assert refused == 1
+    assert len(lab.actions) == 4
+
+
+def test_time_of_repairs_counts_until_the_budget_is_spent(tmp_path: Path) -> None:
+    lab = Repairs([BAD] * 60)
+    lab.at(10.0, lambda: lab.flag(TIP))
+    um_s = 2.0 * REGION.size_m[0] * 1e6 * 8 / SCAN_S
+    speed = Response(ControlResponse.SUCCESS, wire.encode(Parameter("scan-speed", f"{um_s}", "um/s"))[1])
+    lab.intercept = lambda request: (
+        speed if isinstance(request.subject, Parameter) and request.subject.name == "scan-speed" else "go on"
+    )
+    repairing = life(lab, tmp_path / "runs" / "night", 30_000.0, night_time=1000.0)
+    assert 0 < len(lab.actions) < 12
+    assert 0.0 < repairing._spent.time_s <= 1000.0
+    assert lab.problems == (TIP, MALFUNCTION)

@@ -37,6 +37,7 @@ def html(
         section("", _cards(story) + estimate.html(story)),
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
+        section("Treatments of the tip", _treatments(story)),
         section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),
         section("On the sample", sample.sample_map(shown, places, story.frame)),
@@ -194,6 +195,22 @@ def _problems(story: RunStory, clock: PageTimes) -> str:
         table(["problem", "flagged", "by", "in control meanwhile", "done to the tip", "for", "cleared"], rows)
         or "<p>None.</p>"
     ) + routine
+
+
+def _treatments(story: RunStory) -> str:
+    ledger = story.ledger
+    if not ledger.treatments and not ledger.feedback_off_s:
+        return ""
+    rows = [
+        ["pulses", f"{ledger.pulses}, together {quantity(ledger.pulse_v_s, 'V s')}"],
+        ["crashes", f"{ledger.crashes}, together {quantity(ledger.crash_depth_m, 'm')} deep"],
+        ["by", escape(", ".join(f"{who} {count}" for who, count in sorted(ledger.by.items()))) or "none"],
+        ["within 500 nm of a region scanned before", str(ledger.in_keep_away)],
+        ["feedback off", duration_text(ledger.feedback_off_s)],
+    ]
+    if ledger.unknown:
+        rows.append(["with a size that the record does not show", f"{ledger.unknown}, not in these sums"])
+    return table(["what", "how much"], rows)
 
 
 def _notes(story: RunStory, clock: PageTimes) -> str:

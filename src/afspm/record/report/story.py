@@ -27,6 +27,7 @@ from afspm.record.run_json import REAL_S
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
+from afspm.record.treatment_ledger import TreatmentLedger
 
 COLOURS = 5  # of holders, repeated in turn: the CSS classes c0 to c4
 MOST_ROWS = 200
@@ -57,6 +58,7 @@ class RunStory:
         problems: spans of all problems except routine ones, in the order of time.
         actions: treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
+        ledger: totals of what was done to tip and sample.
         comparisons: planned and measured work of each component with a plan.
     """
 
@@ -75,6 +77,7 @@ class RunStory:
     actions: Sequence[JournalEntry]
     notes: Sequence[NoteRow]
     seen_late: Sequence[JournalEntry]
+    ledger: TreatmentLedger
     comparisons: Sequence[WorkComparison] = ()
 
     @property
@@ -164,6 +167,7 @@ def read(run: Run) -> RunStory:
         scans=[_without_routine(scan, overview) for scan in scans],
         spectra=len(run.spectra),
         refusals=gathered([entry for entry in run.refusals if entry not in late]),
+        ledger=run.ledger(),
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),

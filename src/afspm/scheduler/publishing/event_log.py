@@ -20,6 +20,7 @@ from afspm.model import (
     ControlResponse,
     JournalEntries,
     JournalEntry,
+    Parameter,
     ProblemNames,
     Request,
     Response,
@@ -69,6 +70,7 @@ class AnsweredRequest(NamedTuple):
         kind = ORDER if self.request.kind == RESTART_REQUEST else REQUEST
         what = request_text(self.request, problems)[:LONGEST]
         reason = "; ".join(filter(None, (LATE if self.late else "", self.response.reason[:LONGEST])))
+        subject, value, unit = _subject_of(self.request)
         flags = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
         return JournalEntry(
             self.time_ns,
@@ -83,7 +85,20 @@ class AnsweredRequest(NamedTuple):
             late=self.late,
             sent_ns=self.sent_ns,
             key=key_of(self.who, self.request.id),
+            subject=subject,
+            value=value,
+            unit=unit,
         )
+
+
+def _subject_of(request: Request) -> tuple[str, str, str]:
+    # the action, or the parameter that was to be set, with its value and unit
+    asked = request.subject
+    if request.kind == ControlRequest.ACTION:
+        return str(asked)[:LONGEST], "", ""
+    if request.kind != ControlRequest.PARAM or not isinstance(asked, Parameter) or asked.value is None:
+        return "", "", ""
+    return asked.name[:LONGEST], asked.value[:LONGEST], (asked.unit or "")[:LONGEST]
 
 
 @dataclass(frozen=True)

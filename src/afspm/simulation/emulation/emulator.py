@@ -241,6 +241,7 @@ class Emulator(ABC):
             while not self._stop.is_set() and clock.monotonic_s() < self._leave_at_s:
                 self._call_guarded(self.serve, self._wait_s())
                 self.woken.take()
+                self.rig.account(clock.now_s())
         finally:
             self.close()
             self.take_button_away()

@@ -156,14 +156,14 @@ class AsylumController:
         self._curve_running = self._engages = False
         self.rig.withdraw(now_s)
 
-    def engage(self) -> None:
+    def engage(self, now_s: float) -> None:
         """Bring the tip to the sample after a running withdrawal."""
         self._engages = True
-        self.rig.setup.feedback = replace(self.rig.setup.feedback, on=True)
+        self.rig.switch_feedback(now_s, on=True)
 
-    def feedback_off(self) -> None:
+    def feedback_off(self, now_s: float) -> None:
         """Hold the tip at its present height."""
-        self.rig.setup.feedback = replace(self.rig.setup.feedback, on=False)
+        self.rig.switch_feedback(now_s, on=False)
 
     def abandon(self) -> None:
         """Stop scan and curve after an unexpected error."""

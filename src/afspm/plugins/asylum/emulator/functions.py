@@ -133,13 +133,13 @@ class AsylumFunctions:
         return 0.0
 
     def _engage(self, _: str) -> float:
-        self._controller.engage()
+        self._controller.engage(self._now_s())
         return 0.0
 
     def _feedback(self, on: float) -> float:
         if on:
             return self._engage("")
-        self._controller.feedback_off()
+        self._controller.feedback_off(self._now_s())
         return 0.0
 
     def _feedback_on(self) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -172,7 +171,7 @@ class GxsmFunctions:
         program, rig = self._program, self._program.rig
         now_s = program.clock.now_s()
         if name in self._feedback_actions:
-            rig.setup.feedback = replace(rig.setup.feedback, on=name == self._feedback_actions[0])
+            rig.switch_feedback(now_s, on=name == self._feedback_actions[0])
         elif name.startswith("CHECK-") and name.removeprefix("CHECK-") in _MODES[program.card]:
             program.panel.probe_auto_save = True
         elif name == "DSP_VP_ABORT_EXECUTE":

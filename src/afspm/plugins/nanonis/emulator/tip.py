@@ -52,7 +52,7 @@ class ZController:
         if not on and rig.setup.feedback.on and rig.engaged and self._scans.running is None:
             lift_m = (*self._core.registers.get("ZCtrl.TipLift"), 0.0)[0]
             rig.hold(float(np.mean([self._signals.z_m(now_s) for _ in range(_Z_AVERAGED)])) + lift_m)
-        rig.setup.feedback = replace(rig.setup.feedback, on=on)
+        rig.switch_feedback(now_s, on=on)
         if on:
             rig.engaged = True
 
@@ -135,7 +135,7 @@ class ZController:
             rig = self._core.rig
             rig.withdraw(self._core.now_s)
             self.state = "off"
-            rig.setup.feedback = replace(rig.setup.feedback, on=False)
+            rig.switch_feedback(self._core.now_s, on=False)
         return self._core.until_free(wait, timeout_ms)
 
     @answers("AutoApproach.Open")

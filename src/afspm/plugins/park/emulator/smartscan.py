@@ -170,6 +170,7 @@ class SmartScanProgram(MakerProgram):
                 _number(f"{path}.{member}", number, 0.0, 100.0)
         elif isinstance(value, bool) is not isinstance(present, bool):
             raise InvalidValue(f"{path}: {value!r}")
+        self.rig.account(self.now_s)  # with the feedback as it was
         self._values[path] = value
         self._apply()
 
@@ -230,6 +231,7 @@ class SmartScanProgram(MakerProgram):
         self.rig.occupy("move along z", way_um / speed_um_s, self.now_s)
         self._z_um, self.stage_um[2] = scanner_um, stage_um
         height_um = scanner_um + stage_um
+        self.rig.account(self.now_s)
         self.rig.engaged = height_um <= 0.0
         if height_um < -_TOUCHES_UM:
             self.rig.stop("move along z", self.now_s)

@@ -1,0 +1,136 @@
+"""The ledger of a run: what was done to tip and sample, as far as the record shows it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import UnitError
+from afspm.basics.units import convert, si_unit
+from afspm.model import ControlRequest, ControlResponse, JournalEntry, Region, names
+
+_COUNTS = frozenset({ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE})
+"""Responses to an action that may have been carried out: one without an answer counts as done."""
+KEEP_AWAY_M = 500e-9
+"""The distance that the `TipCorrector` keeps from scanned regions by default."""
+XY = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class TreatmentLedger:
+    """Totals of a run.
+
+    Attributes:
+        pulses, pulse_v_s: number of bias pulses, and the sum of |voltage| times duration.
+        crashes, crash_depth_m: number of controlled crashes, and the sum of their depths.
+        unknown: treatments whose voltage, duration or depth the record does not show; the sums lack them.
+        in_keep_away: treatments nearer than the given distance to a region scanned before.
+        feedback_off_s: time with the feedback off, as published, except while the tip was retracted by a request.
+        by: number of treatments of each author.
+    """
+
+    pulses: int = 0
+    pulse_v_s: float = 0.0
+    crashes: int = 0
+    crash_depth_m: float = 0.0
+    unknown: int = 0
+    in_keep_away: int = 0
+    feedback_off_s: float = 0.0
+    by: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def treatments(self) -> int:
+        return self.pulses + self.crashes
+
+
+def treatment_ledger(
+    journal: Iterable[JournalEntry],
+    positions: Sequence[tuple[int, XY]],
+    scanned: Sequence[tuple[int, Region]],
+    feedback: Sequence[tuple[int, bool]],
+    end_ns: int,
+    keep_away_m: float,
+) -> TreatmentLedger:
+    """Return the ledger.
+
+    Args:
+        journal: in the order of time.
+        positions: times and positions of the probe.
+        scanned: beginnings and regions of scans.
+        feedback: times at which its state was published, and whether it was on.
+        end_ns: of the run.
+        keep_away_m: distance from scanned regions within which a treatment counts as near.
+    """
+    ledger, values, retracted = TreatmentLedger(), dict[str, float](), list[tuple[int, bool]]()
+    for entry in journal:
+        if entry.response not in _COUNTS:
+            continue
+        if entry.request == ControlRequest.PARAM and entry.subject:
+            _keep_value(values, entry)
+        elif entry.request == ControlRequest.ACTION and entry.subject in (names.RETRACT, names.ENGAGE):
+            retracted.append((entry.time_ns, entry.subject == names.RETRACT))
+        elif entry.request == ControlRequest.ACTION and entry.subject in (names.PULSE, names.CRASH):
+            near = _is_near(entry, positions, scanned, keep_away_m)
+            ledger = _with_treatment(ledger, entry, values, near=near)
+    return replace(ledger, feedback_off_s=_off_s(feedback, retracted, end_ns))
+
+
+def _keep_value(values: dict[str, float], entry: JournalEntry) -> None:
+    try:
+        value = float(entry.value)
+        values[entry.subject] = convert(value, entry.unit, si_unit(entry.unit)) if entry.unit else value
+    except (ValueError, UnitError):
+        values.pop(entry.subject, None)  # a text, or a unit of another kind: no number of a treatment
+
+
+def _with_treatment(
+    ledger: TreatmentLedger, entry: JournalEntry, values: dict[str, float], *, near: bool
+) -> TreatmentLedger:
+    by = {**ledger.by, entry.who: ledger.by.get(entry.who, 0) + 1}
+    ledger = replace(ledger, by=by, in_keep_away=ledger.in_keep_away + near)
+    if entry.subject == names.CRASH:
+        depth_m = values.get(names.CRASH_DEPTH)
+        unknown, depth_m = depth_m is None, depth_m or 0.0
+        total_m = ledger.crash_depth_m + depth_m
+        return replace(ledger, crashes=ledger.crashes + 1, crash_depth_m=total_m, unknown=ledger.unknown + unknown)
+    voltage_v, duration_s = values.get(names.PULSE_VOLTAGE), values.get(names.PULSE_DURATION)
+    known = voltage_v is not None and duration_s is not None
+    pulse_v_s = abs(voltage_v or 0.0) * (duration_s or 0.0)
+    return replace(
+        ledger,
+        pulses=ledger.pulses + 1,
+        pulse_v_s=ledger.pulse_v_s + pulse_v_s,
+        unknown=ledger.unknown + (not known),
+    )
+
+
+def _is_near(
+    entry: JournalEntry,
+    positions: Sequence[tuple[int, XY]],
+    scanned: Sequence[tuple[int, Region]],
+    keep_away_m: float,
+) -> bool:
+    done_ns = entry.sent_ns if entry.sent_ns is not None else entry.time_ns
+    where = [xy_m for time_ns, xy_m in positions if time_ns <= done_ns]
+    return bool(where) and any(
+        _distance_m(where[-1], region) < keep_away_m for began_ns, region in scanned if began_ns <= done_ns
+    )
+
+
+def _distance_m(xy_m: XY, region: Region) -> float:
+    cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+    dx, dy = xy_m[0] - region.center_m[0], xy_m[1] - region.center_m[1]
+    beside = (abs(dx * cos + dy * sin) - region.size_m[0] / 2, abs(dy * cos - dx * sin) - region.size_m[1] / 2)
+    return math.hypot(*(max(one, 0.0) for one in beside))
+
+
+def _off_s(feedback: Sequence[tuple[int, bool]], retracted: Sequence[tuple[int, bool]], end_ns: int) -> float:
+    changes = sorted([(at, "on", on) for at, on in feedback] + [(at, "away", away) for at, away in retracted])
+    state, total_ns, since_ns = {"on": True, "away": False}, 0, None
+    for at_ns, what, value in [*changes, (end_ns, "on", True)]:
+        if since_ns is not None and not state["on"] and not state["away"]:
+            total_ns += max(0, at_ns - since_ns)
+        state[what], since_ns = value, at_ns
+    return total_ns / NS_PER_S
