@@ -67,6 +67,7 @@ class Bench:
         folder: for saved state and scans; None: a temporary one.
         seed: the same seed gives the same run.
         dies_in_call: the chance that the component is killed at a call to the network.
+        keeps_requests: keep inputs and requests in `folder`, as `[record] requests = true` does.
 
     Attributes:
         packets: all packets that the scheduler published, oldest first.
@@ -83,7 +84,9 @@ class Bench:
         folder: Path | None = None,
         seed: int = 1,
         dies_in_call: float = 0.0,
+        keeps_requests: bool = False,
     ) -> None:
+        self._keeps_requests = keeps_requests
         self._temporary = TemporaryDirectory(prefix="afspm-bench-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else Path(folder or "")
         self.name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(component).__name__).lower()
@@ -131,6 +134,7 @@ class Bench:
             self._time, Weather(), self._scheduler, name, make, self.folder, dies_in_call=dies_in_call
         )
         process.problems = self._named
+        process.keeps_requests = self._keeps_requests
         return process
 
     # --- running ---

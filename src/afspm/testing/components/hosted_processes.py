@@ -151,6 +151,7 @@ class ComponentProcess(BlockingProcess):
         self._inbox: list[Incoming] = []
         self._newest: dict[str, int] = {}
         self.problems: dict[str, int] = {}
+        self.keeps_requests = False
 
     def connect(self) -> None:
         self._inbox = []
@@ -170,6 +171,7 @@ class ComponentProcess(BlockingProcess):
             run_dir=str(self._folder),
             simulated=True,
             problems=self.problems,
+            keeps_requests=self.keeps_requests,
         )
         context = ProcessContext(
             launch,
