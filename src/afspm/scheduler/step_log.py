@@ -20,7 +20,16 @@ from typing import Any
 
 from afspm import wire
 from afspm.basics.launch import Launch
-from afspm.model import ControlResponse, LoggedPacket, Packet, PacketHeader, Request, Response, request_name
+from afspm.model import (
+    CLOCK_REQUEST,
+    ControlResponse,
+    LoggedPacket,
+    Packet,
+    PacketHeader,
+    Request,
+    Response,
+    request_name,
+)
 from afspm.model.snapshot import from_plain, snapshot, to_plain
 from afspm.scheduler import events
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
@@ -157,7 +166,8 @@ def facts_of(effect: events.Effect) -> list[Any]:
         case events.Reply(_, name, response, asked):
             key = f"{name} {request_name(asked)}" if asked else name
             text = f"{_code(response)} {response.reason}".strip()
-            return ["Reply", key, text, response.id, _sum(response.payload), int(response.detail)]
+            payload = b"" if asked == CLOCK_REQUEST else response.payload  # versions and time, which decide nothing
+            return ["Reply", key, text, response.id, _sum(payload), int(response.detail)]
         case events.Forward(number, request):
             return ["Forward", request_name(request.kind), str(request.subject), request.id, number]
         case events.Publish(packet, source_ns, history):
