@@ -45,6 +45,11 @@ _HOMES = {
 
 def __getattr__(name: str) -> object:
     if name not in __all__:
+        from afspm.basics import entry_points
+
+        # a function that a package adds; never under a name of Python's own
+        if not name.startswith("_") and (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
+            return found
         raise AttributeError(f"module 'afspm' has no attribute {name!r}")
     return getattr(import_module(_HOMES.get(name, "afspm.model")), name)
 

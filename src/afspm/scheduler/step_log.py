@@ -4,7 +4,8 @@ The decisions are pure, so the same inputs must give the same effects: `afspm wh
 is a list:
 
 - ["life", launch, saved, cached]: the scheduler starts, with the state and the packets restored from disk.
-- ["step", event, now_s, now_ns, effects]: an input, or null for the start itself.
+- ["step", event, now_s, now_ns, effects, state]: an input, or null for the start itself; `state` has a checksum of each
+  part of the state that the step has changed.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import json
 import logging
 import zlib
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +37,7 @@ from afspm.model.snapshot import from_plain, snapshot, to_plain
 from afspm.scheduler import events
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.state import SchedulerState
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
 
 INLINE_BYTES = 4096
@@ -56,15 +60,33 @@ class Restored:
 
 @dataclass(frozen=True)
 class Step:
-    """One step: its input (None: the start), its times, and the facts of its effects."""
+    """One step: its input (None: the start), its times, the facts of its effects, and sums of the changed state."""
 
     event: events.Input | None
     now_s: float
     now_ns: int
     effects: list[list[Any]]
+    state: dict[str, int]
 
 
 Keep = Callable[[Restored | Step], None]
+
+
+class StateSums:
+    """Checksums of the parts of a scheduler's state, those only that a step has changed."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, object] = {}
+        self._sums: dict[str, int] = {}
+
+    def changed(self, state: SchedulerState) -> dict[str, int]:
+        """Return the checksum of each part that differs from the last call."""
+        before = dict(self._sums)
+        for name, part in vars(state).items():
+            if part is not self._parts.get(name, self):  # most steps leave most parts as they are
+                self._parts[name] = part
+                self._sums[name] = zlib.crc32(_canonical(part).encode())
+        return {name: total for name, total in self._sums.items() if before.get(name) != total}
 
 
 class RecordedCore(SchedulerCore):
@@ -79,6 +101,7 @@ class RecordedCore(SchedulerCore):
         super().__init__(*given)
         self._keep = keep
         self._beginning = Restored()
+        self._sums = StateSums()
 
     def restore(self, saved: SavedState) -> None:
         self._beginning = replace(self._beginning, saved=saved)
@@ -91,12 +114,12 @@ class RecordedCore(SchedulerCore):
     def start(self, now_s: float, now_ns: int) -> list[events.Effect]:
         self._keep(self._beginning)
         effects = super().start(now_s, now_ns)
-        self._keep(Step(None, now_s, now_ns, [*map(facts_of, effects)]))
+        self._keep(Step(None, now_s, now_ns, [*map(facts_of, effects)], self._sums.changed(self.state)))
         return effects
 
     def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]:
         effects = super().step(event, now_s, now_ns)
-        self._keep(Step(event, now_s, now_ns, [*map(facts_of, effects)]))
+        self._keep(Step(event, now_s, now_ns, [*map(facts_of, effects)], self._sums.changed(self.state)))
         return effects
 
 
@@ -116,7 +139,7 @@ class StepLog:
         """Append the beginning of a life, or a step."""
         if isinstance(one, Step):
             event = None if one.event is None else _plain_event(one.event)
-            self._log.add(["step", event, one.now_s, one.now_ns, one.effects])
+            self._log.add(["step", event, one.now_s, one.now_ns, one.effects, one.state])
             return
         saved = None if one.saved is None else snapshot(one.saved, KIND, VERSION, lists=True)
         cached = [[_plain_packet(entry.packet), entry.source_ns, entry.history] for entry in one.cached]
@@ -242,7 +265,24 @@ def _sum(payload: bytes | memoryview) -> int:
 
 
 def _plain_sum(value: object) -> int:
-    return zlib.crc32(json.dumps(to_plain(value, lists=True), default=repr).encode())
+    return zlib.crc32(_canonical(value).encode())
+
+
+def _canonical(value: object) -> str:
+    # equal for equal values in all processes: no order of a set, and no address of an object
+    if isinstance(value, Enum):
+        return repr(value.value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return f"({','.join(_canonical(getattr(value, one.name)) for one in fields(value))})"
+    if isinstance(value, Mapping):
+        return f"{{{','.join(sorted(f'{_canonical(key)}:{_canonical(one)}' for key, one in value.items()))}}}"
+    if isinstance(value, set | frozenset):
+        return f"{{{','.join(sorted(map(_canonical, value)))}}}"
+    if isinstance(value, list | tuple | deque):
+        return f"[{','.join(map(_canonical, value))}]"
+    if value is None or isinstance(value, str | int | float | bytes | bytearray):
+        return repr(value)
+    return type(value).__name__
 
 
 def _text(payload: bytes | memoryview) -> str:

@@ -1,14 +1,14 @@
 """Recorded and replayed outputs beside each other: pure, outputs in, differences out.
 
-Outputs are aligned by message, key and the packet that they answer, and the n-th of one such kind with the n-th. An
-output that is added or missing therefore shifts no later one.
+Outputs are aligned by message, key and the packet that they answer, the n-th with the n-th; those that are left, by
+message and key. An output that is added or missing therefore shifts no later one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from difflib import SequenceMatcher
+from itertools import zip_longest
 from typing import NamedTuple
 
 
@@ -109,47 +109,31 @@ def first_difference(component: str, recorded: Sequence[Output], now: Sequence[O
 
 def aligned(component: str, recorded: Sequence[Output], now: Sequence[Output]) -> tuple[int, list[Difference]]:
     """Return the number of equal outputs, and all differences in the order of their times."""
+    here, there = _by_place(recorded), _by_place(now)
     same, differences = 0, list[Difference]()
-    names = dict.fromkeys(one.name for one in (*recorded, *now))
-    before, after = _by_name(recorded), _by_name(now)
-    for name in names:
-        equal, found = _aligned_by_packet(component, before.get(name, []), after.get(name, []))
-        same += equal
-        differences += found
+    left: dict[tuple[str, str], tuple[list[Output], list[Output]]] = {}
+    for place in {**here, **there}:
+        before, after = here.get(place, []), there.get(place, [])
+        pairs = min(len(before), len(after))
+        for one, other in zip(before[:pairs], after[:pairs], strict=True):
+            if one.value == other.value:
+                same += 1
+            else:
+                differences.append(Difference(component, one, other))
+        alone = left.setdefault(place[0], ([], []))
+        alone[0].extend(before[pairs:])
+        alone[1].extend(after[pairs:])
+    # an output that comes at another packet is one difference, not two
+    for before, after in left.values():
+        differences += [Difference(component, *sides) for sides in zip_longest(before, after)]
     return same, sorted(differences, key=lambda one: one.at_ns)
 
 
-def _aligned_by_packet(
-    component: str, recorded: Sequence[Output], now: Sequence[Output]
-) -> tuple[int, list[Difference]]:
-    here, there = [_place(one) for one in recorded], [_place(one) for one in now]
-    same, differences = 0, list[Difference]()
-    blocks = (
-        [("equal", 0, len(here), 0, len(there))]
-        if here == there
-        else SequenceMatcher(None, here, there, autojunk=False).get_opcodes()
-    )
-    for _, begin, end, first, last in blocks:
-        pairs = min(end - begin, last - first)
-        for before, after in zip(recorded[begin : begin + pairs], now[first : first + pairs], strict=True):
-            if before.is_as == after.is_as:
-                same += 1
-            else:
-                differences.append(Difference(component, before, after))
-        differences += [Difference(component, one, None) for one in recorded[begin + pairs : end]]
-        differences += [Difference(component, None, one) for one in now[first + pairs : last]]
-    return same, differences
-
-
-def _by_name(outputs: Iterable[Output]) -> dict[tuple[str, str], list[Output]]:
-    found: dict[tuple[str, str], list[Output]] = {}
+def _by_place(outputs: Iterable[Output]) -> dict[tuple[tuple[str, str], int, PacketName | None], list[Output]]:
+    found: dict[tuple[tuple[str, str], int, PacketName | None], list[Output]] = {}
     for one in outputs:
-        found.setdefault(one.name, []).append(one)
+        found.setdefault((one.name, one.life, one.packet), []).append(one)
     return found
-
-
-def _place(one: Output) -> tuple[int, PacketName | None]:
-    return (one.life, one.packet)
 
 
 def _order(one: Output) -> tuple[int, int]:

@@ -21,7 +21,7 @@ from afspm.scheduler.coordinate_frame import TIP_FRAME
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler import Scheduler
 from afspm.scheduler.scheduler_core import SchedulerCore
-from afspm.scheduler.step_log import Restored, Step, facts_of, read_cached, read_event
+from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.storage.line_log import read_lines
 from afspm.transport.process.context import ProcessActivity, ProcessContext
@@ -40,7 +40,8 @@ class SchedulerReplay:
         same: number of equal effects.
         differences: all others, in the order of the steps.
         first: the first of them.
-        first_step: its step, counted from 1.
+        first_step: the step, counted from 1, since which the states differ, if the effects do later; else that of
+            `first`.
         stopped: why the replay ended before the record; empty: it did not.
     """
 
@@ -67,8 +68,8 @@ def read_steps(path: Path) -> Iterator[tuple[Launch, Restored] | Step]:
                 state = None if saved is None else restored(SavedState, saved, KIND, VERSION)
                 yield Launch.from_json(json.dumps(launch)), Restored(state, read_cached(cached))
             elif kind == "step":
-                event, now_s, now_ns, effects = rest
-                yield Step(_event(event), now_s, now_ns, effects)
+                event, *more = rest
+                yield Step(_event(event), *more)
     except (IndexError, TypeError, ValueError, WireError) as error:
         raise FileError(f"is not a step log: {error}", where=str(path)) from error
 
@@ -113,12 +114,15 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
     """
     before, now = list[Output](), list[Output]()
     core: SchedulerCore | None = None
-    steps, life, first_step, stopped = 0, 0, None, ""
+    steps, life, stopped = 0, 0, ""
+    parted: int | None = None  # step since which the states differ
+    first: Difference | None = None
+    sums = StateSums()
     began_s, times = time.perf_counter(), list[int]()
     for one in recorded:
         if not isinstance(one, Step):
             make, beginning = one
-            life, core = life + 1, make()
+            life, core, sums = life + 1, make(), StateSums()
             if beginning.saved is not None:
                 core.restore(beginning.saved)
             core.restore_cache(beginning.cached)
@@ -136,18 +140,20 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
             stopped = f"step {steps} fails: {type(error).__name__}: {error}"
             made = [["error", "", stopped]]
         effects = json.loads(json.dumps(made))
+        if parted is None and (effects != one.effects or sums.changed(core.state) != one.state):
+            parted = steps
         place = PacketName(one.now_ns, _input_name(one.event))
         before += [_output(facts, place, life) for facts in one.effects]
         now += [_output(facts, place, life) for facts in effects]
-        if first_step is None and effects != one.effects:
-            first_step, first = steps, _first(one.effects, effects, place, life)
+        if first is None and effects != one.effects:
+            first = _first(one.effects, effects, place, life)
         if stopped:
             break
     real_s, recorded_s = time.perf_counter() - began_s, (times[-1] - times[0]) / 1e9 if times else 0.0
-    if first_step is None:
+    if first is None:
         return SchedulerReplay(steps, len(before), [], None, None, stopped, real_s, recorded_s)
     same, differences = aligned("scheduler", before, now)
-    return SchedulerReplay(steps, same, differences, first, first_step, stopped, real_s, recorded_s)
+    return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s)
 
 
 def _stepped(core: SchedulerCore, one: Step) -> list[list[Any]]:

@@ -164,8 +164,10 @@ class ComponentProcess(BlockingProcess):
         self._feed.close()
 
     def body(self) -> int:
+        made = self._make()
         launch = Launch(
             self.name,
+            f"{type(made).__module__}.{type(made).__qualname__}",
             sockets=Sockets(subscribe=(SOURCE,)),
             state_dir=str(self._folder),
             run_dir=str(self._folder),
@@ -181,7 +183,7 @@ class ComponentProcess(BlockingProcess):
             activity=ProcessActivity(self.timeline),
             session=f"life{self.life}",
         )
-        return self._make().run_process(context)
+        return made.run_process(context)
 
     def cut(self, for_s: float = 0.0) -> None:
         """Break the connections, which are reopened after about `for_s`."""
