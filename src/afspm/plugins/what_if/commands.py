@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 DIFFERS = 3
 """Exit code: a night differs."""
 _MOST_SHOWN = 10
+_LONGEST, _AROUND = 120, 25
 app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=AFTERWARDS)
 
 
@@ -138,7 +139,8 @@ def _print(result: WhatIf) -> None:
     shown = result.differences
     for one in shown[1:_MOST_SHOWN]:
         mark = " (counterfactual)" if one.counterfactual else ""
-        typer.echo(f"{day_and_time(one.at_ns, UTC)}  {one.component}: {_side(one.recorded)} → {_side(one.now)}{mark}")
+        sides = " → ".join(_sides(one))
+        typer.echo(f"{day_and_time(one.at_ns, UTC)}  {one.component}: {sides}{mark}")
     if len(shown) > _MOST_SHOWN:
         typer.echo(f"and {counted(len(shown) - _MOST_SHOWN, 'more difference')}")
     for name, hazards in result.hazards.items():
@@ -151,15 +153,35 @@ def _print(result: WhatIf) -> None:
 def _described(first: Difference) -> list[str]:
     packet = first.packet
     at = f"{day_and_time(first.at_ns, UTC)}, at the packet {packet.envelope}" if packet else "before the first packet"
-    return [
-        f"first difference: {first.component}, {at}",
-        f"  recorded  {_side(first.recorded)}",
-        f"  now       {_side(first.now)}",
-    ]
+    recorded, now = _sides(first)
+    return [f"first difference: {first.component}, {at}", f"  recorded  {recorded}", f"  now       {now}"]
 
 
-def _side(output: Output | None) -> str:
-    return "nothing" if output is None else f"{output.message} {output.key}: {output.text}".replace(" :", ":")
+def _sides(one: Difference) -> tuple[str, str]:
+    if one.recorded is None or one.now is None:
+        return _side(one.recorded), _side(one.now)
+    before, after = one.recorded, one.now
+    if before.value == after.value:
+        return _side(before), f"the same, at another packet: {_place(after)}"
+    # of long messages the part that differs
+    if min(len(before.text), len(after.text)) <= _LONGEST:
+        return _side(before), _side(after)
+    pairs = enumerate(zip(before.text, after.text, strict=False))
+    common = next((at for at, (one, other) in pairs if one != other), 0)
+    since, until = max(0, common - _AROUND), common + _AROUND
+    return _side(before, since, until), _side(after, since, until)
+
+
+def _side(output: Output | None, since: int = 0, until: int = 120) -> str:
+    if output is None:
+        return "nothing"
+    text = f"{'…' if since else ''}{output.text[since:until]}{'…' if until < len(output.text) else ''}"
+    return text if output.reaches else f"{output.key or output.message}: {text}"
+
+
+def _place(output: Output) -> str:
+    packet = output.packet
+    return "none" if packet is None else f"{packet.envelope} of {day_and_time(packet.time_ns, UTC)}"
 
 
 def _facts(result: WhatIf) -> dict[str, Any]:

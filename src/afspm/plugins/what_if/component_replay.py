@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from afspm.basics.clock import ExperimentClock
 from afspm.basics.launch import Launch
 from afspm.model import ProblemNames
 from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_difference
@@ -175,7 +176,7 @@ def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: Outp
         port.clock,
         open_port=lambda heard=None: port,
         log=log,
-        activity=ProcessActivity(port.clock),
+        activity=ProcessActivity(ExperimentClock.real()),  # its readings were not recorded, either
         session=life.facts["session"],
     )
     ended: int | str | None

@@ -108,12 +108,14 @@ class Guard:
             self._note(f"reads a file that is not in the record: {found}")
 
     def _forbid(self, what: str) -> None:
-        self._note(what)
-        raise ReplayForbids(f"in a replay: {what}")
+        if self._note(what):
+            raise ReplayForbids(f"in a replay a component can't do this: it {what}")
 
-    def _note(self, what: str) -> None:
-        if (place := _place(sys._getframe(1), through_afspm=True)) is not None:
+    def _note(self, what: str) -> bool:
+        place = _place(sys._getframe(1), through_afspm=True)
+        if place is not None:
             self.seen.setdefault(f"{what} ({place})")
+        return place is not None
 
     def _profile(self, frame: FrameType, event: str, called: Any) -> None:
         if event == "c_call" and (what := _hazard(called)) and (place := _place(frame)) is not None:
@@ -144,6 +146,8 @@ def _place(frame: FrameType | None, *, through_afspm: bool = False) -> str | Non
     library = str(Path(sysconfig.get_paths()["stdlib"]).resolve()) + os.sep
     while frame is not None:
         file = frame.f_code.co_filename
+        if frame.f_code.co_name == "<module>":
+            return None  # a module that is imported: no decision of the component
         is_ours = file == __file__ or file.startswith(_INFRASTRUCTURE)
         in_library = file.startswith((library, "<frozen")) and "site-packages" not in file
         if is_ours and not through_afspm:

@@ -14,7 +14,6 @@ from afspm.scheduler.control.descriptions import request_text
 
 _PROBLEMS = (ControlRequest.ADD_EXP_PRBLM, ControlRequest.RMV_EXP_PRBLM)
 _HARMLESS = (CLOCK_REQUEST, RELAY_REQUEST, ControlRequest.ACTION_SUPPORT)
-_LONGEST = 200
 
 
 class OutputReader:
@@ -60,8 +59,7 @@ class OutputReader:
                 payload = bytes(wire.encode(thing)[1])
         except AfspmError:  # a message of a package that is not installed here: its bytes are compared
             message, thing = envelope, payload
-        text = repr(thing)
-        text = text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
+        text = getattr(thing, "text", None) or " ".join(repr(thing).split())
         key = envelope if envelope != message else ""
         return Output(message, key, payload, text, packet, time_ns, self._life)
 
