@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 import shutil
+import subprocess
+import sys
 import textwrap
 from pathlib import Path
 from typing import Any
@@ -215,7 +218,6 @@ def test_hazards_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         "wall_clock": (lab.WallClock(), "reads the wall clock by time_ns(), instead of self.clock (what_if_lab.py:"),
         "unseeded": (lab.Unseeded(), "draws random numbers without a seed of its own (what_if_lab.py:"),
         "unseeded_numpy": (lab.UnseededNumpy(), "draws random bytes of the operating system (what_if_lab.py:"),
-        "set_order": (lab.SetOrder(), "depends on the order of a set"),
         "outside_file": (lab.OutsideFile(), f"reads a file that is not in the record: {outside}"),
     }
     lab.record(night, {name: component for name, (component, _) in planted.items()}, until="25 min")
@@ -225,6 +227,21 @@ def test_hazards_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for name, (_, words) in planted.items():
         assert any(words in hazard for hazard in result.hazards[name]), (name, result.hazards[name])
         assert result.components[name].first is not None
+
+
+def test_order_of_a_set_is_named(tmp_path: Path) -> None:
+    """Recorded by another process, as every night: the seed of the hashes of this one is another."""
+    code = (
+        "import sys, pathlib, what_if_lab as lab\n"
+        "lab.record(pathlib.Path(sys.argv[1]), {'set_order': lab.SetOrder()}, until='15 min')"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "7"}
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)
+    result = afspm.what_if(tmp_path, only=["set_order"])
+    assert result.first is not None
+    assert result.hazards == {
+        "set_order": ["depends on the order of a set: two hash seeds give other outputs, first its output 1"]
+    }
 
 
 def test_replay_writes_nothing_outside_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from afspm.record.run import open_run
 
 _SEEDS = ("1", "2")
 _WITHIN_S = 600.0
+_log = logging.getLogger("afspm.what_if")
 
 
 def hazards(run: Path, name: str) -> list[str]:
@@ -33,12 +35,16 @@ def hazards(run: Path, name: str) -> list[str]:
             check=False,
         )
         if done.returncode:
-            return []  # its class is not importable there: nothing is known
+            why = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+            _log.warning(
+                "%s could not be replayed in a process of its own, to look for an order of sets: %s", name, why
+            )
+            return []
         lines.append(done.stdout.splitlines())
     if lines[0] == lines[1]:
         return []
     at = next((n for n, (one, other) in enumerate(zip(*lines, strict=False)) if one != other), min(map(len, lines)))
-    return [f"depends on the order of a set: two hash seeds give other outputs, first its {at + 1}th"]
+    return [f"depends on the order of a set: two hash seeds give other outputs, first its output {at + 1}"]
 
 
 def main() -> None:
