@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import logging
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -13,6 +15,7 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch
 from afspm.basics.units import si
 from afspm.client.component import Component
 from afspm.client.loop import ComponentLoop
@@ -31,6 +34,7 @@ from afspm.model import (
 from afspm.scheduler.events import Effect, Input, Publish
 from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.simulation.simulator import Simulator
 from afspm.testing.components.hosted_processes import ComponentProcess, TranslatorProcess
@@ -99,8 +103,19 @@ class Bench:
         self._weather = Weather()
         settings = SchedulerSettings(limits=limits or ExperimentLimits())
         settings = replace(settings, rules=settings.control.rules(self._problems), watchdog=settings.control.watchdog())
+        make_core = None
+        if keeps_requests:
+            launch = Launch("scheduler", "afspm.scheduler.scheduler.Scheduler", run_dir=str(self.folder))
+            keep = StepLog.of_run(launch, logging.getLogger("afspm.scheduler")).keep
+            make_core = partial(RecordedCore, settings, WireCodec(), keep=keep)
         self._scheduler = SchedulerHost(
-            time, self._weather, settings, WireCodec(), lambda one: wire.header(one.envelope, one.payload), self
+            time,
+            self._weather,
+            settings,
+            WireCodec(),
+            lambda one: wire.header(one.envelope, one.payload),
+            self,
+            make_core=make_core,
         )
         self._scheduler.writes_ahead = True
         given = dict(microscope or {})
