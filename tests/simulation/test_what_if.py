@@ -4,51 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 from rotation import ALL, rotated
 
 from afspm.model import Packet
 from afspm.plugins.what_if import scheduler_replay
-from afspm.plugins.what_if.scheduler_replay import MakeCore, replay
+from afspm.plugins.what_if.scheduler_replay import replay
 from afspm.scheduler.scheduler_core import SchedulerCore
-from afspm.scheduler.state import SchedulerState
-from afspm.scheduler.step_log import RecordedCore, Restored, Step
-from tests.simulation.night import Night, _settings
-from tests.simulation.test_mutants import MUTANTS, _bad_night
+from afspm.scheduler.step_log import Step
+from tests.simulation.recorded_night import RecordedNight, recorded
+from tests.simulation.test_mutants import MUTANTS
 
 pytestmark = pytest.mark.slow
 FOUND = 0.95
 Patch = pytest.MonkeyPatch
-
-
-class RecordedNight(NamedTuple):
-    """A night's steps, and the scheduler's state after each."""
-
-    kept: list[tuple[MakeCore, Restored] | Step]
-    states: list[SchedulerState]
-
-
-def recorded(seed: int) -> RecordedNight:
-    night = Night(_bad_night(seed))
-    settings, cores = _settings(night.plan), list[RecordedCore]()
-    made = RecordedNight([], [])
-
-    def keep(one: Restored | Step) -> None:
-        if isinstance(one, Step):
-            made.kept.append(one)
-            made.states.append(cores[-1].state)
-        else:
-            made.kept.append((lambda: SchedulerCore(settings, night.codec), one))
-
-    def make() -> RecordedCore:
-        cores.append(RecordedCore(settings, night.codec, keep=keep))
-        return cores[-1]
-
-    night.scheduler._make_core = make
-    night.run()
-    return made
 
 
 @pytest.fixture(scope="module")

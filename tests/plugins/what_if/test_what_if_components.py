@@ -12,17 +12,20 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-import what_if_lab as lab
+from tests.plugins.what_if import what_if_lab as lab
 from typer.testing import CliRunner
 
 import afspm
+from afspm import wire
 from afspm.basics.errors import ConfigError, FileError, InvalidValue
 from afspm.plugins.what_if import component_replay
 from afspm.plugins.what_if.commands import DIFFERS, app
 from afspm.plugins.what_if.port_replay import read_lives
 from afspm.plugins.what_if.recorded_packets import recorded_packets
 from afspm.record.run import open_run
+from afspm.storage.memory import Memory
 from afspm.testing import Bench
 
 
@@ -133,7 +136,7 @@ def test_bad_changes_are_refused(night: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="can't be made"):
         afspm.what_if(night, {"judge": {"no_such_setting": 1.0}})
     with pytest.raises(InvalidValue, match="a change can't be 3"):
-        afspm.what_if(night, {"judge": 3})  # type: ignore[dict-item]
+        afspm.what_if(night, {"judge": 3})
     shutil.copy(night / "journal.sqlite", tmp_path)
     with pytest.raises(FileError, match="no recorded requests"):
         afspm.what_if(tmp_path)
@@ -164,14 +167,14 @@ def _mutants() -> dict[str, str]:
 
 
 def _class_of(source: str) -> type[lab.Judge]:
-    space: dict[str, Any] = {"np": lab.np, "Scan": afspm.Scan}
+    space: dict[str, Any] = {"np": np, "Scan": afspm.Scan}
     exec(textwrap.dedent(source), space)
     return type("Mutant", (lab.Judge,), {"remark": space["remark"]})
 
 
 def _decided(class_: type[lab.Judge], scans: list[Any]) -> list[str]:
     judge = class_()
-    judge.memory = {}  # type: ignore[assignment]
+    judge.memory = Memory(None)
     return [judge.remark(scan) for scan in scans]
 
 
@@ -187,9 +190,7 @@ def test_mutants_are_found_at_the_packet_where_they_first_decide_otherwise(tmp_p
             mutant = _class_of(source)
             pairs = enumerate(zip(right, _decided(mutant, scans), strict=True))
             truth = next((at for at, (one, other) in pairs if one != other), None)
-            found = component_replay.replay(
-                lives, recorded_packets(run), tmp_path, make=lambda launch, mutant=mutant: mutant()
-            ).first
+            found = component_replay.replay(lives, recorded_packets(run), tmp_path, make=_made(mutant)).first
             assert (found is None) == (truth is None), name
             if truth is not None:
                 decided_otherwise += 1
@@ -199,9 +200,11 @@ def test_mutants_are_found_at_the_packet_where_they_first_decide_otherwise(tmp_p
     assert decided_otherwise >= 6
 
 
-def _scan(packet: Any) -> Any:
-    from afspm import wire
+def _made(class_: type[lab.Judge]) -> component_replay.Make:
+    return lambda launch: class_()
 
+
+def _scan(packet: Any) -> Any:
     return wire.decode("Scan2d", packet.payload)
 
 
@@ -232,7 +235,7 @@ def test_hazards_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_order_of_a_set_is_named(tmp_path: Path) -> None:
     """Recorded by another process, as every night: the seed of the hashes of this one is another."""
     code = (
-        "import sys, pathlib, what_if_lab as lab\n"
+        "import sys, pathlib\nfrom tests.plugins.what_if import what_if_lab as lab\n"
         "lab.record(pathlib.Path(sys.argv[1]), {'set_order': lab.SetOrder()}, until='15 min')"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "7"}
