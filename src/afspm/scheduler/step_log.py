@@ -90,7 +90,7 @@ class StateSums:
 
 
 class RecordedCore(SchedulerCore):
-    """A scheduler's decisions of which every step is kept.
+    """A scheduler's decisions that keep every step.
 
     Args:
         keep: called with the beginning of a life, then after every step.

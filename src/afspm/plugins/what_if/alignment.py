@@ -1,6 +1,6 @@
 """Recorded and replayed outputs beside each other: pure, outputs in, differences out.
 
-Outputs are aligned by message, key and the packet that they answer, the n-th with the n-th; those that are left, by
+Outputs are aligned by message, key and the packet that they answer, the n-th with the n-th; the remaining ones by
 message and key. An output that is added or missing therefore shifts no later one.
 """
 
@@ -25,7 +25,7 @@ class Output:
 
     Attributes:
         message: name of the request or message.
-        key: what tells apart outputs of one message: the parameter, the action, the problem …
+        key: the parameter, the action, the problem … within a message.
         value: compared.
         text: for people.
         packet: the packet that is handled, or that came last; None: none has come.

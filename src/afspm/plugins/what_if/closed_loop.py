@@ -55,7 +55,7 @@ def rerun(
     """Run a simulated night again with a change and the same seeds, and compare the outcomes.
 
     Args:
-        changes: settings by the name of a component, or an experiment file that is laid over that of the run.
+        changes: settings by the name of a component, or an experiment file that is laid over the run's.
         runs: the folder for the new run.
 
     Raises:

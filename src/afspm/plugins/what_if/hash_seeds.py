@@ -21,7 +21,7 @@ _log = logging.getLogger("afspm.what_if")
 
 
 def hazards(run: Path, name: str) -> list[str]:
-    """Return what is known of a component without a change that does not repeat its record, for no other reason."""
+    """Return the hazard in words if the outputs of an unchanged component depend on the hash seed."""
     command = [sys.executable, "-c", f"from {__name__} import main; main()", str(run), name]
     path = os.pathsep.join([os.getcwd(), *filter(None, sys.path)])  # noqa: PTH109 - "" in sys.path means this folder
     lines = []

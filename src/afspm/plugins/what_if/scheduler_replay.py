@@ -40,8 +40,7 @@ class SchedulerReplay:
         same: number of equal effects.
         differences: all others, in the order of the steps.
         first: the first of them.
-        first_step: the step, counted from 1, since which the states differ, if the effects do later; else that of
-            `first`.
+        first_step: the step, counted from 1, since which states or effects differ.
         stopped: why the replay ended before the record; empty: it did not.
     """
 

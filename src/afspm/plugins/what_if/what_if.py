@@ -1,4 +1,4 @@
-"""`afspm.what_if`: all components and the scheduler of a recorded run, replayed with changes."""
+"""All components and the scheduler of a recorded run, replayed with changes."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] =
     Args:
         run: folder of the run.
         changes: by the name of a component, settings that replace those of the run, or another class; or an experiment
-            file that is laid over that of the run. None: only the installed version differs.
+            file that is laid over the run's. None: only the installed version differs.
         only: names of processes to replay; empty: all.
 
     Raises:
