@@ -107,7 +107,11 @@ class Scheduler:
         return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
     def settings(self, context: ProcessContext) -> SchedulerSettings:
-        """Return the settings of the scheduler's decisions."""
+        """Return the settings of the core.
+
+        Raises:
+            ConfigError: a problem that ends the experiment has no number.
+        """
         launch, control, cache = context.launch, self._control, self._cache
         try:
             rules = control.rules(context.problems)
@@ -122,8 +126,12 @@ class Scheduler:
             run=RunFacts(dict(launch.clock), launch.run, launch.simulated, asdict(versions_here())),
         )
 
-    def coordinates(self, context: ProcessContext) -> Coordinates:
-        """Return the coordinates of components: those of the tip, unless a subclass has others."""
+    def coordinates(self, context: ProcessContext, *, in_process: bool = False) -> Coordinates:
+        """Return the coordinates of components: those of the tip, unless a subclass has others.
+
+        Args:
+            in_process: whether the worker works in this process and at once, as a test needs it.
+        """
         return Coordinates()
 
 

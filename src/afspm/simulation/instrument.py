@@ -247,6 +247,15 @@ class Instrument:
             self.world.restore(self._before)
             self._redraw((*self.scan.adjusted, Adjustment(now_s, self.setup.feedback, self.setup.bias_v)))
 
+    def change_tip(self, condition: str, now_s: float) -> None:
+        """Change the tip, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        self.drawing.wait()
+        self.world.change_tip(condition, now_s)
+        self.note(now_s, "tip changed on demand", {"condition": condition})
+        if self._scans and self.scan is not None and self.scan.running(now_s):
+            self.world.restore(self._before)
+            self._redraw(self.scan.adjusted)
+
     @property
     def _scans(self) -> bool:
         return self.scan is not None and self.scan is self._doing and self.scan.stopped_s is None

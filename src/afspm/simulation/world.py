@@ -28,6 +28,7 @@ from afspm.simulation.scanning import Course, ScannerPlace, ScannerSettings, Sim
 from afspm.simulation.settings import build, nearest
 from afspm.simulation.surfaces import surface_from
 from afspm.simulation.tip import (
+    CONDITIONS,
     SimulatedTip,
     TipChange,
     TipChangeSettings,
@@ -275,6 +276,12 @@ class World:
         self.sample.compensation.set(velocity_m_per_s, t_s)
 
     # -- treating the tip
+
+    def change_tip(self, condition: str, t_s: float) -> None:
+        """Change the tip at a time that has not passed: "sharp", "blunt", "double" or "contaminated"."""
+        if condition not in CONDITIONS:
+            raise InvalidValue(f"a tip is not {condition!r}", hint=f"one of {', '.join(CONDITIONS)}")
+        self._tip.schedule(condition, t_s)
 
     def pulse(
         self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None

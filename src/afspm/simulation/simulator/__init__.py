@@ -218,6 +218,10 @@ class Simulator(Driver):
         loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
 
+    def change_tip(self, condition: str) -> None:
+        """Change the tip now, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        self._reached(refuses=False).instrument.change_tip(condition, self.clock.now_s())
+
     def run_drawing(self, work: Callable[[], None]) -> None:
         """Draw a scan beside everything else."""
         in_background(work)
