@@ -8,7 +8,7 @@ TEST := .venv/.test
 SETUP := .venv/.made
 
 .PHONY: demo demo-drift dev test test-all test-apart mutants test-samples coverage test-ui test-gateway test-translators test-clients test-windows test-hosts
-.PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate power-cut docs changelog clean
+.PHONY: test-nexus test-tiled check bench bench-drift soak chaos simulate replay-nights power-cut docs changelog clean
 .DEFAULT_GOAL := demo
 
 SOURCES := pyproject.toml uv.lock hatch_build.py tools/bootstrap.py $(wildcard proto/*.proto)
@@ -68,7 +68,7 @@ $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
-	@AFSPM_CASES=all $(PYTEST) -n 2 tests/simulation/test_mutants.py
+	@AFSPM_CASES=all $(PYTEST) -n 2 tests/simulation/test_mutants.py tests/simulation/test_what_if.py
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(TEST)
@@ -159,6 +159,11 @@ HOURS ?= 20000
 SEED ?= 1
 simulate: $(TEST)
 	@$(BIN)/python -m tests.simulation.long_run --hours $(HOURS) --seed $(SEED)
+
+## nights with kills, replayed by what-if without a change: NIGHTS=200 SEED=0
+NIGHTS ?= 200
+replay-nights: $(TEST)
+	@PYTHONPATH=tests/support $(BIN)/python -m tests.simulation.replayed_nights --nights $(NIGHTS) --seed $(SEED)
 
 ## a recorded run that loses its power, with all that was not synced, and is resumed, again and again: CUTS=100 SEED=1
 CUTS ?= 100

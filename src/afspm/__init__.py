@@ -6,7 +6,7 @@ What one writes components and scripts with is here, loaded when it is first use
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from afspm.client.component import Component
@@ -43,8 +43,13 @@ _HOMES = {
 }
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     if name not in __all__:
+        from afspm.basics import entry_points
+
+        # a function that a package adds; never under a name of Python's own
+        if not name.startswith("_") and (found := entry_points.load(entry_points.FUNCTIONS, name)) is not None:
+            return found
         raise AttributeError(f"module 'afspm' has no attribute {name!r}")
     return getattr(import_module(_HOMES.get(name, "afspm.model")), name)
 

@@ -34,6 +34,7 @@ ESTIMATORS = "afspm.estimators"  # of drift, by name
 TRACKERS = "afspm.trackers"  # of drift, by name
 FIGURES = "afspm.figures"  # of the report: (run, title), draws into the folder of the run
 DISPLAYS = "afspm.displays"  # of scans and spectra: what their `plot`, `to_sidpy` and notebook pictures call
+FUNCTIONS = "afspm.functions"  # of `afspm` itself, for scripts and notebooks: afspm.NAME
 FORMS = "afspm.forms"  # of experiment files: experiment.forms.FileForm
 COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
@@ -41,7 +42,7 @@ PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
 """The groups of the classes that an experiment file names without a module."""
 _FILE = "entry_points.txt"
-GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, DISPLAYS, FORMS, COMMANDS, PAGES)
+GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, DISPLAYS, FUNCTIONS, FORMS, COMMANDS, PAGES)
 
 
 @dataclass(frozen=True)

@@ -82,6 +82,8 @@ class Launch:
     """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()
     """For a scheduler: the problems that components of the run solve."""
+    keeps_requests: bool = False
+    """Inputs and requests of the process are recorded, so that `afspm what-if` can replay it."""
 
     def to_json(self) -> str:
         """Return one line of JSON, without a newline at its end."""

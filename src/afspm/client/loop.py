@@ -17,6 +17,7 @@ from afspm.client.backlog import PacketBacklog
 from afspm.client.dispatch import HostedComponent, MessageDispatcher, overrides
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.keyed_results import kept_in
+from afspm.client.port_log import RecordedPort, recorded
 from afspm.client.scope import Scope
 from afspm.model import Frame, Packet, Problem
 from afspm.storage.memory import Memory
@@ -48,16 +49,30 @@ class ComponentLoop:
         self._has_reacted = False  # a handler has returned after a tenure of control
         launch = context.launch
         self._dispatcher = MessageDispatcher(component, base, launch.envelopes, context.log)
-        self._ticker = None if self._is_script else _ticker(component, context.clock)
-        self._link = ExperimentLink.of_launch(
-            launch, context.open_port(), context.session, activity=self._activity, log=context.log
-        )
+        port, self._clock = context.open_port(), context.clock
+        if launch.keeps_requests:
+            port = recorded(port, context, self._dispatcher.wants, lambda: component.packet)
+            self._clock = port.clock
+        self._ticker = None if self._is_script else _ticker(component, self._clock)
+        self._link = ExperimentLink.of_launch(launch, port, context.session, activity=self._activity, log=context.log)
         self._link.listen(self._keep)
         self._state_dir = Path(launch.state_dir) if launch.state_dir else None
         self._give_attributes(self._state_dir)
 
     def run(self) -> int:
         """Run to the end, and return the exit code."""
+        port = self._link.port
+        try:
+            code = self._run_and_end()
+        except Exception as error:  # of any kind: only to write it down, it is raised again
+            if isinstance(port, RecordedPort):
+                port.end(type(error).__name__)
+            raise
+        if isinstance(port, RecordedPort):
+            port.end(code)
+        return code
+
+    def _run_and_end(self) -> int:
         try:
             code = self._run_to_the_end()
             self._end()
@@ -136,8 +151,8 @@ class ComponentLoop:
 
     def _handle_rest(self, within_s: float) -> None:
         # measurements before the end still need their handlers: a table must not lack the last scan
-        until_s = self._context.clock.monotonic_s() + within_s
-        while self._has_begun and len(self._backlog) and self._context.clock.monotonic_s() < until_s:
+        until_s = self._clock.monotonic_s() + within_s
+        while self._has_begun and len(self._backlog) and self._clock.monotonic_s() < until_s:
             with contextlib.suppress(ExperimentEnded, StopRequested):  # handlers can send no more requests
                 self._handle_backlog(1)
 
@@ -171,7 +186,7 @@ class ComponentLoop:
         between = self._handle_backlog if has_handlers else lambda: None
         frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
         component.scope = Scope(self._link, context.problems, state_dir, between, frame)
-        component.clock = context.clock
+        component.clock = self._clock
         component.log = context.log
         component.name = context.name
         component.memory = Memory(state_dir / f"{context.name}.json" if state_dir else None)

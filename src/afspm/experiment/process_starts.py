@@ -194,6 +194,7 @@ def _start(
         sample_coordinates=role is Role.COMPONENT and _in_sample_coordinates(resolved),
         retracts=role is Role.TRANSLATOR and _retracts_when_released(resolved),
         adjustable=control.adjustable if role is Role.TRANSLATOR else (),
+        keeps_requests=resolved.sections.record.requests and role is not Role.TRANSLATOR,
     )
     if command[:1] == ("python",):  # the running interpreter
         command = (sys.executable, *command[1:])

@@ -90,6 +90,8 @@ class RecordSection(Section):
     on: StrictBool = True
     scans: StrictBool = True
     """Scans and spectra, too, each as a file."""
+    requests: StrictBool = False
+    """Inputs and requests of each component and of the scheduler, for `afspm what-if`."""
 
 
 class MetadataSection(Section):

@@ -49,8 +49,10 @@ def restored(type_: type[T], plain: Mapping[str, object], kind: str, version: in
 
 
 def _numpy() -> Any:
-    # without a loaded numpy there are no arrays, and most processes do not load it
-    return sys.modules.get("numpy")
+    # Without a loaded numpy there are no arrays, and most processes do not load it. While another thread imports it,
+    # the module is there without its names.
+    numpy = sys.modules.get("numpy")
+    return numpy if hasattr(numpy, "ndarray") and hasattr(numpy, "generic") else None
 
 
 def to_plain(value: object, *, lists: bool = False) -> Any:

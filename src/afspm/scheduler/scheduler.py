@@ -21,6 +21,7 @@ from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
 from afspm.scheduler.shell import FrameWorker, SchedulerShell
 from afspm.scheduler.state_file import StateFile
+from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.scheduler.write_ahead import WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
@@ -82,7 +83,9 @@ class Scheduler:
         folder = Path(launch.state_dir) if launch.state_dir else None
         state = StateFile(folder and folder / f"{launch.name}.json", log)
         coordinates = self.coordinates(context)
-        core = SchedulerCore(self.settings(context), WireCodec(), coordinates.frame)
+        parts = (self.settings(context), WireCodec(), coordinates.frame)
+        keep = StepLog.of_run(launch, log).keep if launch.keeps_requests else None
+        core = SchedulerCore(*parts) if keep is None else RecordedCore(*parts, keep=keep)
         _restore(core, state, log_folder(folder) if folder else None)
         write_ahead = WriteAhead(state, PacketLog(log_folder(folder)) if folder else None, core.cached, log)
         warnings = RateLimitedLog(log, clock)

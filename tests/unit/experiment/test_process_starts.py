@@ -375,3 +375,15 @@ def test_command_may_declare_that_it_sends_no_heartbeats(write: Write) -> None:
     assert not start.beats
     assert start.launch.settings == {}
     assert start.command == (sys.executable, "x.py")
+
+
+def test_components_and_scheduler_keep_requests_if_the_record_does(write: Write) -> None:
+    kept = {name: one.launch.keeps_requests for name, one in starts(write(CORRECTOR)).items()}
+    assert not any(kept.values())
+    kept = {
+        name: one.launch.keeps_requests
+        for name, one in starts(write(CORRECTOR + "[record]\nrequests = true\n")).items()
+    }
+    assert kept["repair"]
+    assert kept["scheduler"]
+    assert not kept["microscope"]

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections import deque
 from dataclasses import dataclass, field
 from enum import Enum
+from types import ModuleType
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from afspm.basics.errors import InvalidValue
-from afspm.model.snapshot import restored, snapshot
+from afspm.model.snapshot import restored, snapshot, to_plain
 
 
 class Colour(Enum):
@@ -47,6 +49,12 @@ TREE = Tree(
     frozenset({"x"}),
     bytes(range(256)),
 )
+
+
+def test_half_imported_numpy_has_no_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another thread may be importing it at that moment."""
+    monkeypatch.setitem(sys.modules, "numpy", ModuleType("numpy"))
+    assert to_plain((1, "a", None)) == [1, "a", None]
 
 
 @pytest.mark.parametrize("lists", [False, True])

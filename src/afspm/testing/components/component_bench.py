@@ -36,6 +36,7 @@ from afspm.scheduler.events import Effect, Input, Publish
 from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.scheduler import Scheduler
 from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.simulation.simulator import Simulator
 from afspm.testing.components.bench_cast import BenchCast, cast_of
@@ -74,6 +75,7 @@ class Bench:
         folder: for saved state and scans; None: a temporary one.
         seed: the same seed gives the same run.
         dies_in_call: the chance that the component is killed at a call to the network.
+        keeps_requests: keep inputs and requests in `folder`, as `[record] requests = true` does.
 
     Attributes:
         packets: all packets that the scheduler published, oldest first.
@@ -90,6 +92,7 @@ class Bench:
         folder: Path | None = None,
         seed: int = 1,
         dies_in_call: float = 0.0,
+        keeps_requests: bool = False,
     ) -> None:
         name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(component).__name__).lower()
         if name in (others or {}):
@@ -97,12 +100,26 @@ class Bench:
         named, given = dict(problems or {}), dict(microscope or {})
         components = {name: component, **(others or {})}
         launches = {
-            each: Launch(each, envelopes=ComponentDeclaration.of_class(type(one)).listens, problems=named)
+            each: Launch(
+                each,
+                f"{type(one).__module__}.{type(one).__qualname__}",
+                envelopes=ComponentDeclaration.of_class(type(one)).listens,
+                problems=named,
+                keeps_requests=keeps_requests,
+            )
             for each, one in components.items()
         }
         cast = BenchCast(
             name, components, launches, Scheduler(limits=to_plain(limits or ExperimentLimits())),
-            Launch("scheduler", problems=named, simulated=True), Simulator, given,
+            Launch(
+                "scheduler",
+                "afspm.scheduler.scheduler.Scheduler",
+                {"limits": to_plain(limits or ExperimentLimits())},
+                problems=named,
+                simulated=True,
+                keeps_requests=keeps_requests,
+            ),
+            Simulator, given,
         )  # fmt: skip
         self._set_up(cast, folder, seed, dies_in_call)
 
@@ -183,7 +200,10 @@ class Bench:
         coordinates = cast.scheduler.coordinates(context, in_process=True)
         if hasattr(self, "_scheduler"):  # else the host makes a core before its first life
             self._scheduler.worker = coordinates.worker
-        return SchedulerCore(cast.scheduler.settings(context), WireCodec(), coordinates.frame)
+        parts = (cast.scheduler.settings(context), WireCodec(), coordinates.frame)
+        if not context.launch.keeps_requests:
+            return SchedulerCore(*parts)
+        return RecordedCore(*parts, keep=StepLog.of_run(context.launch, context.log).keep)
 
     def _make_simulator(self) -> Simulator:
         made: Simulator = self._simulators(**copy.deepcopy(self._microscope))

@@ -1,0 +1,207 @@
+"""The port log: everything that a component gets from outside, and everything that it sends, for a later replay.
+
+Inputs: events of the port, readings of the clock, and the saved memory at the start of each life. Outputs: requests and
+published packets, as bytes. With these a component can be run again without its experiment: `afspm what-if`.
+
+A line of the file is a list; its first item is its kind:
+
+- ["life", facts]: a process starts.
+- ["poll", timeout_s, monotonic_s, now_ns, events, readings]
+- ["send", frames, handled, readings], ["publish", envelope, payload, handled, readings]
+- ["end", how]: the process ends by itself. It is missing after a kill.
+
+`readings` are those of the clock since the line before, `handled` is the packet in whose handler a message was sent.
+Values of scans and spectra are in the record: their packets have only time and envelope here.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from base64 import b64encode
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.basics.clock import Clock
+from afspm.client.keyed_results import kept_in
+from afspm.model import Packet
+from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
+from afspm.transport.port import CaughtUp, Incoming, PacketReceived, Port, ReplyReceived
+from afspm.transport.process.context import ProcessContext
+
+INLINE_BYTES = 4096
+"""Larger packets that the record holds are not kept twice."""
+SUFFIX = ".jsonl"
+_IN_FILES = ("Scan2d", "Spec1d")
+
+
+class RecordedClock:
+    """A clock that keeps its readings, those of the component's own thread only."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._thread = threading.get_ident()
+        self._readings: list[Any] = []
+
+    def now_ns(self) -> int:
+        time_ns = self._clock.now_ns()
+        self._keep("n", time_ns)
+        return time_ns
+
+    def now_s(self) -> float:
+        time_s = self._clock.now_s()
+        self._keep("s", time_s)
+        return time_s
+
+    def monotonic_s(self) -> float:
+        time_s = self._clock.monotonic_s()
+        self._keep("m", time_s)
+        return time_s
+
+    def real_s(self, experiment_s: float) -> float:
+        real_s = self._clock.real_s(experiment_s)
+        self._keep("r", real_s)
+        return real_s
+
+    def late(self) -> AbstractContextManager[None]:
+        return self._clock.late()
+
+    def taken(self) -> list[Any]:
+        """Return the readings since the last call: kind, value, kind, value …"""
+        taken, self._readings = self._readings, []
+        return taken
+
+    def _keep(self, kind: str, value: float) -> None:
+        if threading.get_ident() == self._thread:
+            self._readings += (kind, value)
+
+
+class RecordedPort:
+    """A port that writes the port log. See `afspm.transport.port.Port`.
+
+    Args:
+        wants: returns whether a handler of the component gets a packet.
+        handled: returns the packet in whose handler the component is.
+    """
+
+    def __init__(
+        self, port: Port, log: LineLog, wants: Callable[[Packet], bool], handled: Callable[[], Packet | None]
+    ) -> None:
+        self._port = port
+        self._log = log
+        self._wants = wants
+        self._handled = handled
+        self._real = port.clock
+        self._clock = RecordedClock(port.clock)
+
+    @property
+    def clock(self) -> Clock:
+        return self._clock
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        # before the call: a kill in it may come when the request is on its way
+        self._log.add(["send", [_text(frame) for frame in frames], self._place(), self._clock.taken()])
+        with self._call():
+            self._port.send(frames)
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        with self._call():
+            came = self._port.poll(timeout_s)
+        now = (self._real.monotonic_s(), self._real.now_ns())
+        self._log.add(["poll", timeout_s, *now, [self._plain(one) for one in came], self._clock.taken()])
+        return came
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        self._log.add(["publish", envelope, _text(payload), self._place(), self._clock.taken()])
+        with self._call():
+            self._port.publish(envelope, payload)
+
+    def wake_up(self, incoming: Incoming | None = None) -> None:
+        self._port.wake_up(incoming)
+
+    def wakeup_fileno(self) -> int:
+        return self._port.wakeup_fileno()
+
+    def close(self) -> None:
+        self._port.close()
+
+    def end(self, how: int | str) -> None:
+        """Note that the component has ended by itself: an exit code, or the type of its error."""
+        self._log.add(["end", how])
+        self._log.close()
+
+    @contextmanager
+    def _call(self) -> Iterator[None]:
+        try:
+            yield
+        except Exception:
+            raise
+        except BaseException:  # the process dies in this call: the requests of its `finally` blocks count no more
+            self._log.close()
+            raise
+
+    def _place(self) -> list[Any] | None:
+        packet = self._handled()
+        return None if packet is None else [packet.time_ns, packet.envelope]
+
+    def _plain(self, incoming: Incoming) -> list[Any]:
+        match incoming:
+            case PacketReceived(packet, source):
+                return ["packet", packet.envelope, packet.time_ns, source, self._payload(packet)]
+            case ReplyReceived(response):
+                return ["reply", *map(_text, wire.encode_response(response))]
+            case CaughtUp(source):
+                return ["caught up", source]
+            case _:
+                return [type(incoming).__name__]
+
+    def _payload(self, packet: Packet) -> str | None:
+        is_long = len(packet.payload) > INLINE_BYTES
+        if packet.envelope.startswith("ScanLines"):  # many: kept only for a component that looks at them
+            return _text(packet.payload) if self._wants(packet) else None
+        return None if is_long and packet.envelope.startswith(_IN_FILES) else _text(packet.payload)
+
+
+def recorded(
+    port: Port, context: ProcessContext, wants: Callable[[Packet], bool], handled: Callable[[], Packet | None]
+) -> RecordedPort:
+    """Return a port that writes the port log of a process into the folder of its run."""
+    launch = context.launch
+    log = LineLog(log_path(Path(launch.run_dir or "."), launch.name), context.log)
+    state = Path(launch.state_dir) if launch.state_dir else None
+    log.add(
+        [
+            "life",
+            {
+                "launch": json.loads(replace(launch, keys=None, beat_token="").to_json()),
+                "session": context.session,
+                "speed": 1.0 / (port.clock.real_s(1.0) or 1.0),
+                "monotonic_s": port.clock.monotonic_s(),
+                "now_ns": port.clock.now_ns(),
+                "memory": _content(state, f"{launch.name}.json"),
+                "measurements": _content(state, f"{launch.name}.scope.json"),
+                "results": [] if state is None else kept_in(state, launch.name),
+            },
+        ]
+    )
+    return RecordedPort(port, log, wants, handled)
+
+
+def log_path(run_dir: Path, name: str) -> Path:
+    """Return the file of a component's port log."""
+    return run_dir / REQUESTS_FOLDER / f"{name}{SUFFIX}"
+
+
+def _content(folder: Path | None, name: str) -> str | None:
+    try:
+        return None if folder is None else (folder / name).read_text(encoding="utf-8")
+    except (OSError, ValueError):  # none yet; a damaged one is read by `Memory`, which has the error
+        return None
+
+
+def _text(payload: bytes | memoryview) -> str:
+    return b64encode(payload).decode()

@@ -1,0 +1,140 @@
+"""Recorded and replayed outputs beside each other: pure, outputs in, differences out.
+
+Outputs are aligned by message, key and the packet that they answer, the n-th with the n-th; the remaining ones by
+message and key. An output that is added or missing therefore shifts no later one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import zip_longest
+from typing import NamedTuple
+
+
+class PacketName(NamedTuple):
+    """A published packet: its time and its envelope."""
+
+    time_ns: int
+    envelope: str
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """Something that a process sent.
+
+    Attributes:
+        message: name of the request or message.
+        key: the parameter, the action, the problem … within a message.
+        value: compared.
+        text: for people.
+        packet: the packet that is handled, or that came last; None: none has come.
+        time_ns: experiment time.
+        life: number of the process's life, from 1.
+        reaches: the microscope, or control of it, changes with it.
+    """
+
+    message: str
+    key: str
+    value: str | bytes
+    text: str
+    packet: PacketName | None
+    time_ns: int
+    life: int
+    reaches: bool = False
+
+    @property
+    def name(self) -> tuple[str, str]:
+        return (self.message, self.key)
+
+    @property
+    def is_as(self) -> tuple[object, ...]:
+        """Everything but the time: equal for equal outputs at one place of the record."""
+        return (self.message, self.key, self.value, self.packet, self.life)
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """An output that only one side has, or that differs.
+
+    Attributes:
+        component: which sent it.
+        recorded, now: None: this side lacks it.
+        counterfactual: it comes after the first difference that reaches the microscope.
+    """
+
+    component: str
+    recorded: Output | None
+    now: Output | None
+    counterfactual: bool = False
+
+    @property
+    def at_ns(self) -> int:
+        """The time of the packet at which the sides part."""
+        return min(one.packet.time_ns if one.packet else one.time_ns for one in self._sides)
+
+    @property
+    def packet(self) -> PacketName | None:
+        """The earlier of the packets that the two sides answer."""
+        return min((one.packet for one in self._sides if one.packet), default=None)
+
+    @property
+    def reaches(self) -> bool:
+        return any(one.reaches for one in self._sides)
+
+    @property
+    def kind(self) -> str:
+        """One of "added", "removed", "changed"."""
+        return "changed" if self.recorded and self.now else "removed" if self.recorded else "added"
+
+    @property
+    def _sides(self) -> list[Output]:
+        return [one for one in (self.recorded, self.now) if one is not None]
+
+
+def first_difference(component: str, recorded: Sequence[Output], now: Sequence[Output]) -> Difference | None:
+    """Return the first place where two sequences of outputs part; None if they are equal."""
+    for before, after in zip(recorded, now, strict=False):
+        if before.is_as != after.is_as:
+            # one side may just lack an output: then the other is about a later packet
+            if before.name == after.name and before.packet == after.packet:
+                return Difference(component, before, after)
+            if _order(before) <= _order(after):
+                return Difference(component, before, None)
+            return Difference(component, None, after)
+    if len(recorded) > len(now):
+        return Difference(component, recorded[len(now)], None)
+    return Difference(component, None, now[len(recorded)]) if len(now) > len(recorded) else None
+
+
+def aligned(component: str, recorded: Sequence[Output], now: Sequence[Output]) -> tuple[int, list[Difference]]:
+    """Return the number of equal outputs, and all differences in the order of their times."""
+    here, there = _by_place(recorded), _by_place(now)
+    same, differences = 0, list[Difference]()
+    left: dict[tuple[str, str], tuple[list[Output], list[Output]]] = {}
+    for place in {**here, **there}:
+        before, after = here.get(place, []), there.get(place, [])
+        pairs = min(len(before), len(after))
+        for one, other in zip(before[:pairs], after[:pairs], strict=True):
+            if one.value == other.value:
+                same += 1
+            else:
+                differences.append(Difference(component, one, other))
+        alone = left.setdefault(place[0], ([], []))
+        alone[0].extend(before[pairs:])
+        alone[1].extend(after[pairs:])
+    # an output that comes at another packet is one difference, not two
+    for before, after in left.values():
+        differences += [Difference(component, *sides) for sides in zip_longest(before, after)]
+    return same, sorted(differences, key=lambda one: one.at_ns)
+
+
+def _by_place(outputs: Iterable[Output]) -> dict[tuple[tuple[str, str], int, PacketName | None], list[Output]]:
+    found: dict[tuple[tuple[str, str], int, PacketName | None], list[Output]] = {}
+    for one in outputs:
+        found.setdefault((one.name, one.life, one.packet), []).append(one)
+    return found
+
+
+def _order(one: Output) -> tuple[int, int]:
+    return (one.life, one.packet.time_ns if one.packet else 0)

@@ -1,0 +1,144 @@
+"""A simulated night once more with a change, to its end, and both nights by their outcomes."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TextIO
+
+from afspm.basics.clock import NS_PER_S, utc_time
+from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.basics.formatting import duration_text
+from afspm.experiment.toml_writer import dumps
+from afspm.plugins.what_if.what_if import changed_experiment
+from afspm.record.report import story
+from afspm.record.report.story import RunStory
+from afspm.record.run import Run, open_run
+from afspm.record.run_json import ENDED, run_json_or_empty
+from afspm.supervisor.run import RunOptions
+from afspm.supervisor.run import run as run_experiment
+
+_TRUTH = "truth.jsonl"
+_DAMAGE = ("pulse", "crash")
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """Two nights beside each other.
+
+    Attributes:
+        folder: of the new run.
+        rows: by heading, the text for the recorded and for the new night.
+    """
+
+    folder: Path
+    rows: Mapping[str, tuple[str, str]]
+
+    @property
+    def differs(self) -> bool:
+        return any(before != now for before, now in self.rows.values())
+
+
+def rerun(
+    run: str | Path,
+    changes: Mapping[str, Mapping[str, Any]] | str | Path,
+    *,
+    runs: Path = Path("runs"),
+    terminal: TextIO | None = None,
+) -> Outcomes:
+    """Run a simulated night again with a change and the same seeds, and compare the outcomes.
+
+    Args:
+        changes: settings by the name of a component, or an experiment file that is laid over the run's.
+        runs: the folder for the new run.
+
+    Raises:
+        InvalidValue: the run was not simulated, has not ended, or a change is not a table of settings.
+        ConfigError: the changed experiment has errors.
+    """
+    with open_run(run) as record, TemporaryDirectory(prefix="afspm-what-if-") as made:
+        facts = run_json_or_empty(record.folder)
+        _require_simulated(record, facts)
+        overlay = Path(made) / "changed.toml"
+        overlay.write_text(_overlay(changes, facts), encoding="utf-8")
+        experiment = changed_experiment(record.folder, *_files(changes), overlay)
+        speed = facts.get("clock", {}).get("speed")
+        ended = run_experiment(experiment, RunOptions(runs=runs, speed=speed, report=False), terminal)
+        with open_run(ended.folder) as again:
+            return Outcomes(ended.folder, _rows(record, again))
+
+
+def _require_simulated(record: Run, facts: Mapping[str, Any]) -> None:
+    if not record.simulated:
+        raise InvalidValue(
+            "only a simulated night can be run again", where=str(record.folder), hint="without --closed it is replayed"
+        )
+    if ENDED not in facts:
+        raise InvalidValue("the run has not ended", where=str(record.folder), hint="compare it once it has")
+
+
+def _files(changes: Mapping[str, Mapping[str, Any]] | str | Path) -> list[Path]:
+    return [] if isinstance(changes, Mapping) else [Path(changes)]
+
+
+def _overlay(changes: Mapping[str, Mapping[str, Any]] | str | Path, facts: Mapping[str, Any]) -> str:
+    # the new night begins at the experiment time of the recorded one
+    start_s = facts.get("clock", {}).get("start_s")
+    start: dict[str, Any] = {}
+    if start_s is not None:
+        begun: datetime = utc_time(round(start_s * NS_PER_S))
+        start = {"clock": {"start": begun}}
+    tables = dict(changes) if isinstance(changes, Mapping) else {}
+    for name, table in tables.items():
+        if not isinstance(table, Mapping):
+            raise InvalidValue(f"[{name}] of a night that is run again must be settings, not {table!r}")
+    try:
+        return dumps({**start, **tables})
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"the changes can't be written as TOML: {error}") from error
+
+
+def _rows(before: Run, now: Run) -> dict[str, tuple[str, str]]:
+    sides = [(story.read(one), one, _truth(one.folder)) for one in (before, now)]
+    texts = {head: tuple(text(*side) for side in sides) for head, text in _OUTCOMES.items()}
+    return {head: (both[0], both[1]) for head, both in texts.items()}
+
+
+def _truth(folder: Path) -> list[dict[str, Any]]:
+    lines: dict[int, dict[str, Any]] = {}  # after a kill of the microscope the last line may come twice
+    with suppress(OSError):
+        for text in (folder / _TRUTH).read_text(encoding="utf-8").splitlines():
+            with suppress(ValueError):
+                line = json.loads(text)
+                lines[line["n"]] = line
+    return list(lines.values())
+
+
+def _usable(_: RunStory, run: Run, truth: list[dict[str, Any]]) -> str:
+    # by the truth, not by the verdicts of the night: those may be what was changed
+    scans = [line.get("scan", {}).get("tips") for line in truth if line.get("event") == "scan"]
+    known = [tips for tips in scans if tips]
+    return f"{sum(not any(tip['flaws'] for tip in tips) for tips in known)} of {len(known)}" if known else "unknown"
+
+
+def _damage(_: RunStory, run: Run, truth: list[dict[str, Any]]) -> str:
+    counts = Counter(line["event"] for line in truth if line.get("event") in _DAMAGE)
+    return ", ".join(f"{count} × {name}" for name, count in sorted(counts.items())) or "none"
+
+
+_OUTCOMES: Mapping[str, Callable[[RunStory, Run, list[dict[str, Any]]], str]] = {
+    "lasted": lambda story, run, truth: duration_text(story.lasted_ns / NS_PER_S),
+    "whole scans": lambda story, run, truth: str(len(story.scans) - story.interrupted),
+    "interrupted scans": lambda story, run, truth: str(story.interrupted),
+    "scans with a sharp tip": _usable,
+    "spectra": lambda story, run, truth: str(story.spectra),
+    "problems": lambda story, run, truth: str(len(story.problems)),
+    "treatments of the tip": _damage,
+    "refusals": lambda story, run, truth: str(sum(one.count for one in story.refusals)),
+}

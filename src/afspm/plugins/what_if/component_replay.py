@@ -1,0 +1,224 @@
+"""A component in its recorded lives, once more: its own code, in this process, without waiting."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.launch import Launch
+from afspm.model import ProblemNames
+from afspm.plugins.what_if.alignment import Difference, Output, aligned, first_difference
+from afspm.plugins.what_if.hazards import Guard
+from afspm.plugins.what_if.outputs import OutputReader
+from afspm.plugins.what_if.port_replay import Life, LifeOver, PacketOf, ReplayPort, recorded_outputs
+from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE
+from afspm.transport.process.context import ExperimentProcess, ProcessActivity, ProcessContext
+from afspm.transport.process.loading import load
+from afspm.wire.message_types import register_all
+
+Make = Callable[[Launch], ExperimentProcess]
+"""Makes the component of a launch line."""
+
+
+@dataclass
+class ComponentReplay:
+    """The result of a replay of one component.
+
+    Attributes:
+        name: of the component.
+        recorded, now: outputs then and now.
+        same: number of equal outputs.
+        differences: all others, in the order of time.
+        first: the place where the two part.
+        acts: it commands the microscope, or asks for control.
+        hazards: dependencies beyond its inputs, in words.
+        stopped: why the replay ended before the record; empty: it did not.
+        real_s: real time of the replay.
+        recorded_s: experiment time of the record.
+    """
+
+    name: str
+    recorded: list[Output]
+    now: list[Output]
+    hazards: list[str] = field(default_factory=list)
+    stopped: str = ""
+    real_s: float = 0.0
+    recorded_s: float = 0.0
+    same: int = 0
+    differences: list[Difference] = field(default_factory=list)
+    first: Difference | None = None
+
+    def __post_init__(self) -> None:
+        self.first = first_difference(self.name, self.recorded, self.now)
+        if self.first is None:
+            self.same = len(self.recorded)
+        else:
+            self.same, self.differences = aligned(self.name, self.recorded, self.now)
+
+    @property
+    def acts(self) -> bool:
+        flags = ("ADD_EXP_PRBLM", "RMV_EXP_PRBLM")
+        return any(one.reaches and one.message not in flags for one in (*self.recorded, *self.now))
+
+
+def replay(
+    lives: Sequence[Life],
+    packet_of: PacketOf,
+    run_dir: Path,
+    *,
+    make: Make = load,
+    settings: Mapping[str, Any] | None = None,
+    watch: bool = False,
+) -> ComponentReplay:
+    """Replay all lives of a component, and compare its outputs with the recorded ones.
+
+    Args:
+        packet_of: returns a recorded packet whose values are in the record.
+        run_dir: folder of the run.
+        make: makes the component; by default of the class in the launch line.
+        settings: replace those of the launch line.
+        watch: look for clocks and random numbers, too. It halves the speed.
+
+    Raises:
+        ConfigError: the component can't be made.
+        FileError: the record lacks a packet.
+    """
+    result: list[ComponentReplay] = []
+    errors: list[BaseException] = []
+
+    def work() -> None:
+        try:
+            result.append(_replay(lives, packet_of, run_dir, make, settings, watch=watch))
+        except BaseException as error:  # of any kind: it is raised again in the thread of the caller
+            errors.append(error)
+
+    # not the main thread: there every wait of a component would install handlers of signals
+    thread = threading.Thread(target=work, name="what-if", daemon=True)
+    thread.start()
+    thread.join()
+    if errors:
+        raise errors[0]
+    return result[0]
+
+
+def _replay(
+    lives: Sequence[Life],
+    packet_of: PacketOf,
+    run_dir: Path,
+    make: Make,
+    settings: Mapping[str, Any] | None,
+    *,
+    watch: bool,
+) -> ComponentReplay:
+    name = lives[0].facts["launch"]["name"]
+    recorded, now, stopped = list[Output](), list[Output](), ""
+    began_s = time.perf_counter()
+    with TemporaryDirectory(prefix="afspm-what-if-") as folder:
+        guard = Guard(Path(folder), (run_dir,))
+        home = _Home(Path(folder), run_dir, name)
+        for number, life in enumerate(lives, 1):
+            launch = _launch(life, home.folder, settings)
+            outputs = OutputReader(ProblemNames(launch.problems), number)
+            recorded += recorded_outputs(life, outputs)
+            home.begin(life, is_own=_parted(recorded, now))
+            with guard.active(), guard.watching() if watch else nullcontext():
+                port = ReplayPort(life, outputs, packet_of)
+                _run(launch, port, life, make, outputs)
+            now += port.outputs
+            if port.unanswered:
+                stopped = f"the record has no answer to: {port.unanswered}"
+                break
+    return ComponentReplay(
+        name, recorded, now, list(guard.seen), stopped, time.perf_counter() - began_s, _length_s(lives)
+    )
+
+
+def _parted(recorded: Sequence[Output], now: Sequence[Output]) -> bool:
+    # of the lives so far; the recorded outputs of the next one are among the first, but not among the second
+    return first_difference("", recorded[: len(now)], now) is not None
+
+
+def _length_s(lives: Sequence[Life]) -> float:
+    last = lives[-1].lines[-1:] or lives[-1:]
+    end_ns = getattr(last[0], "now_ns", lives[-1].facts["now_ns"])
+    return float(max(0.0, (end_ns - lives[0].facts["now_ns"]) / 1e9))
+
+
+def _launch(life: Life, folder: Path, settings: Mapping[str, Any] | None) -> Launch:
+    launch = Launch.from_json(json.dumps(life.facts["launch"]))
+    return replace(
+        launch,
+        settings=launch.settings if settings is None else dict(settings),
+        run_dir=str(folder),
+        state_dir=str(folder / "state"),
+        keeps_requests=False,
+    )
+
+
+def _run(launch: Launch, port: ReplayPort, life: Life, make: Make, outputs: OutputReader) -> None:
+    log = logging.getLogger(f"afspm.what_if.{launch.name}")
+    log.propagate, log.disabled = False, True
+    register_all(launch.messages)
+    component = make(launch)
+    port.handled = lambda: getattr(component, "packet", None)
+    context = ProcessContext(
+        launch,
+        port.clock,
+        open_port=lambda heard=None: port,
+        log=log,
+        activity=ProcessActivity(ExperimentClock.real()),  # its readings were not recorded, either
+        session=life.facts["session"],
+    )
+    ended: int | str | None
+    try:
+        ended = int(component.run_process(context))
+    except LifeOver:
+        ended = None
+    except Exception as error:  # the component's code may raise anything; the record has the type only
+        ended = type(error).__name__
+    if ended is not None and (life.end is not None or not port.is_over):
+        port.outputs.append(outputs.end(ended, port.place(), port.clock.shown_ns))
+
+
+class _Home:
+    """The folders of a replayed component: what it has saved, as far as the record knows."""
+
+    def __init__(self, folder: Path, run_dir: Path, name: str) -> None:
+        self.folder = folder / "run"
+        self._state = self.folder / "state"
+        self._state.mkdir(parents=True)
+        self._name = name
+        self._results = run_dir / "state" / f"{name}.results"
+        for file in (EXPERIMENT_FILE, RUN_FILE):
+            if (run_dir / file).is_file():
+                shutil.copy(run_dir / file, self.folder)
+
+    def begin(self, life: Life, *, is_own: bool) -> None:
+        """Restore what was saved at the start of a life; `is_own`: the replay goes on with what it has saved itself."""
+        if is_own:
+            return
+        for kept, file in (("memory", f"{self._name}.json"), ("measurements", f"{self._name}.scope.json")):
+            text, path = life.facts[kept], self._state / file
+            if text is None:
+                path.unlink(missing_ok=True)
+            else:
+                path.write_text(text, encoding="utf-8")
+        there = self._state / f"{self._name}.results"
+        wanted = set(life.facts["results"])
+        for path in there.glob("*"):
+            if path.name not in wanted:
+                path.unlink()
+        for missing in wanted - {path.name for path in there.glob("*")}:
+            if (self._results / missing).is_file():
+                there.mkdir(exist_ok=True)
+                shutil.copy(self._results / missing, there)

@@ -1,0 +1,58 @@
+"""Replays under two seeds of Python's hashes: they differ if a component depends on the order of a set."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+from afspm.client import port_log
+from afspm.plugins.what_if import component_replay
+from afspm.plugins.what_if.port_replay import read_lives
+from afspm.plugins.what_if.recorded_packets import recorded_packets
+from afspm.record.run import open_run
+
+_SEEDS = ("1", "2")
+_WITHIN_S = 600.0
+_log = logging.getLogger("afspm.what_if")
+
+
+def hazards(run: Path, name: str) -> list[str]:
+    """Return the hazard in words if the outputs of an unchanged component depend on the hash seed."""
+    command = [sys.executable, "-c", f"from {__name__} import main; main()", str(run), name]
+    path = os.pathsep.join([os.getcwd(), *filter(None, sys.path)])  # noqa: PTH109 - "" in sys.path means this folder
+    lines = []
+    for seed in _SEEDS:
+        done = subprocess.run(
+            command,
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            timeout=_WITHIN_S,
+            check=False,
+        )
+        if done.returncode:
+            why = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+            _log.warning(
+                "%s could not be replayed in a process of its own, to look for an order of sets: %s", name, why
+            )
+            return []
+        lines.append(done.stdout.splitlines())
+    if lines[0] == lines[1]:
+        return []
+    at = next((n for n, (one, other) in enumerate(zip(*lines, strict=False)) if one != other), min(map(len, lines)))
+    return [f"depends on the order of a set: two hash seeds give other outputs, first its output {at + 1}"]
+
+
+def main() -> None:
+    """Print a line for each output of a component of a run."""
+    run, name = sys.argv[1:]
+    with open_run(run) as record:
+        lives = read_lives(port_log.log_path(record.folder, name))
+        made = component_replay.replay(lives, recorded_packets(record), record.folder)
+    for one in made.now:
+        value = one.value if isinstance(one.value, bytes) else one.value.encode()
+        sys.stdout.write(f"{one.message} {one.key} {zlib.crc32(value)} {one.packet} {one.life}\n")

@@ -1,0 +1,412 @@
+"""The recorded lives of a component, and the port and clock that offer them again."""
+
+from __future__ import annotations
+
+from base64 import b64decode
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.basics.errors import FileError, WireError
+from afspm.model import CLOCK_REQUEST, LEASE_REQUEST, RELAY_REQUEST, ControlRequest, ControlResponse, Packet, Response
+from afspm.plugins.what_if.alignment import Output, PacketName
+from afspm.plugins.what_if.outputs import OutputReader
+from afspm.storage.line_log import read_lines
+from afspm.transport.port import (
+    CaughtUp,
+    ControlConnected,
+    ControlDisconnected,
+    Incoming,
+    Killed,
+    PacketReceived,
+    ParentGone,
+    ReplyReceived,
+)
+
+PacketOf = Callable[[int, str], Packet]
+"""Returns the recorded packet of a time and an envelope."""
+
+_SIGNALS = {one.__name__: one for one in (Killed, ParentGone, ControlConnected, ControlDisconnected)}
+_ANSWERABLE = {
+    ControlRequest.REQUEST_CTRL, ControlRequest.RELEASE_CTRL, ControlRequest.ADD_EXP_PRBLM,
+    ControlRequest.RMV_EXP_PRBLM, ControlRequest.ACTION_SUPPORT, CLOCK_REQUEST, RELAY_REQUEST, LEASE_REQUEST,
+}  # fmt: skip
+_DONE = "answered"
+_MOST_POLLS = 100_000  # without any progress
+
+
+class LifeOver(BaseException):
+    """Raised in the component where its recorded life ends; no handler of errors should catch it."""
+
+
+@dataclass(slots=True)
+class Poll:
+    """A return of `poll`, with the events as they were written."""
+
+    timeout_s: float | None
+    monotonic_s: float
+    now_ns: int
+    events: list[Any]
+    readings: list[Any]
+
+
+@dataclass(slots=True)
+class Sent:
+    """A request, or a message published by the component itself.
+
+    Attributes:
+        frames: of the request; for a message [envelope, payload].
+    """
+
+    frames: tuple[bytes, ...]
+    handled: PacketName | None
+    readings: list[Any]
+    is_request: bool = True
+
+
+Line = Poll | Sent
+
+
+@dataclass
+class Life:
+    """One recorded life of a process.
+
+    Attributes:
+        facts: of the line "life".
+        end: the exit code, or the type of the error; None: it was killed.
+    """
+
+    facts: dict[str, Any]
+    lines: list[Line] = field(default_factory=list)
+    end: int | str | None = None
+
+
+def read_lives(path: Path) -> list[Life]:
+    """Return the recorded lives in a port log.
+
+    Raises:
+        FileError: the file can't be read, or is not a port log.
+    """
+    lives: list[Life] = []
+    try:
+        for kind, *rest in read_lines(path):
+            if kind == "life":
+                lives.append(Life(rest[0]))
+            elif kind == "poll":
+                lives[-1].lines.append(Poll(*rest))
+            elif kind == "send":
+                frames, handled, readings = rest
+                lives[-1].lines.append(Sent(tuple(map(b64decode, frames)), _name(handled), readings))
+            elif kind == "publish":
+                envelope, payload, handled, readings = rest
+                frames = (envelope.encode(), b64decode(payload))
+                lives[-1].lines.append(Sent(frames, _name(handled), readings, is_request=False))
+            elif kind == "end":
+                lives[-1].end = rest[0]
+    except (IndexError, TypeError, ValueError) as error:
+        raise FileError(f"is not a port log: {error}", where=str(path)) from error
+    return lives
+
+
+def _name(handled: Sequence[Any] | None) -> PacketName | None:
+    return None if handled is None else PacketName(handled[0] or 0, handled[1])
+
+
+class ReplayClock:
+    """Shows the recorded readings, in their order; without one, the time of the last recorded event."""
+
+    def __init__(self, monotonic_s: float, now_ns: int, speed: float) -> None:
+        self._speed = speed or 1.0
+        self._shown: dict[str, Any] = {"m": monotonic_s, "n": now_ns, "s": now_ns / 1e9}
+        self._coming: dict[str, deque[Any]] = defaultdict(deque)
+
+    def monotonic_s(self) -> float:
+        return float(self._read("m"))
+
+    def now_ns(self) -> int:
+        return int(self._read("n"))
+
+    def now_s(self) -> float:
+        return float(self._read("s"))
+
+    def real_s(self, experiment_s: float) -> float:
+        coming = self._coming["r"]
+        return float(coming.popleft()) if coming else experiment_s / self._speed
+
+    def late(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    @property
+    def shown_s(self) -> float:
+        """The monotonic time shown last."""
+        return float(self._shown["m"])
+
+    @property
+    def shown_ns(self) -> int:
+        """The experiment time shown last."""
+        return int(self._shown["n"])
+
+    def expect(self, readings: Sequence[Any]) -> None:
+        """Take the readings up to the next recorded line; those left from before are dropped."""
+        self._coming.clear()
+        for kind, value in zip(readings[::2], readings[1::2], strict=True):
+            self._coming[kind].append(value)
+
+    def move(self, monotonic_s: float, now_ns: int) -> None:
+        """Go on to the time of an event; a clock never goes back."""
+        self._shown["m"] = max(self._shown["m"], monotonic_s)
+        if now_ns > self._shown["n"]:
+            self._shown["n"], self._shown["s"] = now_ns, now_ns / 1e9
+
+    def pass_by(self, seconds: float) -> None:
+        """Let real time pass in which nothing happens."""
+        self.move(self._shown["m"] + seconds, self._shown["n"] + round(seconds * self._speed * 1e9))
+
+    def _read(self, kind: str) -> Any:
+        if coming := self._coming[kind]:
+            self._shown[kind] = coming.popleft()
+        return self._shown[kind]
+
+
+class ReplayPort:
+    """Offers a recorded life to a component. See `afspm.transport.port.Port`.
+
+    While the component sends what it sent then, every event comes as it came. After the first difference, a request is
+    answered at once: as the n-th request of its content was, or with a success, if the record has none. A command to
+    the microscope can't be answered without it: there the replay of an acting component ends.
+
+    Attributes:
+        outputs: everything that the component has sent.
+        differs: it has sent something else than in the recorded life.
+        unanswered: the command that ended the replay; empty: none.
+        handled: returns the packet in whose handler the component is.
+    """
+
+    def __init__(self, life: Life, outputs: OutputReader, packet_of: PacketOf) -> None:
+        facts = life.facts
+        self._life = life
+        self._reader = outputs
+        self._packet_of = packet_of
+        self._clock = ReplayClock(facts["monotonic_s"], facts["now_ns"], facts["speed"])
+        self._at = 0
+        self._newest: PacketName | None = None
+        self._pending: list[Incoming] = []
+        self._sent: set[str] = set()
+        self._asked: Counter[bytes] = Counter()
+        self._answers = _answers(life)
+        self._ids: dict[str, str] = {}
+        self._polls = 0
+        self.outputs: list[Output] = []
+        self.differs = False
+        self.unanswered = ""
+        self.handled: Callable[[], Packet | None] = lambda: None
+        self._expect_readings()
+
+    @property
+    def clock(self) -> ReplayClock:
+        return self._clock
+
+    @property
+    def is_over(self) -> bool:
+        """True once the component has got and sent everything that is recorded."""
+        return self._at >= len(self._life.lines) and not self._pending
+
+    def wake_up(self, incoming: Incoming | None = None) -> None:
+        if incoming is not None:
+            self._pending.append(incoming)
+
+    def wakeup_fileno(self) -> int:
+        return -1
+
+    def close(self) -> None:
+        """There is nothing to close."""
+
+    # --- what the component sends ---
+
+    def send(self, frames: Sequence[bytes]) -> None:
+        self._end_if_killed()
+        there = tuple(map(bytes, frames))
+        output = self._reader.request(there, self.place(), self._clock.shown_ns)
+        request_id = wire.id_of(frames)
+        if output is not None and (not request_id or request_id not in self._sent):
+            self.outputs.append(output)
+        self._sent.add(request_id)
+        content = b"\0".join(there[:2])
+        self._asked[content] += 1
+        if self._follows(there, is_request=True):
+            return
+        self._answer(frames, content, request_id)
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        self._end_if_killed()
+        self.outputs.append(self._reader.message(envelope, bytes(payload), self.place(), self._clock.shown_ns))
+        self._follows((envelope.encode(), bytes(payload)), is_request=False)
+
+    def _follows(self, frames: tuple[bytes, ...], *, is_request: bool) -> bool:
+        line = self._line()
+        if not self.differs and isinstance(line, Sent) and (line.frames, line.is_request) == (frames, is_request):
+            self._advance()
+            return True
+        self.differs = True
+        return False
+
+    def _answer(self, frames: Sequence[bytes], content: bytes, request_id: str) -> None:
+        recorded = self._answers.get(content, [])
+        number = self._asked[content] - 1
+        if number < len(recorded):
+            recorded_id, response = recorded[number]
+            self._ids[recorded_id] = _DONE  # its recorded answer may still come
+            response = Response(response.code, response.payload, response.reason, request_id, response.detail)
+        else:
+            response = self._made_up(frames, request_id)
+        self._pending.append(ReplyReceived(response))
+
+    def _made_up(self, frames: Sequence[bytes], request_id: str) -> Response:
+        try:
+            request = wire.decode_request(frames)
+        except WireError as error:
+            return Response(int(error.response), reason=str(error), id=request_id)
+        if request.kind == ControlRequest.PARAM and request.subject.value is None:
+            return self._last_value(request.subject.name, request_id)
+        if request.kind not in _ANSWERABLE:
+            self.unanswered = self.outputs[-1].text
+            raise LifeOver
+        return Response(int(ControlResponse.SUCCESS), b"", "", request_id)
+
+    def _last_value(self, name: str, request_id: str) -> Response:
+        for answers in self._answers.values():
+            for _, response in reversed(answers):
+                if response.ok and response.payload and _parameter_name(response.payload) == name:
+                    return Response(response.code, response.payload, "", request_id)
+        reason = f"the value of {name} is not in the record"
+        return Response(int(ControlResponse.FAILURE), b"", reason, request_id)
+
+    def place(self) -> PacketName | None:
+        """Return the packet that the component handles, or that came last."""
+        packet = self.handled()
+        return self._newest if packet is None else PacketName(packet.time_ns or 0, packet.envelope)
+
+    # --- what the component gets ---
+
+    def poll(self, timeout_s: float | None) -> list[Incoming]:
+        if self._pending:
+            pending, self._pending = self._pending, []
+            return pending
+        self._skip_sent()
+        self._end_if_over()
+        self._polls += 1
+        if self._polls > _MOST_POLLS:
+            self.unanswered = "it polls without end, and no time passes"
+            raise LifeOver
+        until_s = None if timeout_s is None else self._clock.shown_s + timeout_s
+        while isinstance(line := self._line(), Poll):
+            is_due = until_s is None or line.monotonic_s <= until_s
+            if line.timeout_s != timeout_s and not is_due:
+                break
+            self._polls = 0
+            self._clock.move(line.monotonic_s, line.now_ns)
+            self._advance()
+            if line.events or line.timeout_s == timeout_s:
+                return self._incoming(line.events)
+            self._skip_sent()
+        self._end_if_over()
+        self._clock.pass_by(timeout_s or 0.0)
+        return []
+
+    def _skip_sent(self) -> None:
+        while isinstance(self._line(), Sent):
+            self.differs = True
+            self._advance()
+
+    def _incoming(self, written: Sequence[Any]) -> list[Incoming]:
+        came: list[Incoming] = []
+        for kind, *rest in written:
+            if kind == "packet":
+                envelope, time_ns, source, payload = rest
+                came.append(PacketReceived(self._packet(envelope, time_ns, payload), source))
+                self._newest = PacketName(time_ns or 0, envelope)
+            elif kind == "reply":
+                response = wire.decode_response([*map(b64decode, rest)])
+                response.id = self._ids.get(response.id, response.id)
+                came.append(ReplyReceived(response))
+            else:
+                came.append(CaughtUp(rest[0]) if kind == "caught up" else _SIGNALS[kind]())
+        return came
+
+    def _packet(self, envelope: str, time_ns: int | None, payload: str | None) -> Packet:
+        if payload is not None:
+            return Packet(envelope, b64decode(payload), time_ns)
+        return self._packet_of(time_ns or 0, envelope)
+
+    # --- the recorded lines ---
+
+    def _line(self) -> Line | None:
+        return self._life.lines[self._at] if self._at < len(self._life.lines) else None
+
+    def _advance(self) -> None:
+        self._at += 1
+        self._expect_readings()
+
+    def _expect_readings(self) -> None:
+        line = self._line()
+        self._clock.expect([] if line is None else line.readings)
+
+    def _end_if_over(self) -> None:
+        if self.is_over:
+            raise LifeOver
+
+    def _end_if_killed(self) -> None:
+        # what a killed process would have sent next is not known; one that ended by itself sent nothing more
+        if self._life.end is None:
+            self._end_if_over()
+
+
+def recorded_outputs(life: Life, outputs: OutputReader) -> Iterator[Output]:
+    """Yield everything that a component sent in a recorded life, repetitions of a request left out."""
+    sent: set[str] = set()
+    newest: PacketName | None = None
+    now_ns = life.facts["now_ns"]
+    for line in life.lines:
+        if isinstance(line, Poll):
+            now_ns = line.now_ns
+            for kind, *rest in line.events:
+                if kind == "packet":
+                    newest = PacketName(rest[1] or 0, rest[0])
+            continue
+        place = line.handled or newest
+        if not line.is_request:
+            yield outputs.message(line.frames[0].decode(), line.frames[1], place, now_ns)
+            continue
+        request_id = wire.id_of(line.frames)
+        output = outputs.request(line.frames, place, now_ns)
+        if output is not None and (not request_id or request_id not in sent):
+            yield output
+        sent.add(request_id)
+    if life.end is not None:
+        yield outputs.end(life.end, newest, now_ns)
+
+
+def _answers(life: Life) -> dict[bytes, list[tuple[str, Response]]]:
+    # the answers to all requests of one content, in the order in which these were sent
+    answered: dict[str, Response] = {}
+    for line in life.lines:
+        for kind, *rest in line.events if isinstance(line, Poll) else ():
+            if kind == "reply":
+                response = wire.decode_response([*map(b64decode, rest)])
+                answered.setdefault(response.id, response)
+    found: dict[bytes, list[tuple[str, Response]]] = defaultdict(list)
+    for line in life.lines:
+        if isinstance(line, Sent) and line.is_request and (request_id := wire.id_of(line.frames)) in answered:
+            found[b"\0".join(line.frames[:2])].append((request_id, answered[request_id]))
+    return found
+
+
+def _parameter_name(payload: bytes) -> str | None:
+    try:
+        return wire.decode_parameter(payload).name
+    except WireError:  # the answer to a request of another kind
+        return None

@@ -1,0 +1,218 @@
+"""The decisions of a recorded scheduler, once more: the same inputs through the pure core, step by step."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError, FileError, WireError
+from afspm.basics.launch import Launch
+from afspm.model.snapshot import restored
+from afspm.plugins.what_if.alignment import Difference, Output, PacketName, aligned
+from afspm.scheduler import events
+from afspm.scheduler.coordinate_frame import TIP_FRAME
+from afspm.scheduler.saved_state import KIND, VERSION, SavedState
+from afspm.scheduler.scheduler import Scheduler
+from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.step_log import Restored, StateSums, Step, facts_of, read_cached, read_event
+from afspm.scheduler.wire_codec import WireCodec
+from afspm.storage.line_log import read_lines
+from afspm.transport.process.context import ProcessActivity, ProcessContext
+from afspm.transport.process.loading import load
+
+MakeCore = Callable[[], SchedulerCore]
+_REACHING = ("Forward", "Kill")
+
+
+@dataclass
+class SchedulerReplay:
+    """The result of a replay of a scheduler.
+
+    Attributes:
+        steps: number of steps compared.
+        same: number of equal effects.
+        differences: all others, in the order of the steps.
+        first: the first of them.
+        first_step: the step, counted from 1, since which states or effects differ.
+        stopped: why the replay ended before the record; empty: it did not.
+    """
+
+    steps: int
+    same: int
+    differences: list[Difference]
+    first: Difference | None
+    first_step: int | None = None
+    stopped: str = ""
+    real_s: float = 0.0
+    recorded_s: float = 0.0
+
+
+def read_steps(path: Path) -> Iterator[tuple[Launch, Restored] | Step]:
+    """Yield the beginnings of a scheduler's lives, and their steps.
+
+    Raises:
+        FileError: the file can't be read, or is not a step log.
+    """
+    try:
+        for kind, *rest in read_lines(path):
+            if kind == "life":
+                launch, saved, cached = rest
+                state = None if saved is None else restored(SavedState, saved, KIND, VERSION)
+                yield Launch.from_json(json.dumps(launch)), Restored(state, read_cached(cached))
+            elif kind == "step":
+                event, *more = rest
+                yield Step(_event(event), *more)
+    except (IndexError, TypeError, ValueError, WireError) as error:
+        raise FileError(f"is not a step log: {error}", where=str(path)) from error
+
+
+def _event(plain: list[Any] | None) -> events.Input | None:
+    try:
+        return read_event(plain)
+    except KeyError:
+        return events.FrameReported(plain)
+
+
+def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> SchedulerReplay:
+    """Replay the scheduler of a run.
+
+    Args:
+        settings: replace those of the launch line.
+
+    Raises:
+        FileError: the file can't be read, or is not a step log.
+        ConfigError: the settings can't be used.
+    """
+    core: MakeCore = _no_core
+
+    def lives() -> Iterator[tuple[MakeCore, Restored] | Step]:
+        nonlocal core
+        for one in read_steps(path):
+            if isinstance(one, Step):
+                yield one
+            else:
+                launch, beginning = one
+                core = _core_of(launch, settings)
+                yield core, beginning
+
+    return replay(lives())
+
+
+def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerReplay:
+    """Step new cores with recorded inputs, and compare the effects.
+
+    Args:
+        recorded: the beginning of each life, with a function that makes its core, followed by its steps.
+    """
+    before, now = list[Output](), list[Output]()
+    core: SchedulerCore | None = None
+    steps, life, stopped = 0, 0, ""
+    parted: int | None = None  # step since which the states differ
+    first: Difference | None = None
+    sums = StateSums()
+    began_s, times = time.perf_counter(), list[int]()
+    for one in recorded:
+        if not isinstance(one, Step):
+            make, beginning = one
+            life, core, sums = life + 1, make(), StateSums()
+            if beginning.saved is not None:
+                core.restore(beginning.saved)
+            core.restore_cache(beginning.cached)
+            continue
+        if core is None:
+            continue
+        steps += 1
+        times = [*times[:1], one.now_ns]
+        if isinstance(one.event, events.FrameReported):
+            stopped = "the reports of a coordinate frame are not recorded"
+            break
+        try:
+            made = _stepped(core, one)
+        except Exception as error:  # changed decisions may fail on inputs of another night, and in any way
+            stopped = f"step {steps} fails: {type(error).__name__}: {error}"
+            made = [["error", "", stopped]]
+        effects = json.loads(json.dumps(made))
+        if parted is None and (effects != one.effects or sums.changed(core.state) != one.state):
+            parted = steps
+        place = PacketName(one.now_ns, _input_name(one.event))
+        before += [_output(facts, place, life) for facts in one.effects]
+        now += [_output(facts, place, life) for facts in effects]
+        if first is None and effects != one.effects:
+            first = _first(one.effects, effects, place, life)
+        if stopped:
+            break
+    real_s, recorded_s = time.perf_counter() - began_s, (times[-1] - times[0]) / 1e9 if times else 0.0
+    if first is None:
+        return SchedulerReplay(steps, len(before), [], None, None, stopped, real_s, recorded_s)
+    same, differences = aligned("scheduler", before, now)
+    return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s)
+
+
+def _stepped(core: SchedulerCore, one: Step) -> list[list[Any]]:
+    if one.event is None:
+        return [*map(facts_of, core.start(one.now_s, one.now_ns))]
+    return [*map(facts_of, core.step(one.event, one.now_s, one.now_ns))]
+
+
+def _first(recorded: list[list[Any]], now: list[list[Any]], place: PacketName, life: int) -> Difference:
+    before, after = next((a, b) for a, b in zip_longest(recorded, now) if a != b)
+    if before is not None and after is not None and before[:2] != after[:2]:  # one of them lacks an effect
+        before, after = (before, None) if len(recorded) > len(now) else (None, after)
+    there = None if before is None else _output(before, place, life)
+    here = None if after is None else _output(after, place, life)
+    if before is not None and after is not None and before[0] == "SaveState":
+        parts = ", ".join(name for name, total in before[3].items() if after[3].get(name) != total)
+        here = None if here is None else replace(here, text=f"saves another state: {parts}")
+    return Difference("scheduler", there, here)
+
+
+def _output(facts: list[Any], place: PacketName, life: int) -> Output:
+    kind, key, text, *rest = facts
+    reaches = kind in _REACHING
+    return Output(kind, key, json.dumps([text, *rest]), text, place, place.time_ns, life, reaches)
+
+
+def _input_name(event: events.Input | None) -> str:
+    match event:
+        case None:
+            return "start"
+        case events.PacketIn(packet):
+            return packet.envelope
+        case events.RequestIn(_, name, request):
+            return f"request of {name}: {request.subject}"
+        case _:
+            return type(event).__name__
+
+
+def _no_core() -> SchedulerCore:
+    raise FileError("is not a step log: it begins with a step")
+
+
+def _core_of(launch: Launch, settings: Mapping[str, Any] | None) -> MakeCore:
+    launch = replace(launch, settings=launch.settings if settings is None else dict(settings), keeps_requests=False)
+
+    def make() -> SchedulerCore:
+        scheduler = load(launch)
+        if not isinstance(scheduler, Scheduler):
+            raise ConfigError(f"{launch.class_} is not afspm's scheduler", where=launch.name)
+        clock = ExperimentClock.real()  # the settings do not depend on it
+        context = ProcessContext(launch, clock, _no_port, logging.getLogger("afspm.what_if"), ProcessActivity(clock))
+        if type(scheduler).coordinates is not Scheduler.coordinates:
+            raise ConfigError(
+                f"the decisions of {type(scheduler).__name__} can't be replayed: its frame has a worker",
+                where=launch.name,
+            )
+        return SchedulerCore(scheduler.settings(context), WireCodec(), TIP_FRAME)
+
+    return make
+
+
+def _no_port(*_: object) -> Any:
+    raise AssertionError("the decisions open no port")

@@ -1,0 +1,312 @@
+"""All components and the scheduler of a recorded run, replayed with changes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm.basics.launch import Launch
+from afspm.client import port_log
+from afspm.client.component import Component
+from afspm.experiment import Experiment
+from afspm.experiment.experiment import load_expanded
+from afspm.model import Role
+from afspm.plugins.what_if import component_replay, hash_seeds, scheduler_replay
+from afspm.plugins.what_if.alignment import Difference
+from afspm.plugins.what_if.component_replay import ComponentReplay
+from afspm.plugins.what_if.port_replay import Life, PacketOf, read_lives
+from afspm.plugins.what_if.recorded_packets import recorded_packets
+from afspm.plugins.what_if.scheduler_replay import SchedulerReplay
+from afspm.record.run import open_run
+from afspm.record.run_json import EXPERIMENT_FILE, run_json_or_empty
+from afspm.scheduler import step_log
+from afspm.storage.line_log import REQUESTS_FOLDER, read_lines
+from afspm.supervisor.ports import FreePorts
+from afspm.supervisor.run import HOMES
+from afspm.transport.process.loading import load
+
+Changes = Mapping[str, Mapping[str, Any] | type[Component]] | str | Path | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table: one process.
+
+    Attributes:
+        same, added, removed, changed: numbers of outputs.
+        counterfactual: how many of the differences come after the first that reaches the microscope.
+        note: what limits the result, in words.
+    """
+
+    name: str
+    same: int
+    added: int
+    removed: int
+    changed: int
+    counterfactual: int
+    note: str = ""
+
+
+@dataclass
+class WhatIf:
+    """A recorded run against a change.
+
+    Attributes:
+        run: folder of the run.
+        components: the replays, by name.
+        scheduler: None: it was not replayed.
+        controls: replays of the unchanged component, of those components that differ and were changed.
+        unread: why processes were not replayed, by name.
+    """
+
+    run: Path
+    components: dict[str, ComponentReplay] = field(default_factory=dict)
+    scheduler: SchedulerReplay | None = None
+    scheduler_name: str = "scheduler"
+    controls: dict[str, ComponentReplay] = field(default_factory=dict)
+    unread: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def first(self) -> Difference | None:
+        """The first difference of all processes; None: there is none."""
+        return min(self._firsts, key=lambda one: one.at_ns, default=None)
+
+    @property
+    def counterfactual_from_ns(self) -> int | None:
+        """The time of the first difference that reaches the microscope; None: none does."""
+        return min((one.at_ns for one in self._all if one.reaches), default=None)
+
+    @property
+    def differences(self) -> list[Difference]:
+        """All differences in the order of time; those after the first that reaches the microscope are marked."""
+        since_ns = self.counterfactual_from_ns
+        marked = (
+            replace(one, counterfactual=since_ns is not None and one.at_ns > since_ns)
+            for one in sorted(self._all, key=lambda one: one.at_ns)
+        )
+        return list(marked)
+
+    @property
+    def differs(self) -> bool:
+        return self.first is not None
+
+    @property
+    def hazards(self) -> dict[str, list[str]]:
+        """What components depend on beyond their recorded inputs, by name."""
+        replays = {**self.components, **self.controls}
+        return {name: one.hazards for name, one in replays.items() if one.hazards}
+
+    def table(self) -> list[Row]:
+        """Return a row for each process: counts of equal and of different outputs.
+
+        Differences of a component that acts are not counted after the first that reaches the microscope: its recorded
+        inputs are then those of another night.
+        """
+        acting = {name for name, one in self.components.items() if one.acts}
+        rows = []
+        by_name: dict[str, list[Difference]] = {}
+        for one in self.differences:
+            by_name.setdefault(one.component, []).append(one)
+        sames = {name: one.same for name, one in self.components.items()}
+        if self.scheduler is not None:
+            sames[self.scheduler_name] = self.scheduler.same
+        for name, same in sames.items():
+            found = by_name.get(name, [])
+            counted = [one for one in found if not (one.counterfactual and name in acting)]
+            kinds = [one.kind for one in counted]
+            rows.append(
+                Row(
+                    name, same, kinds.count("added"), kinds.count("removed"), kinds.count("changed"),
+                    sum(one.counterfactual for one in found), self._note(name),
+                )
+            )  # fmt: skip
+        return rows
+
+    def _note(self, name: str) -> str:
+        one: ComponentReplay | SchedulerReplay | None = self.components.get(name)
+        if one is None and name == self.scheduler_name:
+            one = self.scheduler
+        control = self.controls.get(name)
+        notes = [one.stopped] if one is not None and one.stopped else []
+        if control is not None and control.first is not None:
+            notes.append("the unchanged component differs, too")
+        elif control is not None:
+            notes.append("the unchanged component repeats its record")
+        return "; ".join(notes)
+
+    @property
+    def _firsts(self) -> list[Difference]:
+        firsts = [one.first for one in self.components.values()]
+        if self.scheduler is not None:
+            firsts.append(self._named(self.scheduler.first))
+        return [one for one in firsts if one is not None]
+
+    @property
+    def _all(self) -> list[Difference]:
+        found = [one for replayed in self.components.values() for one in replayed.differences]
+        if self.scheduler is not None:
+            found += [one for one in map(self._named, self.scheduler.differences) if one is not None]
+        return found
+
+    def _named(self, one: Difference | None) -> Difference | None:
+        return one and replace(one, component=self.scheduler_name)
+
+
+def what_if(run: str | Path, changes: Changes = None, *, only: Collection[str] = ()) -> WhatIf:
+    """Replay a recorded run with changed components, and compare what they send with what was sent.
+
+        r = afspm.what_if("runs/night-12", {"classifier": {"sigmas": 4.0}})
+        r.first     # the first difference: its time, its packet, recorded and now
+        r.table()   # for each component: same, added, removed, changed
+
+    The run must have been recorded with `[record] requests = true`. Nothing outside a temporary folder is written.
+
+    Args:
+        run: folder of the run.
+        changes: by the name of a component, settings that replace those of the run, or another class; or an experiment
+            file that is laid over the run's. None: only the installed version differs.
+        only: names of processes to replay; empty: all.
+
+    Raises:
+        FileError: the run has no recorded requests, or they can't be read.
+        ConfigError: a changed component can't be made, or a name is unknown.
+    """
+    with open_run(run) as record:
+        logs = _logs(record.folder)
+        changed = _changed(record.folder, changes, logs)
+        unknown = {*(changes if isinstance(changes, Mapping) else ()), *only} - logs.keys()
+        if unknown:
+            raise ConfigError(
+                f"the record has no requests of {', '.join(sorted(unknown))}",
+                where=str(record.folder),
+                hint=f"it has those of {', '.join(sorted(logs))}",
+            )
+        result = WhatIf(record.folder)
+        packet_of = recorded_packets(record)
+        for name, path in sorted(logs.items()):
+            if only and name not in only:
+                continue
+            try:
+                if path.name.endswith(step_log.SUFFIX):
+                    result.scheduler_name = name
+                    result.scheduler = scheduler_replay.replay_file(path, changed.get(name, (None, None))[0])
+                else:
+                    _replay(result, name, read_lives(path), packet_of, changed.get(name))
+            except (FileError, ConfigError) as error:
+                if name in changed or only:
+                    raise
+                result.unread[name] = str(error)
+        return result
+
+
+Changed = tuple[Mapping[str, Any] | None, component_replay.Make | None]
+
+
+def _replay(
+    result: WhatIf,
+    name: str,
+    lives: list[Life],
+    packet_of: PacketOf,
+    changed: Changed | None,
+) -> None:
+    if not lives:
+        result.unread[name] = "its log is empty"
+        return
+    settings, make = changed or (None, None)
+    made = component_replay.replay(lives, packet_of, result.run, make=make or load, settings=settings)
+    result.components[name] = made
+    if made.first is None:
+        return
+    # is it the change? the unchanged component must repeat its record; if not, the watch says what it depends on
+    control = component_replay.replay(lives, packet_of, result.run, watch=True)
+    if changed is not None:
+        result.controls[name] = control
+    elif control.hazards:
+        made.hazards += [one for one in control.hazards if one not in made.hazards]
+    if control.first is not None and not control.hazards:
+        control.hazards += hash_seeds.hazards(result.run, name)
+        made.hazards += [one for one in control.hazards if one not in made.hazards]
+
+
+def _logs(folder: Path) -> dict[str, Path]:
+    found = {}
+    for path in (folder / REQUESTS_FOLDER).glob(f"*{port_log.SUFFIX}"):
+        is_scheduler = path.name.endswith(step_log.SUFFIX)
+        found[path.name.removesuffix(step_log.SUFFIX if is_scheduler else port_log.SUFFIX)] = path
+    if not found:
+        raise FileError(
+            "this run has no recorded requests",
+            where=str(folder),
+            hint="set requests = true in [record] of the experiment file before a run",
+        )
+    return found
+
+
+def _changed(folder: Path, changes: Changes, logs: Mapping[str, Path]) -> dict[str, Changed]:
+    if changes is None:
+        return {}
+    if isinstance(changes, str | Path):
+        return _changed_by_file(folder, Path(changes), logs)
+    found: dict[str, Changed] = {}
+    for name, change in changes.items():
+        if isinstance(change, type):
+            found[name] = (None, _made_by(change))
+        elif isinstance(change, Mapping):
+            found[name] = ({**_settings(logs[name]), **change}, None) if name in logs else (change, None)
+        else:
+            raise InvalidValue(
+                f"a change can't be {change!r}", where=name, hint="give a dict of settings, or a class of a component"
+            )
+    return found
+
+
+def _made_by(class_: type[Component]) -> component_replay.Make:
+    return lambda launch: class_(**launch.settings)
+
+
+def _settings(path: Path) -> dict[str, Any]:
+    launch = _launch(path)
+    return dict(launch.settings)
+
+
+def _launch(path: Path) -> Launch:
+    for kind, facts, *_ in read_lines(path):
+        if kind == "life":
+            return Launch.from_json(json.dumps(facts.get("launch", facts)))
+    raise FileError("has no beginning of a life", where=str(path))
+
+
+def _changed_by_file(folder: Path, file: Path, logs: Mapping[str, Path]) -> dict[str, Changed]:
+    if not file.is_file():
+        raise FileError("there is no such file", where=str(file))
+    experiment = changed_experiment(folder, file)
+    found: dict[str, Changed] = {}
+    for start in experiment.launches(take_address=FreePorts().address):
+        launch = start.launch
+        if start.role is Role.TRANSLATOR or launch.name not in logs:
+            continue
+        before = _launch(logs[launch.name])
+        if (launch.class_, json.dumps(launch.settings)) == (before.class_, json.dumps(before.settings)):
+            continue
+        found[launch.name] = (launch.settings, _loaded_as(launch.class_))
+    return found
+
+
+def _loaded_as(class_path: str) -> component_replay.Make:
+    return lambda launch: load(replace(launch, class_=class_path))
+
+
+def changed_experiment(folder: Path, *files: Path) -> Experiment:
+    """Return the experiment of a run with files laid over it.
+
+    Raises:
+        ConfigError: it has errors.
+    """
+    homes = [*map(Path, run_json_or_empty(folder).get(HOMES, [])), *(file.resolve().parent for file in files)]
+    experiment = load_expanded(folder / EXPERIMENT_FILE, homes, *files)
+    experiment.require_valid()
+    return experiment

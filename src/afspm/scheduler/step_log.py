@@ -1,0 +1,289 @@
+"""The step log: every input of the scheduler's decisions, and a fingerprint of every effect, for a later replay.
+
+The decisions are pure, so the same inputs must give the same effects: `afspm what-if` checks that. A line of the file
+is a list:
+
+- ["life", launch, saved, cached]: the scheduler starts, with the state and the packets restored from disk.
+- ["step", event, now_s, now_ns, effects, state]: an input, or null for the start itself; `state` has a checksum of each
+  part of the state that the step has changed.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import zlib
+from base64 import b64decode, b64encode
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from afspm import wire
+from afspm.basics.launch import Launch
+from afspm.model import (
+    CLOCK_REQUEST,
+    ControlResponse,
+    LoggedPacket,
+    Packet,
+    PacketHeader,
+    Request,
+    Response,
+    request_name,
+)
+from afspm.model.snapshot import from_plain, snapshot, to_plain
+from afspm.scheduler import events
+from afspm.scheduler.saved_state import KIND, VERSION, SavedState
+from afspm.scheduler.scheduler_core import SchedulerCore
+from afspm.scheduler.state import SchedulerState
+from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
+
+INLINE_BYTES = 4096
+"""The values of larger packets decide nothing: only their length is kept."""
+SUFFIX = ".steps.jsonl"
+_PLAIN = (
+    events.Connected, events.Disconnected, events.Greeted, events.TranslatorUp, events.TranslatorDown,
+    events.TranslatorCaughtUp, events.ProblemSeen, events.Announced, events.Stopped, events.Tick,
+)  # fmt: skip
+_BY_NAME: dict[str, type[Any]] = {one.__name__: one for one in _PLAIN}
+
+
+@dataclass(frozen=True)
+class Restored:
+    """The beginning of a scheduler's life: the state and the packets from its disk."""
+
+    saved: SavedState | None = None
+    cached: tuple[LoggedPacket, ...] = ()
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step: its input (None: the start), its times, the facts of its effects, and sums of the changed state."""
+
+    event: events.Input | None
+    now_s: float
+    now_ns: int
+    effects: list[list[Any]]
+    state: dict[str, int]
+
+
+Keep = Callable[[Restored | Step], None]
+
+
+class StateSums:
+    """Checksums of the parts of a scheduler's state, those only that a step has changed."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, object] = {}
+        self._sums: dict[str, int] = {}
+
+    def changed(self, state: SchedulerState) -> dict[str, int]:
+        """Return the checksum of each part that differs from the last call."""
+        before = dict(self._sums)
+        for name, part in vars(state).items():
+            if part is not self._parts.get(name, self):  # most steps leave most parts as they are
+                self._parts[name] = part
+                self._sums[name] = zlib.crc32(_canonical(part).encode())
+        return {name: total for name, total in self._sums.items() if before.get(name) != total}
+
+
+class RecordedCore(SchedulerCore):
+    """A scheduler's decisions that keep every step.
+
+    Args:
+        keep: called with the beginning of a life, then after every step.
+        given: as to `SchedulerCore`.
+    """
+
+    def __init__(self, *given: Any, keep: Keep) -> None:
+        super().__init__(*given)
+        self._keep = keep
+        self._beginning = Restored()
+        self._sums = StateSums()
+
+    def restore(self, saved: SavedState) -> None:
+        self._beginning = replace(self._beginning, saved=saved)
+        super().restore(saved)
+
+    def restore_cache(self, packets: Iterable[LoggedPacket]) -> None:
+        self._beginning = replace(self._beginning, cached=tuple(packets))
+        super().restore_cache(self._beginning.cached)
+
+    def start(self, now_s: float, now_ns: int) -> list[events.Effect]:
+        self._keep(self._beginning)
+        effects = super().start(now_s, now_ns)
+        self._keep(Step(None, now_s, now_ns, [*map(facts_of, effects)], self._sums.changed(self.state)))
+        return effects
+
+    def step(self, event: events.Input, now_s: float, now_ns: int) -> list[events.Effect]:
+        effects = super().step(event, now_s, now_ns)
+        self._keep(Step(event, now_s, now_ns, [*map(facts_of, effects)], self._sums.changed(self.state)))
+        return effects
+
+
+class StepLog:
+    """Writes the step log of a scheduler."""
+
+    def __init__(self, log: LineLog, launch: Launch) -> None:
+        self._log = log
+        self._launch = launch
+
+    @classmethod
+    def of_run(cls, launch: Launch, logger: logging.Logger) -> StepLog:
+        """Return the log of a scheduler, in the folder of its run."""
+        return cls(LineLog(log_path(Path(launch.run_dir or "."), launch.name), logger), launch)
+
+    def keep(self, one: Restored | Step) -> None:
+        """Append the beginning of a life, or a step."""
+        if isinstance(one, Step):
+            event = None if one.event is None else _plain_event(one.event)
+            self._log.add(["step", event, one.now_s, one.now_ns, one.effects, one.state])
+            return
+        saved = None if one.saved is None else snapshot(one.saved, KIND, VERSION, lists=True)
+        cached = [[_plain_packet(entry.packet), entry.source_ns, entry.history] for entry in one.cached]
+        launch = json.loads(replace(self._launch, keys=None, beat_token="").to_json())
+        self._log.add(["life", launch, saved, cached])
+
+
+def log_path(run_dir: Path, name: str) -> Path:
+    """Return the file of a scheduler's step log."""
+    return run_dir / REQUESTS_FOLDER / f"{name}{SUFFIX}"
+
+
+def read_cached(plain: Sequence[Any]) -> tuple[LoggedPacket, ...]:
+    """Return the packets in a line "life"."""
+    return tuple(LoggedPacket(_packet(packet), source_ns, history) for packet, source_ns, history in plain)
+
+
+def read_event(plain: Sequence[Any] | None) -> events.Input | None:
+    """Return the input in a line "step".
+
+    Raises:
+        KeyError: only the coordinate frame can read it.
+        WireError: its bytes are damaged.
+    """
+    if plain is None:
+        return None
+    name, *given = plain
+    if name == "RequestIn":
+        connection, who, frames, user, heard_s = given
+        return events.RequestIn(connection, who, wire.decode_request([*map(b64decode, frames)]), user, heard_s)
+    if name == "PacketIn":
+        packet, header = given
+        return events.PacketIn(_packet(packet), from_plain(PacketHeader, header))
+    if name == "Unreadable":
+        return events.Unreadable(given[0], wire.decode_response([*map(b64decode, given[1])]))
+    if name == "TranslatorReply":
+        return events.TranslatorReply(given[0], wire.decode_response([*map(b64decode, given[1])]))
+    if name == "ReplayRequested":
+        return events.ReplayRequested(given[0], tuple(given[1]), given[2])
+    made: events.Input = from_plain(_BY_NAME[name], given[0])
+    return made
+
+
+def facts_of(effect: events.Effect) -> list[Any]:
+    """Return an effect as a list of facts: kind, key, text for people, and the rest."""
+    match effect:
+        case events.Reply(_, name, response, asked):
+            key = f"{name} {request_name(asked)}" if asked else name
+            text = f"{_code(response)} {response.reason}".strip()
+            payload = b"" if asked == CLOCK_REQUEST else response.payload  # versions and time, which decide nothing
+            return ["Reply", key, text, response.id, _sum(payload), int(response.detail)]
+        case events.Forward(number, request):
+            return ["Forward", request_name(request.kind), str(request.subject), request.id, number]
+        case events.Publish(packet, source_ns, history):
+            size = _short(packet.payload)
+            return [
+                "Publish",
+                packet.envelope,
+                f"{len(packet.payload)} bytes",
+                packet.time_ns,
+                source_ns,
+                history,
+                size,
+            ]
+        case events.Replay(_, packets):
+            order = [(one.envelope, one.time_ns) for one in packets]
+            return ["Replay", "", f"{len(packets)} packets", zlib.crc32(repr(order).encode())]
+        case events.SaveState(state):
+            sums = {one.name: _plain_sum(getattr(state, one.name)) for one in fields(state)}
+            return ["SaveState", "", "", sums]
+        case events.Log(level, text):
+            return ["Log", level, text]
+        case events.Kill(tip_is_safe):
+            return ["Kill", "", "the tip is safe" if tip_is_safe else "the tip is in danger"]
+        case events.Delegate(job):
+            return ["Delegate", type(job).__name__, ""]
+
+
+def _code(response: Response) -> str:
+    known = ControlResponse._value2member_map_.get(response.code)
+    return str(response.code) if known is None else ControlResponse(response.code).name
+
+
+def _plain_event(event: events.Input) -> list[Any]:
+    name = type(event).__name__
+    match event:
+        case events.RequestIn(connection, who, request, user, heard_s):
+            return [name, connection, who, _request(request), user, heard_s]
+        case events.PacketIn(packet, header):
+            return [name, _plain_packet(packet), to_plain(header)]
+        case events.Unreadable(who, response):
+            return [name, who, [*map(_text, wire.encode_response(response))]]
+        case events.TranslatorReply(number, response):
+            return [name, number, [*map(_text, wire.encode_response(response))]]
+        case events.ReplayRequested(_, prefixes, since_ns):
+            return [name, 0, list(prefixes), since_ns]
+        case _:
+            # the reports of a coordinate frame's worker have a form of their own, and end the replay
+            return [name, to_plain(event) if isinstance(event, _PLAIN) else None]
+
+
+def _request(request: Request) -> list[str]:
+    return [*map(_text, wire.encode_request(request))]
+
+
+def _plain_packet(packet: Packet) -> list[Any]:
+    payload = packet.payload
+    kept = _text(payload) if len(payload) <= INLINE_BYTES else len(payload)
+    return [packet.envelope, packet.time_ns, kept]
+
+
+def _packet(plain: Sequence[Any]) -> Packet:
+    envelope, time_ns, kept = plain
+    return Packet(envelope, bytes(kept) if isinstance(kept, int) else b64decode(kept), time_ns)
+
+
+def _short(payload: bytes | memoryview) -> int:
+    return _sum(payload) if len(payload) <= INLINE_BYTES else len(payload)
+
+
+def _sum(payload: bytes | memoryview) -> int:
+    return zlib.crc32(payload)
+
+
+def _plain_sum(value: object) -> int:
+    return zlib.crc32(_canonical(value).encode())
+
+
+def _canonical(value: object) -> str:
+    # equal for equal values in all processes: no order of a set, and no address of an object
+    if isinstance(value, Enum):
+        return repr(value.value)
+    if is_dataclass(value) and not isinstance(value, type):
+        return f"({','.join(_canonical(getattr(value, one.name)) for one in fields(value))})"
+    if isinstance(value, Mapping):
+        return f"{{{','.join(sorted(f'{_canonical(key)}:{_canonical(one)}' for key, one in value.items()))}}}"
+    if isinstance(value, set | frozenset):
+        return f"{{{','.join(sorted(map(_canonical, value)))}}}"
+    if isinstance(value, list | tuple | deque):
+        return f"[{','.join(map(_canonical, value))}]"
+    if value is None or isinstance(value, str | int | float | bytes | bytearray):
+        return repr(value)
+    return type(value).__name__
+
+
+def _text(payload: bytes | memoryview) -> str:
+    return b64encode(payload).decode()

@@ -1,0 +1,76 @@
+"""A log of JSON lines, each handed to the operating system at once: a kill of the process loses none."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from afspm.basics.errors import FileError
+
+REQUESTS_FOLDER = "requests"
+"""Folder of a run with the logs that `[record] requests = true` keeps."""
+
+
+class LineLog:
+    """Appends lines to a file.
+
+    A disk that refuses must not end the experiment: the error is logged once, and the log of this life ends there.
+    """
+
+    def __init__(self, path: Path, logger: logging.Logger) -> None:
+        self._path = path
+        self._logger = logger
+        self._file: int | None = None
+        self._open()
+
+    def _open(self) -> None:
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
+            os.write(self._file, b"\n")  # a kill or a full disk may have left half a line
+        except OSError as error:
+            self._give_up(error)
+
+    def add(self, line: list[Any]) -> None:
+        """Append a line of JSON's types."""
+        if self._file is None:
+            return
+        try:
+            text = memoryview(json.dumps(line, separators=(",", ":")).encode() + b"\n")
+            while text:
+                text = text[os.write(self._file, text) :]
+        except OSError as error:
+            self._give_up(error)
+
+    def close(self) -> None:
+        """Close the file. Safe to repeat."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def _give_up(self, error: OSError) -> None:
+        self._logger.error("requests are no longer recorded, what-if can replay up to here only: %s", error)
+        self.close()
+
+
+def read_lines(path: Path) -> Iterator[list[Any]]:
+    """Yield the lines of a log; half a line, which a kill left, is skipped.
+
+    Raises:
+        FileError: the file can't be read.
+    """
+    try:
+        with path.open("rb") as file:
+            for text in file:
+                try:
+                    line = json.loads(text)
+                except ValueError:
+                    continue
+                if isinstance(line, list) and line:
+                    yield line
+    except OSError as error:
+        raise FileError(f"can't be read: {error}", where=str(path)) from error

@@ -1,0 +1,287 @@
+"""Components of a recorded night, replayed as they were and changed."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.plugins.what_if import what_if_lab as lab
+from typer.testing import CliRunner
+
+import afspm
+from afspm import wire
+from afspm.basics.errors import ConfigError, FileError, InvalidValue
+from afspm.plugins.what_if import component_replay
+from afspm.plugins.what_if.commands import DIFFERS, app
+from afspm.plugins.what_if.port_replay import read_lives
+from afspm.plugins.what_if.recorded_packets import recorded_packets
+from afspm.record.run import open_run
+from afspm.storage.memory import Memory
+from afspm.testing import Bench
+
+
+def kills(bench: Bench) -> None:
+    for when, name in (
+        ("1 s", ""),
+        ("11 min", ""),
+        ("15 min", "judge"),
+        ("25 min", "scheduler"),
+        ("26 min", "alarmist"),
+    ):
+        bench.at(when, bench.kill, name)
+
+
+@pytest.fixture(scope="module")
+def night(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("night")
+    bench = lab.record(folder, {"judge": lab.Judge(), "alarmist": lab.Alarmist()}, kills)
+    assert len(bench.scans) >= 4
+    return folder
+
+
+def test_unchanged_night_with_kills_repeats_its_record(night: Path) -> None:
+    result = afspm.what_if(night)
+    assert result.first is None
+    assert not result.hazards
+    assert not result.unread
+    rows = {row.name: row for row in result.table()}
+    assert rows["series"].same > 20
+    assert rows["judge"].same >= 4
+    assert len(read_lives(night / "requests" / "series.jsonl")) >= 3  # it was killed
+
+
+@pytest.mark.parametrize("seed", range(2, 4))
+def test_killed_anywhere_the_unchanged_night_repeats_its_record(tmp_path: Path, seed: int) -> None:
+    lab.record(tmp_path, {"judge": lab.Judge()}, kills_of_judge, seed=seed, dies_in_call=0.05)
+    result = afspm.what_if(tmp_path)
+    assert result.first is None
+    assert len(read_lives(tmp_path / "requests" / "series.jsonl")) > 1
+
+
+def kills_of_judge(bench: Bench) -> None:
+    for when in ("9 min", "19 min", "21 min"):
+        bench.at(when, bench.kill, "judge")
+
+
+def test_changed_setting_is_named_at_the_packet_where_it_first_decides_otherwise(night: Path) -> None:
+    result = afspm.what_if(night, {"alarmist": {"at": 3}})
+    first = result.first
+    assert first is not None
+    assert (first.component, first.kind) == ("alarmist", "removed")
+    assert first.recorded is not None
+    assert first.recorded.text == "flags tip-shape-changed"
+    scans = [packet for packet in open_run(night).packets(messages=["Scan2d"]) if packet.envelope.endswith("Height")]
+    assert first.packet is not None
+    assert first.packet.time_ns == scans[1].time_ns
+    assert result.counterfactual_from_ns == scans[1].time_ns
+    rows = {row.name: row for row in result.table()}
+    assert "repeats its record" in rows["alarmist"].note
+    assert rows["judge"].same >= 4
+    assert not rows["judge"].added + rows["judge"].removed + rows["judge"].changed
+
+
+def test_difference_that_stays_away_from_the_microscope_is_not_counterfactual(night: Path) -> None:
+    result = afspm.what_if(night, {"judge": {"factor": 0.0}})
+    row = next(row for row in result.table() if row.name == "judge")
+    assert row.changed
+    assert result.counterfactual_from_ns is None
+    assert row.counterfactual == 0
+
+
+def test_changed_class_is_replayed_in_the_place_of_the_recorded_one(night: Path) -> None:
+    class Rough(lab.Judge):
+        def remark(self, scan: Any) -> str:
+            return "rough"
+
+    result = afspm.what_if(night, {"judge": Rough}, only=["judge"])
+    assert list(result.components) == ["judge"]
+    assert {one.now.text for one in result.differences if one.now} == {"rough"}
+
+
+def test_component_that_asks_for_another_scan_ends_where_the_record_has_no_answer(night: Path) -> None:
+    class Larger(lab.Series):
+        def __init__(self) -> None:
+            super().__init__()
+            self.plan = type(self.plan)(self.plan.regions, (16, 16), self.plan.rounds)
+
+    result = afspm.what_if(night, {"series": Larger}, only=["series"])
+    row = result.table()[0]
+    assert "no answer to" in row.note
+    assert "16 x 16" in row.note
+    assert result.first is not None
+    assert result.first.reaches
+
+
+def test_error_of_a_changed_component_is_a_difference(night: Path) -> None:
+    class Broken(lab.Judge):
+        def remark(self, scan: Any) -> str:
+            raise ZeroDivisionError
+
+    result = afspm.what_if(night, {"judge": Broken}, only=["judge"])
+    assert any(one.now and "ZeroDivisionError" in one.now.text for one in result.differences)
+
+
+def test_bad_changes_are_refused(night: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no requests of stranger"):
+        afspm.what_if(night, {"stranger": {"factor": 1.0}})
+    with pytest.raises(ConfigError, match="can't be made"):
+        afspm.what_if(night, {"judge": {"no_such_setting": 1.0}})
+    with pytest.raises(InvalidValue, match="a change can't be 3"):
+        afspm.what_if(night, {"judge": 3})
+    shutil.copy(night / "journal.sqlite", tmp_path)
+    with pytest.raises(FileError, match="no recorded requests"):
+        afspm.what_if(tmp_path)
+
+
+# --- mutants ---
+
+
+def _mutants() -> dict[str, str]:
+    source = inspect.getsource(lab.Judge.remark)
+    changes = {
+        "greater": ("roughness > ", "roughness < "),
+        "never": ("if seen and", "if False and"),
+        "always": ("if seen and", "if True or"),
+        "product": ("self.factor *", "2.0 *"),
+        "half": ("self.factor *", "0.5 *"),
+        "number": ("/ len(seen)", "/ (len(seen) + 1)"),
+        "newest": ("[*seen, roughness]", "[roughness]"),
+        "oldest": ("[*seen, roughness]", "[*seen[:0], *(seen or [roughness])]"),
+        "swapped": ('"rough" if', '"smooth" if'),
+        "forgetful": ('self.memory.get("seen", [])', "[]"),
+        "squared": ("np.std(scan.values)", "np.std(scan.values) ** 2"),
+        "mean": ("np.std(scan.values)", "np.abs(np.mean(scan.values))"),
+    }
+    for before, _ in changes.values():
+        assert before in source
+    return {name: source.replace(*change) for name, change in changes.items()}
+
+
+def _class_of(source: str) -> type[lab.Judge]:
+    space: dict[str, Any] = {"np": np, "Scan": afspm.Scan}
+    exec(textwrap.dedent(source), space)
+    return type("Mutant", (lab.Judge,), {"remark": space["remark"]})
+
+
+def _decided(class_: type[lab.Judge], scans: list[Any]) -> list[str]:
+    judge = class_()
+    judge.memory = Memory(None)
+    return [judge.remark(scan) for scan in scans]
+
+
+def test_mutants_are_found_at_the_packet_where_they_first_decide_otherwise(tmp_path: Path) -> None:
+    """The truth: the decisions of original and mutant on the scans of the night, without any experiment."""
+    lab.record(tmp_path, {"judge": lab.Judge()})
+    with open_run(tmp_path) as run:
+        packets = [one for one in run.packets(messages=["Scan2d"]) if one.envelope.endswith(lab.CHANNEL)]
+        scans = [_scan(packet) for packet in packets]
+        lives = read_lives(tmp_path / "requests" / "judge.jsonl")
+        right, decided_otherwise = _decided(lab.Judge, scans), 0
+        for name, source in _mutants().items():
+            mutant = _class_of(source)
+            pairs = enumerate(zip(right, _decided(mutant, scans), strict=True))
+            truth = next((at for at, (one, other) in pairs if one != other), None)
+            found = component_replay.replay(lives, recorded_packets(run), tmp_path, make=_made(mutant)).first
+            assert (found is None) == (truth is None), name
+            if truth is not None:
+                decided_otherwise += 1
+                assert found is not None
+                assert found.packet is not None, name
+                assert found.packet.time_ns == packets[truth].time_ns, name
+    assert decided_otherwise >= 6
+
+
+def _made(class_: type[lab.Judge]) -> component_replay.Make:
+    return lambda launch: class_()
+
+
+def _scan(packet: Any) -> Any:
+    return wire.decode("Scan2d", packet.payload)
+
+
+# --- hazards ---
+
+
+def test_hazards_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    outside = tmp_path / "outside.txt"
+    outside.write_text("before")
+    monkeypatch.setenv(lab.OUTSIDE, str(outside))
+    night = tmp_path / "night"
+    night.mkdir()
+    planted = {
+        "wall_clock": (lab.WallClock(), "reads the wall clock by time_ns(), instead of self.clock (what_if_lab.py:"),
+        "unseeded": (lab.Unseeded(), "draws random numbers without a seed of its own (what_if_lab.py:"),
+        "unseeded_numpy": (lab.UnseededNumpy(), "draws random bytes of the operating system (what_if_lab.py:"),
+        "outside_file": (lab.OutsideFile(), f"reads a file that is not in the record: {outside}"),
+    }
+    lab.record(night, {name: component for name, (component, _) in planted.items()}, until="25 min")
+    outside.write_text("after")
+    result = afspm.what_if(night)
+    assert result.hazards.keys() == planted.keys()
+    for name, (_, words) in planted.items():
+        assert any(words in hazard for hazard in result.hazards[name]), (name, result.hazards[name])
+        assert result.components[name].first is not None
+
+
+def test_order_of_a_set_is_named(tmp_path: Path) -> None:
+    """Recorded by another process, as every night: the seed of the hashes of this one is another."""
+    code = (
+        "import sys, pathlib\nfrom tests.plugins.what_if import what_if_lab as lab\n"
+        "lab.record(pathlib.Path(sys.argv[1]), {'set_order': lab.SetOrder()}, until='15 min')"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "7"}
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)
+    result = afspm.what_if(tmp_path, only=["set_order"])
+    assert result.first is not None
+    assert result.hazards == {
+        "set_order": ["depends on the order of a set: two hash seeds give other outputs, first its output 1"]
+    }
+
+
+def test_replay_writes_nothing_outside_its_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    table, night = tmp_path / "table.txt", tmp_path / "night"
+    table.touch()
+    monkeypatch.setenv(lab.OUTSIDE, str(table))
+    night.mkdir()
+    lab.record(night, {"writer": lab.Writer()}, until="15 min")
+    written = table.read_text()
+    assert written
+    result = afspm.what_if(night)
+    assert table.read_text() == written
+    assert any(f"writes a file outside its folder: {table}" in one for one in result.hazards["writer"])
+
+
+# --- the command ---
+
+
+def test_command_exits_with_three_if_a_night_differs(night: Path) -> None:
+    same = CliRunner().invoke(app, [str(night)])
+    assert same.exit_code == 0, same.output
+    assert "no difference" in same.output
+    differs = CliRunner().invoke(app, [str(night), "--set", "alarmist.at=3"])
+    assert differs.exit_code == DIFFERS, differs.output
+    assert "first difference: alarmist" in differs.output
+    assert "flags tip-shape-changed" in differs.output
+
+
+def test_command_prints_json_for_programs(night: Path) -> None:
+    result = CliRunner().invoke(app, [str(night), "--set", "judge.factor=0.0", "--component", "judge", "--json"])
+    assert result.exit_code == DIFFERS
+    facts = json.loads(result.output)
+    assert facts["first"]["component"] == "judge"
+    assert facts["first"]["packet"]["envelope"].startswith("Scan2d")
+    assert [row["name"] for row in facts["table"]] == ["judge"]
+
+
+@pytest.mark.parametrize("given", [["x.toml"], ["run", "a.toml", "b.toml"], ["run", "--set", "judge"]])
+def test_command_refuses_what_it_can_not_read(given: list[str]) -> None:
+    assert CliRunner().invoke(app, given).exit_code == 2

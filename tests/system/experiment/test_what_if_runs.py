@@ -1,0 +1,47 @@
+"""A real run that keeps its requests, over kills, replayed; and run again to its end."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from tests.system.experiment.experiment_lab import AfspmRun, Run
+
+import afspm
+from afspm.plugins.what_if.closed_loop import rerun
+
+KEEPS = "[record]\nrequests = true\n"
+
+
+def test_recorded_run_with_kills_repeats_its_record(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    one: AfspmRun = run(more=KEEPS, scans=3)
+    one.wait_for("scan 1 of 3")
+    one.kill("series")
+    one.kill("scheduler")
+    assert one.end() in (0, 3), one.output
+    folder = one.folder
+    monkeypatch.syspath_prepend(str(tmp_path))  # the witness
+    result = afspm.what_if(folder)
+    assert result.first is None, result.first
+    assert not result.unread
+    rows = {row.name: row for row in result.table()}
+    assert rows["series"].same > 5
+    assert rows["scheduler"].same > 50
+    for log in (folder / "requests").iterdir():
+        for line in log.read_text(encoding="utf-8").splitlines():
+            kind, *rest = json.loads(line) if line else ("",)
+            if kind == "life":
+                launch = rest[0].get("launch", rest[0])
+                assert launch["keys"] is None
+                assert launch["beat_token"] == ""
+
+    changed = tmp_path / "changed.toml"
+    changed.write_text("[series]\nscans = 2\n", encoding="utf-8")
+    fewer = afspm.what_if(folder, changed)
+    assert fewer.first is not None
+    assert fewer.first.component == "series"
+    outcomes = rerun(folder, changed, runs=tmp_path / "again", terminal=sys.stderr)
+    assert outcomes.rows["whole scans"] == ("3", "2")
+    assert afspm.open_run(outcomes.folder).simulated
