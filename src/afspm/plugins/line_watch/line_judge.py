@@ -40,6 +40,8 @@ JUMP_REACH = (12, 16)  # the same for a sample that has jumped
 MOST_JUMPS = 3  # in one scan
 REMEMBERED = 12  # lines for the search after a jump
 DRIFT = 1.0  # standard deviations that a line must exceed the usual by, for the sum to grow
+LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too small a misfit of steep flanks
+SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
 LOOK = 0.6  # share of the threshold
@@ -320,20 +322,22 @@ class RunningScan:
         place, registration = self._comparer.place, self._comparer.registration
         if place is None or registration is None or self._jumps >= MOST_JUMPS:
             return False
-        wide = RowRegistration(place.templates[0], registration.shift, JUMP_REACH, steady=1.0)
-        lines = [(row, line) for row, line in self._recent if self._is_suspect(row)]
-        for row, line in lines:
-            wide.follow(row, line[0])
-        again = _Comparer(place, wide)
-        sigmas = [self._statistic.sigmas(fits) for row, line in lines if (fits := again.fits(row, line))]
-        newer = len(sigmas) // 2  # the older half may lie before the jump
-        if not sigmas or float(np.median(sigmas[newer:])) > DRIFT:
-            return False
-        self._jumps += 1
-        self._comparer.registration = RowRegistration(place.templates[0], wide.shift, REACH)
-        for row, line in lines[newer:]:
-            self._comparer.follow(row, line)
-        return True
+        # since the change, for a sample that has jumped; all lines, for a lattice that was matched one period away
+        suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
+        for lines in (suspects, self._recent):
+            wide = RowRegistration(place.templates[0], registration.shift, JUMP_REACH, steady=1.0)
+            for row, line in lines:
+                wide.follow(row, line[0])
+            again = _Comparer(place, wide)
+            sigmas = [self._statistic.sigmas(fits) for row, line in lines if (fits := again.fits(row, line))]
+            newer = len(sigmas) // 2  # the older half may lie before the jump
+            if sigmas and float(np.median(sigmas[newer:])) < DRIFT:
+                self._jumps += 1
+                self._comparer.registration = RowRegistration(place.templates[0], wide.shift, REACH)
+                for row, line in lines[newer:]:
+                    self._comparer.follow(row, line)
+                return True
+        return False
 
     def _is_suspect(self, row: int) -> bool:
         numbers = [number for number, _ in self._recent]
@@ -393,10 +397,9 @@ class LineJudge:
         self._kinds.remove(known)
         self._kinds.append(known)
         place = known.place(region)
-        if not again:
-            self._compare(known, place, picture, region, at_s, downwards=downwards)
+        doubtful = set() if again else self._compare(known, place, picture, region, at_s, downwards=downwards)
         known.places = [one for one in known.places if one is not place]
-        known.places.append(Place(region, at_s, tuple(RowTemplate.of(values) for values in picture)))
+        known.places.append(Place(region, at_s, tuple(RowTemplate.of(values, doubtful) for values in picture)))
         del known.places[:-MOST_PLACES]
 
     def _compare(
@@ -408,19 +411,21 @@ class LineJudge:
         at_s: float,
         *,
         downwards: bool,
-    ) -> None:
+    ) -> set[int]:
+        doubtful: set[int] = set()
         lines = [(row, [levelled(values[row])[0] for values in picture]) for row in range(len(picture[0]))]
         lines = [(row, line) for row, line in lines if all(np.isfinite(values).all() for values in line)]
         if downwards:
             lines.reverse()
         if len(lines) <= ACQUIRE:
-            return
+            return doubtful
         if place is not None and len(place.templates) == len(picture):
             registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
-            _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs))
+            _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs, doubtful))
             known.note_shift(place, region, at_s, registration.shift)
         if len(picture) == 2:
-            _append(known.unrest, _statistics(_Comparer(None, None), lines, known.unrest))
+            _append(known.unrest, _statistics(_Comparer(None, None), lines, known.unrest, doubtful))
+        return doubtful
 
     def state(self) -> Plain:
         """Return what is usual of each kind, to save, in JSON's types. The earlier scans are not in it."""
@@ -453,8 +458,12 @@ def _append(pairs: list[PairStatistics], found: PairStatistics | None) -> None:
 
 
 def _statistics(
-    comparer: _Comparer, lines: Sequence[tuple[int, list[Array]]], before: Sequence[PairStatistics]
+    comparer: _Comparer,
+    lines: Sequence[tuple[int, list[Array]]],
+    before: Sequence[PairStatistics],
+    doubtful: set[int],
 ) -> PairStatistics | None:
+    # adds to `doubtful` the rows that differ by themselves
     fitted: list[tuple[int, list[RowFit]]] = []
     for number, (row, line) in enumerate(lines):
         comparer.follow(row, line)
@@ -471,7 +480,10 @@ def _statistics(
     # judged by the other pairs, as a running scan is
     statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
     for row, fits in fitted:
-        cusum.add(row, statistic.sigmas(fits))
+        sigmas = statistic.sigmas(fits)
+        if sigmas > SCAR:
+            doubtful.add(row)
+        cusum.add(row, sigmas)
         highest = max(highest, cusum.value)
     return PairStatistics(flat_m, per_slope, usual, spread, highest)
 
@@ -485,4 +497,4 @@ def _expected(fits: Sequence[RowFit]) -> tuple[float, float]:
     steep = steepness >= np.quantile(steepness, 0.9)
     flat_m = robust_spread(residual[flat])
     beyond = max(0.0, robust_spread(residual[steep]) ** 2 - flat_m**2)
-    return flat_m, math.sqrt(beyond) / max(float(np.median(steepness[steep])), 1e-15)
+    return flat_m, max(LEAST_PER_SLOPE, math.sqrt(beyond) / max(float(np.median(steepness[steep])), 1e-15))

@@ -7,7 +7,10 @@ shift below a pixel is fitted with offset and tilt of the row: to first order it
 
 from __future__ import annotations
 
+import math
+from collections.abc import Collection
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,18 +38,26 @@ class RowTemplate:
         heights: in m, [y, x], rows levelled, without holes.
         slopes: along the rows, [y, x - 1].
         row_slopes, column_slopes: the gradient, in m per pixel.
+        spline: coefficients of the heights: linear interpolation would change sharp features with the part of a pixel.
         spread: typical size of a slope.
+        trusted: by row; False: a scar, say, which another scan does not show.
     """
 
     heights: Array
     slopes: Array
     row_slopes: Array
     column_slopes: Array
+    spline: Array
     spread: float
+    trusted: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, heights: Array) -> RowTemplate:
-        """Prepare a scan; rows without values are filled from their neighbours."""
+    def of(cls, heights: Array, doubtful: Collection[int] = ()) -> RowTemplate:
+        """Prepare a scan; rows without values are filled from their neighbours.
+
+        Args:
+            doubtful: rows that are compared with nothing.
+        """
         level = levelled(heights)
         rows = np.arange(len(level))
         there = np.isfinite(level).all(axis=1)
@@ -55,7 +66,10 @@ class RowTemplate:
             level = level[nearest]
         slopes = np.diff(level, axis=1)
         row_slopes, column_slopes = (np.asarray(np.gradient(level, axis=axis)) for axis in (0, 1))
-        return cls(level, slopes, row_slopes, column_slopes, robust_spread(slopes))
+        spline = np.asarray(ndimage.spline_filter(level, order=3))
+        trusted = there & ~np.isin(rows, list(doubtful))
+        # the spread is not robust: on particles most of the ground is flat, and only flanks show a shift
+        return cls(level, slopes, row_slopes, column_slopes, spline, float(np.std(slopes)) or 1e-15, trusted)
 
 
 @dataclass(frozen=True)
@@ -109,11 +123,13 @@ class RowRegistration:
         for _ in range(ITERATIONS):
             at, beside = number + down + moved[0], columns + along + moved[1]
             inside = (beside >= 0) & (beside <= nx - 1) & np.isfinite(row)
-            if not 0.0 <= at <= ny - 1 or inside.mean() < LEAST_OVERLAP:
+            if not 0.0 <= at <= ny - 1 or not template.trusted[math.floor(at) : math.ceil(at) + 1].all():
                 return None
-            expected, down_slope, along_slope = (
-                _row_at(picture, at, beside)
-                for picture in (template.heights, template.row_slopes, template.column_slopes)
+            if inside.mean() < LEAST_OVERLAP:
+                return None
+            expected = _row_at(template.spline, at, beside, order=3)
+            down_slope, along_slope = (
+                _row_at(picture, at, beside, order=1) for picture in (template.row_slopes, template.column_slopes)
             )
             basis = np.stack([np.ones(nx), np.linspace(-1.0, 1.0, nx), down_slope, along_slope], axis=1)
             residual, more = _unexplained(row - expected, basis, inside, moved)
@@ -187,8 +203,9 @@ def _cut(picture: Array, row: int, column: int, rows: int, columns: int) -> Arra
     return part
 
 
-def _row_at(picture: Array, at: float, columns: Array) -> Array:
-    return np.asarray(ndimage.map_coordinates(picture, [np.full(columns.shape, at), columns], order=1, mode="nearest"))
+def _row_at(picture: Array, at: float, columns: Array, order: Literal[1, 3]) -> Array:
+    places = [np.full(columns.shape, at), columns]
+    return np.asarray(ndimage.map_coordinates(picture, places, order=order, mode="nearest", prefilter=False))
 
 
 def _vertex(cost: Array, at: int) -> float:
