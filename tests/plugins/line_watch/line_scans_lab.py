@@ -25,10 +25,10 @@ def scan_at(
     return {name: scan.channels()[name][1] for name in CHANNELS}
 
 
-def world_with(flaw: str, changed_s: float) -> World:
+def world_with(flaw: str, changed_s: float, surface: str = "particles") -> World:
     """Return a world in which the tip changes at a time."""
     settings = {
-        "surface": {"kind": "particles"},
+        "surface": {"kind": surface},
         "drift": {"velocity_m_per_s": [0.02e-9, -0.02e-9, 0.0]},
         "tip_changes": {"schedule": [[changed_s, flaw]]},
     }

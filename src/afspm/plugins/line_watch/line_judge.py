@@ -41,6 +41,7 @@ MOST_JUMPS = 3  # in one scan
 REMEMBERED = 12  # lines for the search after a jump
 DRIFT = 1.0  # standard deviations that a line must exceed the usual by, for the sum to grow
 LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too small a misfit of steep flanks
+SPIKE = 6.0  # the same for a single pixel
 SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
@@ -345,6 +346,30 @@ class RunningScan:
         return since is None or since not in numbers or numbers.index(row) >= numbers.index(since)
 
 
+@dataclass
+class _OddRows:
+    # rows of a good scan with a scar, and single pixels with a spike: no measure of later scans
+    doubtful: set[int] = field(default_factory=set)
+    spikes: list[tuple[int, int, Array]] = field(default_factory=list)
+
+    def note(self, row: int, fits: Sequence[RowFit], statistic: LineStatistic, sigmas: float, *, spikes: bool) -> None:
+        if sigmas > SCAR:
+            self.doubtful.add(row)
+        for channel, fit in enumerate(fits if spikes else ()):
+            off = np.nan_to_num(np.abs(fit.residual) / statistic.sigma_m(fit.steepness))
+            beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
+            alone = (off > SPIKE) & (beside < 0.5 * off)
+            if alone.any():
+                self.spikes.append((channel, row, np.where(alone, fit.residual, 0.0)))
+
+    def cleaned(self, values: Array, channel: int) -> Array:
+        clean = values.copy()
+        for of, row, spike in self.spikes:
+            if of == channel:
+                clean[row] -= spike
+        return clean
+
+
 class LineJudge:
     """Learns from scans with a good tip, and judges the lines of running ones."""
 
@@ -397,9 +422,10 @@ class LineJudge:
         self._kinds.remove(known)
         self._kinds.append(known)
         place = known.place(region)
-        doubtful = set() if again else self._compare(known, place, picture, region, at_s, downwards=downwards)
+        odd = _OddRows() if again else self._compare(known, place, picture, region, at_s, downwards=downwards)
+        templates = tuple(RowTemplate.of(odd.cleaned(values, n), odd.doubtful) for n, values in enumerate(picture))
         known.places = [one for one in known.places if one is not place]
-        known.places.append(Place(region, at_s, tuple(RowTemplate.of(values, doubtful) for values in picture)))
+        known.places.append(Place(region, at_s, templates))
         del known.places[:-MOST_PLACES]
 
     def _compare(
@@ -411,21 +437,23 @@ class LineJudge:
         at_s: float,
         *,
         downwards: bool,
-    ) -> set[int]:
-        doubtful: set[int] = set()
+    ) -> _OddRows:
+        odd = _OddRows()
         lines = [(row, [levelled(values[row])[0] for values in picture]) for row in range(len(picture[0]))]
         lines = [(row, line) for row, line in lines if all(np.isfinite(values).all() for values in line)]
         if downwards:
             lines.reverse()
         if len(lines) <= ACQUIRE:
-            return doubtful
+            return odd
         if place is not None and len(place.templates) == len(picture):
             registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
-            _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs, doubtful))
+            _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs, odd))
             known.note_shift(place, region, at_s, registration.shift)
         if len(picture) == 2:
-            _append(known.unrest, _statistics(_Comparer(None, None), lines, known.unrest, doubtful))
-        return doubtful
+            # where an earlier scan shows the place, rows are compared with it alone
+            other = _OddRows() if place is not None else odd
+            _append(known.unrest, _statistics(_Comparer(None, None), lines, known.unrest, other))
+        return odd
 
     def state(self) -> Plain:
         """Return what is usual of each kind, to save, in JSON's types. The earlier scans are not in it."""
@@ -461,9 +489,8 @@ def _statistics(
     comparer: _Comparer,
     lines: Sequence[tuple[int, list[Array]]],
     before: Sequence[PairStatistics],
-    doubtful: set[int],
+    odd: _OddRows,
 ) -> PairStatistics | None:
-    # adds to `doubtful` the rows that differ by themselves
     fitted: list[tuple[int, list[RowFit]]] = []
     for number, (row, line) in enumerate(lines):
         comparer.follow(row, line)
@@ -481,8 +508,7 @@ def _statistics(
     statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
     for row, fits in fitted:
         sigmas = statistic.sigmas(fits)
-        if sigmas > SCAR:
-            doubtful.add(row)
+        odd.note(row, fits, statistic, sigmas, spikes=comparer.place is not None)
         cusum.add(row, sigmas)
         highest = max(highest, cusum.value)
     return PairStatistics(flat_m, per_slope, usual, spread, highest)

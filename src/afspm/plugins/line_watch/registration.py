@@ -25,6 +25,7 @@ LEAST_OVERLAP = 0.4  # share of a row that the template must cover
 PRIOR_PX = 0.7  # standard deviation of what is left of a shift
 MOST_MOVED_PX = 1.5
 ITERATIONS = 2  # the template's slopes are those at the place that the first one finds
+PULL = 0.02  # cost of each squared pixel from the predicted shift, on ground too flat to show a shift
 STEADY = 0.75  # share of the cost that a shift elsewhere must stay below: on a lattice many shifts are nearly as good
 CLIP_SIGMAS = 4.0  # of a slope in the cost of a shift, and of a pixel in a residual
 MAD_TO_SIGMA = 1.4826  # of normally distributed values
@@ -92,13 +93,17 @@ class RowRegistration:
         template: the earlier scan.
         expected: predicted shift.
         reach: largest deviation from it that is searched, (rows, columns).
-        steady: see `STEADY`; 1: the best shift, wherever it is.
+        steady: see `STEADY`; 1: the best shift, wherever it is, without `PULL`.
     """
 
     def __init__(self, template: RowTemplate, expected: Shift, reach: tuple[int, int], steady: float = STEADY) -> None:
         self._template = template
         self._reach, self._steady = reach, steady
         self._middle = (round(expected[0]), round(expected[1]))
+        rows, columns = (
+            np.arange(-far, far + 1) + m - e for far, m, e in zip(reach, self._middle, expected, strict=True)
+        )
+        self._away = PULL * (rows[:, None] ** 2 + columns[None, :] ** 2) * float(steady < 1.0)
         self._cost: Array | None = None
         self.shift: Shift = expected
 
@@ -153,6 +158,7 @@ class RowRegistration:
         return np.asarray(np.where(share >= LEAST_OVERLAP, total / np.maximum(share, LEAST_OVERLAP), 4.0 * usual))
 
     def _best(self, cost: Array) -> Shift:
+        cost = cost + float(np.median(cost)) * self._away
         origin = (self._middle[0] - self._reach[0], self._middle[1] - self._reach[1])
         near = [round(at) - first for at, first in zip(self.shift, origin, strict=True)]
         rows, columns = (
