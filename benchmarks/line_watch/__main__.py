@@ -27,13 +27,14 @@ MOST_FALSE, LEAST_SEEN, LEAST_SAVED = 1 / 50, 0.9, 0.6
 def main(arguments: Sequence[str]) -> int:
     asked = argparse.ArgumentParser(prog="benchmarks.line_watch")
     asked.add_argument("--nights", type=int, default=1000)
+    asked.add_argument("--first", type=int, default=0, help="seed of the first night")
     asked.add_argument("--minutes", type=float, default=10.0, help="begin no night after that long")
     asked.add_argument("--half", choices=HALVES, default="unseen")
     asked.add_argument("--processes", type=int, default=1)
     given = asked.parse_args(arguments)
     end_s, found = time.monotonic() + 60.0 * given.minutes, []
     KEPT.parent.mkdir(exist_ok=True)
-    seeds = iter(range(given.nights))
+    seeds = iter(range(given.first, given.first + given.nights))
     with ProcessPoolExecutor(given.processes) as pool, KEPT.open("w", encoding="utf-8") as kept:
         while (batch := list(islice(seeds, 4 * given.processes))) and time.monotonic() < end_s:
             for outcome in pool.map(judged_night, [given.half] * len(batch), batch):

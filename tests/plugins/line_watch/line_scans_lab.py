@@ -18,17 +18,15 @@ CHANNELS = ("Height", "Height Retrace")
 Picture = Mapping[str, np.ndarray[tuple[int, int], np.dtype[np.float64]]]
 
 
-def scan_at(
-    world: World, number: int, *, direction: str = "up", region: Region = HOME, line_s: float = LINE_S
-) -> Picture:
-    scan = world.scan(region, (ROWS, ROWS), line_s, number * PERIOD_S, direction=direction)
+def scan_at(world: World, number: int, direction: str) -> Picture:
+    scan = world.scan(HOME, (ROWS, ROWS), LINE_S, number * PERIOD_S, direction=direction)
     return {name: scan.channels()[name][1] for name in CHANNELS}
 
 
-def world_with(flaw: str, changed_s: float, surface: str = "particles") -> World:
+def world_with(flaw: str, changed_s: float) -> World:
     """Return a world in which the tip changes at a time."""
     settings = {
-        "surface": {"kind": surface},
+        "surface": {"kind": "particles"},
         "drift": {"velocity_m_per_s": [0.02e-9, -0.02e-9, 0.0]},
         "tip_changes": {"schedule": [[changed_s, flaw]]},
     }
@@ -39,7 +37,7 @@ def world_with(flaw: str, changed_s: float, surface: str = "particles") -> World
 def night(flaw: str = "double", direction: str = "up") -> tuple[Picture, ...]:
     """Return three scans to learn from, one more good one, and one with a change in its middle."""
     world = world_with(flaw, (LEARNT + 1) * PERIOD_S + CHANGED_ROW * LINE_S)
-    return tuple(scan_at(world, number, direction=direction) for number in range(LEARNT + 2))
+    return tuple(scan_at(world, number, direction) for number in range(LEARNT + 2))
 
 
 def began_ns(number: int) -> int:

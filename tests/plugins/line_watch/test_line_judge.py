@@ -15,8 +15,6 @@ from tests.plugins.line_watch.line_scans_lab import (
     ROWS,
     Picture,
     night,
-    scan_at,
-    world_with,
 )
 
 from afspm.model import Region
@@ -120,19 +118,9 @@ def test_rows_from_the_last_to_the_first_are_judged_alike() -> None:
     assert ROWS - 1 - CHANGED_ROW - 20 <= row <= ROWS - 1 - CHANGED_ROW
 
 
-def test_debris_is_seen_at_a_new_place() -> None:
-    line_s, last = 2.0, 1000.0
-    world = world_with("contaminated", last + 10 * line_s, "rough")
-    judge, places = LineJudge(), [Region((3e-6 * i, 0.0), HOME.size_m) for i in range(LEARNT + 1)]
-    for number, place in enumerate(places[:-1]):
-        judge.learn(heights(scan_at(world, 3 * number, region=place, line_s=line_s)), place, KIND, 180.0 * number)
-    scan = world.scan(places[-1], (ROWS, ROWS), line_s, last).channels()
-    running = judge.begin(places[-1], KIND, last, channels=2)
-    assert running is not None
-    alarms = [running.add(row, [scan[channel][1][row] for channel in CHANNELS]) for row in range(ROWS)]
-    rows = [alarm.row for alarm in alarms if alarm is not None]
-    assert rows
-    assert min(rows) >= 10
+def test_scan_of_a_new_place_is_not_judged() -> None:
+    elsewhere = Region((3e-6, 0.0), HOME.size_m)
+    assert taught().begin(elsewhere, KIND, LEARNT * PERIOD_S, channels=2) is None
 
 
 def test_state_that_was_saved_judges_alike() -> None:

@@ -24,7 +24,7 @@ from tests.unit.client.client_lab import Lab, run
 from afspm import wire
 from afspm.basics.exit_codes import ExitCode
 from afspm.components.tip_verdict import BAD, LineVerdict, read_line_verdict, verdict_message
-from afspm.model import ControlRequest, Feedback, Problem, Scan
+from afspm.model import ControlRequest, Feedback, Problem, Scan, ScopeState, ScopeStatus
 from afspm.plugins.line_watch.line_watch import LineWatch
 
 TIP = Problem.TIP_SHAPE_CHANGED
@@ -33,6 +33,7 @@ TIP = Problem.TIP_SHAPE_CHANGED
 def tell(lab: Lab, number: int, picture: Picture, *, complete: bool = True) -> None:
     """Publish the lines of a scan, and its end."""
     at_s = 100.0 + number * PERIOD_S
+    lab.at(at_s, partial(lab.publish, ScopeStatus(ScopeState.SCANNING)))
     publish_lines(lab, picture, number, range(ROWS), at_s)
     if complete:
         publish_scan(lab, picture, number, at_s + 30.0)
@@ -129,3 +130,16 @@ def test_restarted_watch_learns_no_scan_twice(tmp_path: Path) -> None:
     run(again, second, tmp_path)
     assert again.memory["learnt_ns"] == learnt
     assert verdicts(second)[-1].stops, "judged with what the earlier life learnt"
+
+
+def test_alarm_that_comes_after_the_scan_flags_nothing() -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    at_s = 100.0 + (LEARNT + 1) * PERIOD_S
+    lab.at(at_s - 1.0, partial(lab.publish, ScopeStatus(ScopeState.FREE)))
+    publish_lines(lab, night()[-1], LEARNT + 1, range(ROWS), at_s)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(), lab)
+    assert verdicts(lab)
+    assert flags(lab) == 0

@@ -1,7 +1,7 @@
 """A watch on running scans: sees in their lines that the tip has changed.
 
-**Theory of operation.** Each line is compared with an earlier scan of the same place; what that scan does not explain is
-summed, and a sum above what good scans reach is an alarm.
+**Theory of operation.** Each line is compared with an earlier scan of the same place. What that scan does not explain
+is summed, and a sum above what good scans reach is an alarm.
 
     comes in      lines of running scans, complete scans, verdicts on these, the feedback, flags
     state         for each kind of scan: what is usual between good scans (saved), and the newest of them (not saved)

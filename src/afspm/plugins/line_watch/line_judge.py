@@ -3,8 +3,8 @@
 Each line is compared with an earlier scan of the place, at the shift that the lines so far have (`registration`). What
 the earlier scan does not explain, relative to what is usual between two good scans of this kind, goes into a CUSUM
 (Page 1954): its sum grows while lines differ more than usual, and falls back to zero while they do not. So a scar or a
-spike in one line is no alarm, and ten lines that differ a little are one. Where no earlier scan shows the place, the
-disagreement of trace and retrace alone is compared, which shows debris on the tip and nothing else.
+spike in one line is no alarm, and ten lines that differ a little are one. Where no earlier scan shows the place,
+nothing is judged.
 
 Thresholds are those of a kind of scan (same size, angle, pixels and setpoint; decision 0044): the sums that good scans
 reached, times a factor. A sum above the threshold is `STOP`, one above a part of it `LOOK`. Before an alarm, a wider
@@ -45,6 +45,7 @@ SPIKE = 6.0  # the same for a single pixel
 SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
+FEWEST_SUSPECT = 6  # rows since a change before a scan is stopped: fewer don't show whether the sample has jumped
 LOOK = 0.6  # share of the threshold
 GOOD_DECAY = 5.0  # of the share of good scans that reach some evidence
 FEWEST_PAIRS = 2  # of good scans, before such scans are judged
@@ -146,14 +147,12 @@ class KindReference:
     Attributes:
         places: earlier scans, the newest at the end.
         pairs: of scans of one place, the newest at the end.
-        unrest: of the disagreement of trace and retrace in good scans, the newest at the end.
         speeds: (rows, columns) per second by which the shift changed, the newest at the end.
     """
 
     kind: Kind
     places: list[Place] = field(default_factory=list)
     pairs: list[PairStatistics] = field(default_factory=list)
-    unrest: list[PairStatistics] = field(default_factory=list)
     speeds: list[Shift] = field(default_factory=list)
 
     def place(self, region: Region) -> Place | None:
@@ -245,19 +244,13 @@ def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> f
 
 @dataclass
 class _Comparer:
-    """Compares lines with a place, or trace with retrace where there is none."""
-
-    place: Place | None
-    registration: RowRegistration | None
+    place: Place
+    registration: RowRegistration
 
     def follow(self, row: int, line: Sequence[Array]) -> None:
-        if self.registration is not None:
-            self.registration.follow(row, line[0])
+        self.registration.follow(row, line[0])
 
     def fits(self, row: int, line: Sequence[Array]) -> list[RowFit]:
-        if self.registration is None or self.place is None:
-            difference = line[0] - line[1]
-            return [RowFit(difference - np.median(difference), np.abs(np.gradient(line[0])))]
         found = []
         for template, values in zip(self.place.templates, line, strict=True):
             fit = self.registration.fit(row, values, template)
@@ -315,13 +308,13 @@ class RunningScan:
         return self.alarm
 
     def _level(self) -> AlarmLevel | None:
-        if self.evidence >= 1.0:
+        if self.evidence >= 1.0 and sum(self._is_suspect(row) for row, _ in self._recent) >= FEWEST_SUSPECT:
             return AlarmLevel.STOP
         return AlarmLevel.LOOK if self.evidence >= LOOK else None
 
     def _has_jumped(self) -> bool:
         place, registration = self._comparer.place, self._comparer.registration
-        if place is None or registration is None or self._jumps >= MOST_JUMPS:
+        if self._jumps >= MOST_JUMPS:
             return False
         # since the change, for a sample that has jumped; all lines, for a lattice that was matched one period away
         suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
@@ -352,10 +345,10 @@ class _OddRows:
     doubtful: set[int] = field(default_factory=set)
     spikes: list[tuple[int, int, Array]] = field(default_factory=list)
 
-    def note(self, row: int, fits: Sequence[RowFit], statistic: LineStatistic, sigmas: float, *, spikes: bool) -> None:
+    def note(self, row: int, fits: Sequence[RowFit], statistic: LineStatistic, sigmas: float) -> None:
         if sigmas > SCAR:
             self.doubtful.add(row)
-        for channel, fit in enumerate(fits if spikes else ()):
+        for channel, fit in enumerate(fits):
             off = np.nan_to_num(np.abs(fit.residual) / statistic.sigma_m(fit.steepness))
             beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
             alone = (off > SPIKE) & (beside < 0.5 * off)
@@ -395,9 +388,6 @@ class LineJudge:
             registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
             what = "lines differ from the earlier scan of this place"
             return RunningScan(_Comparer(place, registration), LineStatistic(known.pairs), what)
-        if place is None and channels == 2 and len(known.unrest) > FEWEST_PAIRS:
-            what = "trace and retrace disagree more than in earlier scans"
-            return RunningScan(_Comparer(None, None), LineStatistic(known.unrest), what)
         return None
 
     def learn(
@@ -449,10 +439,6 @@ class LineJudge:
             registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
             _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs, odd))
             known.note_shift(place, region, at_s, registration.shift)
-        if len(picture) == 2:
-            # where an earlier scan shows the place, rows are compared with it alone
-            other = _OddRows() if place is not None else odd
-            _append(known.unrest, _statistics(_Comparer(None, None), lines, known.unrest, other))
         return odd
 
     def state(self) -> Plain:
@@ -508,7 +494,7 @@ def _statistics(
     statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
     for row, fits in fitted:
         sigmas = statistic.sigmas(fits)
-        odd.note(row, fits, statistic, sigmas, spikes=comparer.place is not None)
+        odd.note(row, fits, statistic, sigmas)
         cusum.add(row, sigmas)
         highest = max(highest, cusum.value)
     return PairStatistics(flat_m, per_slope, usual, spread, highest)

@@ -13,7 +13,7 @@ from afspm.basics.units import convert
 from afspm.client.component import Component
 from afspm.components import tip_verdict
 from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
-from afspm.model import ControlState, Feedback, Scan, ScanLines
+from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState
 from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, RunningScan, confidence
 from afspm.plugins.line_watch.registration import Array
 
@@ -63,7 +63,7 @@ class LineWatch(Component):
     """Flags `tip-shape-changed` while a scan is running, as soon as its lines show that the tip has changed.
 
     The scheduler then stops the scan, so its remaining time is saved. Each line is compared with an earlier scan of the
-    place at the predicted drift; where there is none, only the disagreement of trace and retrace is compared. It learns
+    place at the predicted drift; where there is none, nothing is judged. It learns
     from the first scans of each size, number of pixels and setting of the feedback, so the tip must be good then: scans
     are judged from the fourth of a place on. It learns nothing from a scan with an alarm, from one during which a
     problem was flagged or the feedback was changed, or from one that a `TipClassifier` calls bad.
@@ -212,8 +212,13 @@ class LineWatch(Component):
         )
         # published first: a series that loses its scan looks for the row
         self.publish(tip_verdict.line_verdict_message(verdict), f"{tip_verdict.OF_LINES}_{self.name}")
-        if stops and not self._is_flagged:
-            self.scope.flag(self.problem)
+        if not stops:
+            return
+        # on a busy computer lines wait here, while the scan may end, and others find and repair the tip
+        if self.scope.state is not ScopeState.SCANNING or self.scope.control_state.problems:
+            self.log.warning("row %d came late: the scan is over already, and nothing is flagged", alarm.row)
+            return
+        self.scope.flag(self.problem)
 
     def _learn_finished(self) -> None:
         finished, self._finished = self._finished, None
