@@ -4,7 +4,7 @@
 is summed, and a sum above what good scans reach is an alarm.
 
     comes in      lines of running scans, complete scans, verdicts on these, the feedback, flags
-    state         for each kind of scan: what is usual between good scans (saved), and the newest of them (not saved)
+    state         for each kind of scan: the usual difference of good scans (saved), and the newest of them (not saved)
     goes out      a `TipVerdict` with the row; the flag `tip-shape-changed`
     always holds  nothing is learnt from a scan with an alarm, under a flag, with a changed feedback, or called bad
 

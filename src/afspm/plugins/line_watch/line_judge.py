@@ -1,7 +1,7 @@
 """Judge of running scans: sees in the lines that the tip has changed. Pure.
 
 Each line is compared with an earlier scan of the place, at the shift that the lines so far have (`registration`). What
-the earlier scan does not explain, relative to what is usual between two good scans of this kind, goes into a CUSUM
+the earlier scan does not explain, relative to the usual difference of two good scans of this kind, goes into a CUSUM
 (Page 1954): its sum grows while lines differ more than usual, and falls back to zero while they do not. So a scar or a
 spike in one line is no alarm, and ten lines that differ a little are one. Where no earlier scan shows the place,
 nothing is judged.
@@ -147,7 +147,7 @@ class KindReference:
     Attributes:
         places: earlier scans, the newest at the end.
         pairs: of scans of one place, the newest at the end.
-        speeds: (rows, columns) per second by which the shift changed, the newest at the end.
+        speeds: changes of the shift in (rows, columns) per second, the newest at the end.
     """
 
     kind: Kind
@@ -234,7 +234,7 @@ class LineStatistic:
 
 
 def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> float:
-    """Return the mean squared difference of a line, in units of what is usual at each pixel, with a limit for each."""
+    """Return the mean squared difference of a line, in units of the usual one at each pixel, with a limit for each."""
     means = []
     for fit in fits:
         square = (fit.residual / np.hypot(flat_m, per_slope * fit.steepness)) ** 2
@@ -442,14 +442,14 @@ class LineJudge:
         return odd
 
     def state(self) -> Plain:
-        """Return what is usual of each kind, to save, in JSON's types. The earlier scans are not in it."""
+        """Return the statistics of each kind, to save, in JSON's types. The earlier scans are not in it."""
         return {"kinds": [to_plain(replace(one, places=[], speeds=[]), lists=True) for one in self._kinds]}
 
     def restore(self, state: Plain) -> None:
         self._kinds = [from_plain(KindReference, kept) for kept in state["kinds"]]
 
     def forget_places(self) -> None:
-        """Forget all earlier scans: the tip is another one now. What is usual of each kind is kept."""
+        """Forget all earlier scans: the tip is another one now. The statistics of each kind are kept."""
         for kind in self._kinds:
             kind.places.clear()
 

@@ -181,7 +181,7 @@ class LineWatch(Component):
             )
 
     def _judge(self, lines: ScanLines, running: _Lines) -> None:
-        # a line is judged when all its channels have come; the order of lines is that of the scan
+        # a line is judged when all its channels have come; lines come in the order of the scan
         newest = range(lines.first_row, lines.first_row + len(lines.values))
         downwards = running.taken and newest.stop <= running.taken[-1]
         for row in reversed(newest) if downwards else newest:

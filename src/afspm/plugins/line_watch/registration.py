@@ -1,7 +1,7 @@
 """Registration of single rows against an earlier scan of the same place. Pure.
 
 The rows of a scan arrive one by one, while the sample drifts. A row alone fixes its place badly (a flat terrace, one
-particle), so the cost of every shift in a window is summed over rows, and older rows count less. What is left of a
+particle), so the cost of every shift in a window is summed over rows, and older rows count less. The remainder of a
 shift below a pixel is fitted with offset and tilt of the row: to first order it adds the template's two slopes.
 """
 
@@ -18,11 +18,11 @@ from scipy import ndimage
 
 Array = NDArray[np.float64]
 Shift = tuple[float, float]
-"""(rows, columns) by which the content of the template lies further on than that of the running scan."""
+"""(rows, columns) from the running scan to the same feature in the template."""
 
 FORGET = 0.85  # weight of the older rows in the cost of a shift
 LEAST_OVERLAP = 0.4  # share of a row that the template must cover
-PRIOR_PX = 0.7  # standard deviation of what is left of a shift
+PRIOR_PX = 0.7  # standard deviation of the remainder of a shift
 MOST_MOVED_PX = 1.5
 ITERATIONS = 2  # the template's slopes are those at the place that the first one finds
 PULL = 0.02  # cost of each squared pixel from the predicted shift, on ground too flat to show a shift
@@ -224,7 +224,7 @@ def _vertex(cost: Array, at: int) -> float:
 
 
 def _unexplained(difference: Array, basis: Array, inside: NDArray[np.bool_], moved: Array) -> tuple[Array, Array]:
-    # three times, with less weight for what is far off: pixels that a scar moved must not move the fit
+    # three times, with less weight for outliers: pixels that a scar moved must not move the fit
     weights, residual, found = inside.astype(np.float64), difference, np.zeros(4)
     prior = np.array([0.0, 0.0, 1.0 / PRIOR_PX**2, 1.0 / PRIOR_PX**2])
     for _ in range(3):
