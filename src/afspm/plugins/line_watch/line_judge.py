@@ -47,7 +47,7 @@ MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
 FEWEST_SUSPECT = 6  # rows since a change before a scan is stopped: fewer don't show whether the sample has jumped
 LOOK = 0.6  # share of the threshold
-GOOD_DECAY = 5.0  # of the share of good scans that reach some evidence
+GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
 FEWEST_PAIRS = 2  # of good scans, before such scans are judged
 KEPT_PAIRS, KEPT_SPEEDS = 16, 3
 MOST_KINDS, MOST_PLACES = 4, 8
@@ -206,7 +206,7 @@ class Cusum:
 
 
 def confidence(evidence: float) -> float:
-    """Return the share of scans with a good tip whose evidence stays below this, fitted to simulated ones."""
+    """Return a rough share of scans with a good tip whose evidence stays below this: an assumed exponential."""
     return 1.0 - math.exp(-GOOD_DECAY * max(0.0, evidence))
 
 
