@@ -64,15 +64,25 @@ class Events(Iterator[PublishedEvent]):
             except ExperimentEnded:
                 self.close()
                 raise StopIteration from None
-            packet = self._backlog.take()
-            if packet is None:
-                continue
-            try:
-                message = wire.decode(wire.message_of(packet.envelope), packet.payload)
-            except WireError as error:
-                self._link.log.warning("a packet can't be read: %s", error)
-                continue
-            return PublishedEvent(packet.envelope, message, packet.time_ns)
+            if (event := self._next_kept()) is not None:
+                return event
+
+    def waiting(self) -> Iterator[PublishedEvent]:
+        """Yield the messages that have arrived, without waiting for more."""
+        while len(self._backlog) > 0:
+            if (event := self._next_kept()) is not None:
+                yield event
+
+    def _next_kept(self) -> PublishedEvent | None:
+        packet = self._backlog.take()
+        if packet is None:
+            return None
+        try:
+            message = wire.decode(wire.message_of(packet.envelope), packet.payload)
+        except WireError as error:
+            self._link.log.warning("a packet can't be read: %s", error)
+            return None
+        return PublishedEvent(packet.envelope, message, packet.time_ns)
 
     def close(self) -> None:
         """Drop all waiting messages, and keep no more."""

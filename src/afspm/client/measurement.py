@@ -8,7 +8,15 @@ from datetime import UTC
 from typing import Any
 
 from afspm import wire
-from afspm.basics.errors import ExperimentEnded, MeasurementFailed, NoResponse, Refused, RequestError, WireError
+from afspm.basics.errors import (
+    ControlLost,
+    ExperimentEnded,
+    MeasurementFailed,
+    NoResponse,
+    Refused,
+    RequestError,
+    WireError,
+)
 from afspm.basics.formatting import day_and_time
 from afspm.client.command_retry import NOT_IN_CONTROL, CommandRetry
 from afspm.client.control_hold import ControlHold
@@ -66,6 +74,7 @@ class _MeasurementTask:
     key: str | None
     stem: str
     until_s: float | None
+    repeat: bool = True
     attempt: int = 0
     failures: int = 0
     interruptions: list[str] = field(default_factory=list)
@@ -101,21 +110,20 @@ class MeasurementRunner:
         self._channels: dict[str, frozenset[str]] = {}
         self._unfinished = self._of_earlier_life()
 
-    def take(self, target: Target, key: str | None, until_s: float | None) -> MeasurementResult:
+    def take(self, target: Target, key: str | None, until_s: float | None, *, repeat: bool = True) -> MeasurementResult:
         """Measure until there is a complete result; with a key, once in all lives of the component.
 
         Raises:
             Refused: the microscope or a limit refuses.
             NoResponse: not until `until_s`.
             MeasurementFailed: the microscope fails again and again.
-            ControlLost: control was not given until `until_s`.
+            ControlLost: control was not given until `until_s`; or, without `repeat`, was lost during the measurement.
         """
         if key is not None and (found := self._results.find(check_key(key), target.facts())) is not None:
             return found
         self._link.wait_caught_up(until_s)  # a cached result must not be taken for this measurement's
-        task = _MeasurementTask(
-            target, key, f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id(), until_s
-        )
+        stem = f"{self._link.name}/{KEYED}/{key}" if key else self._link.next_id()
+        task = _MeasurementTask(target, key, stem, until_s, repeat)
         try:
             self._take_up(task)
             things = self._finish(task)
@@ -301,6 +309,8 @@ class MeasurementRunner:
         else:
             why = self._why_failed(target, cycle)
         task.interruptions.append(f"{day_and_time(self._link.clock.now_ns(), UTC)}: {why}")
+        if not task.repeat and not self._control.held:
+            raise ControlLost(f"{target.what} interrupted: {why}", where=self._link.name)
         self._link.log.warning("%s interrupted: %s; retrying", target.what, why)
         # lost control is a known reason, and comes back; any other failure must not repeat for a night
         task.failures = task.failures + 1 if self._control.held else 0

@@ -99,6 +99,7 @@ class Scope(ExperimentView):
         *,
         shape: tuple[int, int] | None = None,
         key: str | None = None,
+        repeat: bool = True,
         timeout_s: float | None = None,
     ) -> ScanSet:
         """Take a scan and return all its channels.
@@ -112,10 +113,11 @@ class Scope(ExperimentView):
             key: take this scan once in this run: after a restart the component gets the scan of its earlier life. Each
                 component has its own keys, one for each measurement. A saved scan needs its space on disk until
                 `forget`.
+            repeat: False raises ControlLost where control was lost during the scan, instead of taking it again.
         """
         with self._call():
             target = ScanTarget.of(region, shape, self._frame)
-            return self._runner.take(target, key, self._link.until(timeout_s)).scans
+            return self._runner.take(target, key, self._link.until(timeout_s), repeat=repeat).scans
 
     def spectrum(
         self,

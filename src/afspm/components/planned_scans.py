@@ -10,13 +10,15 @@ from datetime import UTC
 from typing import Any, Literal
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.errors import ConfigError, InvalidValue, RequestError, UnitError
+from afspm.basics.errors import ConfigError, ControlLost, InvalidValue, Refused, RequestError, UnitError
 from afspm.basics.formatting import day_and_time
 from afspm.basics.units import Angle, Length, Period, convert, si
 from afspm.client.component import Component
+from afspm.client.events import Events
 from afspm.client.parameter_text import to_parameter
-from afspm.components.scan_plan import XY, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
-from afspm.model import Region, names
+from afspm.components import tip_verdict
+from afspm.components.scan_plan import XY, PlanRest, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
+from afspm.model import Region, ScanSet, names
 from afspm.model.names import BASE_PARAMETERS
 from afspm.model.planned_work import PlannedWork, planned_rounds
 
@@ -25,9 +27,10 @@ Pixels = tuple[int, int]
 FRAME = (names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y, names.SCAN_SIZE_X, names.SCAN_SIZE_Y)
 
 
-Missed = Literal["extend", "catch-up", "skip"]
+Missed = Literal["extend", "catch-up", "skip", "rest"]
 _MISSED: dict[Missed, str] = {
     "extend": "to be taken at the end",
+    "rest": "to be taken at the end",
     "catch-up": "to be taken now, one after the other",
     "skip": "skipped",
 }
@@ -44,7 +47,8 @@ class PlannedScans(Component):
         end_when_done: whether to end the whole experiment after the last scan.
         parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
         missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
-            are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never.
+            are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never;
+            "rest": as "extend", and of a scan that a `LineWatch` stopped only the rows since the change are taken.
 
     Attributes:
         plan: the regions, and the number of rounds.
@@ -151,21 +155,58 @@ class PlannedScans(Component):
     def _take(self, step: PlanStep) -> None:
         if step.starts_round:
             self._round_began_s = self.clock.now_s()
-        scans = self.scope.scan(step.region, shape=step.shape, key=step.key)
+        scans = self._scan_rest(step) if self.missed == "rest" and step.shape else self._scan(step)
         if scans.interruptions:
             self._round_began_s = None
         if self._round_began_s is not None and (step.index + 1) % len(self.plan.regions) == 0:
             round_s = self.clock.now_s() - self._round_began_s
             self.memory["pace_s"] = min(round_s, float(self.memory.get("pace_s", round_s)))
         self.memory["done"], self.memory["done_s"] = step.index + 1, self.clock.now_s()
+        rest = self.memory.pop("rest", None)
         if self.memory.save(synced=False):  # if not saved, a restart requests the same scan
-            self.scope.forget(step.key)
+            self.scope.forget(PlanRest(*rest).of(step).key if rest else step.key)
         for interruption in scans.interruptions:
             self.log.warning("%s was interrupted, and taken again: %s", step.key, interruption)
         if (total := self._total) is not None:
             self.scope.progress(step.index + 1, total, left_s=self._left_s(step.index + 1, total))
         at = "" if scans.time is None else f"at {day_and_time(round(scans.time.timestamp() * NS_PER_S), UTC)}"
         self.log.info("scan %d%s %s", step.index + 1, self._of_total(), at)
+
+    def _scan(self, step: PlanStep, *, repeat: bool = True) -> ScanSet:
+        return self.scope.scan(step.region, shape=step.shape, key=step.key, repeat=repeat)
+
+    def _scan_rest(self, step: PlanStep) -> ScanSet:
+        rows, _ = step.shape or (0, 0)
+        kept = self.memory.get("rest")
+        rest = PlanRest(*kept) if kept else PlanRest(0, rows - 1)
+        with self.scope.events(tip_verdict.OF_LINES) as verdicts:
+            while True:
+                part = rest.of(step)
+                try:
+                    return self._scan(part, repeat=False)
+                except ControlLost as lost:
+                    self._round_began_s = None
+                    self.log.warning("%s: %s", part.key, lost.what)
+                except Refused as refused:
+                    if part is step:
+                        raise
+                    self.log.warning("%s can't be taken alone: %s; all rows are taken again", part.key, refused.reason)
+                    rest = PlanRest(0, rows - 1)
+                with self.scope.control():  # in control again: the tip is repaired, and all verdicts have arrived
+                    pass
+                rest = self._since_change(rest, part, verdicts)
+
+    def _since_change(self, rest: PlanRest, part: PlanStep, verdicts: Events) -> PlanRest:
+        found = [tip_verdict.read_line_verdict(event.message) for event in verdicts.waiting()]
+        stopping = [one for one in found if one is not None and one.stops and one.shape == part.shape]
+        if not stopping:
+            return rest
+        rest = rest.since(stopping[-1].since_row, downwards=stopping[-1].downwards)
+        self.log.info("%s: rows %d to %d are left", part.key, rest.first, rest.last)
+        # saved before the request: after a kill the same rows are requested, under the same key
+        self.memory["rest"] = [rest.first, rest.last]
+        self.memory.save()
+        return rest
 
     def _left_s(self, done: int, total: int) -> float:
         # as fast as so far, but not faster than `every` allows

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import lengths_text
 from afspm.model import Region
 
 XY = tuple[float, float]
+REST_OVERLAP = 2  # rows before the estimated change that are taken again
+FEWEST_ROWS = 8  # of the rest of a scan: fewer rows show too little to be judged or registered
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,45 @@ class RoundSchedule:
     def too_slow_for(self, left_out: int, pace_s: float) -> int:
         """Return how many of these rounds were missed because one takes `pace_s`, longer than the period."""
         return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
+
+
+@dataclass(frozen=True)
+class PlanRest:
+    """Rows of a scan that are still to be taken.
+
+    Attributes:
+        first, last: indices of the rows in the whole scan.
+    """
+
+    first: int
+    last: int
+
+    def since(self, row: int, *, downwards: bool) -> PlanRest:
+        """Return the rows from one of these on, with some before it, as a part of the whole scan.
+
+        Args:
+            row: index in this part.
+            downwards: whether the rows are scanned from the last to the first.
+        """
+        at = self.first + min(max(row, 0), self.last - self.first)
+        if downwards:
+            return PlanRest(self.first, min(self.last, max(at + REST_OVERLAP, self.first + FEWEST_ROWS - 1)))
+        return PlanRest(max(self.first, min(at - REST_OVERLAP, self.last - FEWEST_ROWS + 1)), self.last)
+
+    def of(self, step: PlanStep) -> PlanStep:
+        """Return the step that measures only these rows, under a key of its own."""
+        rows, columns = step.shape or (0, 0)
+        if (self.first, self.last) == (0, rows - 1):
+            return step
+        width_m, height_m = step.region.size_m
+        away_m = ((self.first + self.last) / 2 / (rows - 1) - 0.5) * height_m
+        angle = step.region.angle_rad
+        x_m, y_m = step.region.center_m
+        center_m = (x_m - away_m * math.sin(angle), y_m + away_m * math.cos(angle))
+        size_m = (width_m, (self.last - self.first) / (rows - 1) * height_m)
+        region = replace(step.region, center_m=center_m, size_m=size_m)
+        shape = (self.last - self.first + 1, columns)
+        return replace(step, key=f"{step.key}-rows-{self.first}-{self.last}", region=region, shape=shape)
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:

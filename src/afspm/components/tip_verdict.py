@@ -1,17 +1,98 @@
-"""The verdict on a scan as a message of the contract: a list of places, each with a score."""
+"""Verdicts on the tip as messages.
+
+The verdict on a complete scan is a message of the contract: a list of places, each with a score. The verdict on the
+lines of a running scan is a `TipVerdict`.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 from afspm import wire
-from afspm.model import Scan
+from afspm.model import Region, Scan, ScanParameters
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE, read_verdict
 
-__all__ = ["BAD", "GOOD", "MESSAGE", "UNCLEAR", "read_verdict", "verdict_message"]
+__all__ = [
+    "BAD",
+    "GOOD",
+    "MESSAGE",
+    "OF_LINES",
+    "UNCLEAR",
+    "LineVerdict",
+    "line_verdict_message",
+    "read_line_verdict",
+    "read_verdict",
+    "verdict_message",
+]
 
 MESSAGE = VERDICT_MESSAGE
+OF_LINES = "TipVerdict"
 GOOD, UNCLEAR = 1.0, 0.5
+
+
+@dataclass(frozen=True)
+class LineVerdict:
+    """The tip has changed during a scan.
+
+    Attributes:
+        region, shape: of the whole scan.
+        began_ns: its start, as in its lines.
+        row: index of the row that raised the alarm.
+        since_row: index of the first row with the change, by estimate.
+        downwards: whether rows are scanned from the last to the first.
+        confidence: share of scans with a good tip that give less evidence.
+        stops: the scan is stopped; else a person may look.
+    """
+
+    region: Region
+    shape: tuple[int, int]
+    channel: str
+    began_ns: int | None
+    row: int
+    since_row: int
+    downwards: bool
+    confidence: float
+    stops: bool
+    reason: str = ""
+
+
+def line_verdict_message(verdict: LineVerdict) -> Any:
+    """Return a `TipVerdict`."""
+    message: Any = wire.message_type(OF_LINES)(
+        channel=verdict.channel,
+        row=verdict.row,
+        since_row=verdict.since_row,
+        downwards=verdict.downwards,
+        confidence=verdict.confidence,
+        stops=verdict.stops,
+        reason=verdict.reason,
+    )
+    message.params.MergeFromString(wire.encode(ScanParameters(verdict.region, verdict.shape))[1])
+    if verdict.began_ns is not None:
+        message.timestamp.FromNanoseconds(verdict.began_ns)
+    return message
+
+
+def read_line_verdict(message: Any) -> LineVerdict | None:
+    """Return the content of a `TipVerdict`; None without region and pixels."""
+    parameters = wire.decode("ScanParameters2d", message.params.SerializeToString())
+    if not (isinstance(parameters, ScanParameters) and isinstance(parameters.region, Region)):
+        return None
+    if not isinstance(parameters.shape, tuple):
+        return None
+    return LineVerdict(
+        parameters.region,
+        parameters.shape,
+        message.channel,
+        message.timestamp.ToNanoseconds() if message.HasField("timestamp") else None,
+        message.row,
+        message.since_row,
+        message.downwards,
+        message.confidence,
+        message.stops,
+        message.reason,
+    )
 
 
 def verdict_message(scan: Scan, score: float) -> Any:

@@ -248,6 +248,9 @@ POINTS: Final = MessageDeclaration(
 FEEDBACK_ANALYSIS: Final = MessageDeclaration(
     type=feedback_pb2.FeedbackAnalysis, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False
 )
+TIP_VERDICT: Final = MessageDeclaration(
+    type=lines_pb2.TipVerdict, kind=MessageKind.RESULT, source=Role.COMPONENT, always=False, named=True
+)
 
 _MODULES = (
     analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, instruments_pb2,

@@ -185,3 +185,18 @@ def test_channels_without_end_push_out_the_oldest() -> None:
         store.take_scan(scan(1.0, i + 1, f"channel {i}"), i + 1)
     assert len(store.channels) == MOST_CHANNELS
     assert store.newest(f"channel {3 * MOST_CHANNELS - 1}") is not None
+
+
+def test_row_with_a_changed_tip_is_marked_in_the_scan_that_is_running() -> None:
+    store = FrameStore()
+    store.take_lines(lines(0, 1.0, began_ns=7))
+    before = store.newest_number()
+    store.take_change(7, 1)
+    frame = store.newest()
+    assert frame is not None
+    assert frame.changed_row == 1
+    assert store.newest_number() > before, "a page that waits for a newer picture gets this one"
+    store.take_lines(lines(1, 1.0, began_ns=7))
+    assert (store.newest() or frame).changed_row == 1
+    store.take_lines(lines(0, 1.0, began_ns=9))
+    assert (store.newest() or frame).changed_row is None

@@ -25,6 +25,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "region_grid": ("[grid]\ncounts = [2, 2]\npixels = [16, 16]\n", 4, 0),
     "adaptive_map": ("[map.until]\nspectra = 12\n", 0, 12),
     "spectroscopy_grid": ("[curves]\ncounts = [2, 2]\n", 0, 4),
+    "line_watch": ("[series]\nscans = 2\npixels = [16, 16]\n", 2, 0),
     "picture": ("[clock]\nspeed = 600.0\n[details]\npixels = [16, 12]\n", 3, 0),
     "own_component": (SERIES, 2, 0),
     "other_language": ("[flattest]\npixels = 32\n", 2, 0),

@@ -15,7 +15,19 @@ from afspm.basics.exit_codes import ExitCode
 from afspm.client.component import Component
 from afspm.components.planned_scans import ScanList, ScanSeries
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
-from afspm.model import RELAY_REQUEST, ControlRequest, Note, Problem, Progress, Request
+from afspm.components.tip_verdict import LineVerdict, line_verdict_message
+from afspm.model import (
+    RELAY_REQUEST,
+    ControlRequest,
+    ControlResponse,
+    Note,
+    Problem,
+    Progress,
+    Region,
+    Request,
+    Response,
+    ScanParameters,
+)
 
 
 def series(scans: int = 3, *, keep_control: bool = False, end_when_done: bool = True, **planned: Any) -> ScanSeries:
@@ -281,3 +293,81 @@ def test_spectroscopy_grid_publishes_its_progress() -> None:
 def test_a_series_without_a_sensible_period_is_refused(every: float) -> None:
     with pytest.raises(ConfigError, match="a period of"):
         ScanSeries(size=(1e-6, 1e-6), every=every)
+
+
+def line_verdict(shape: tuple[int, int], row: int, *, stops: bool) -> LineVerdict:
+    where = Region((0.0, 0.0), (1e-6, 1e-6))
+    return LineVerdict(where, shape, "Height", None, row + 3, row, downwards=False, confidence=0.99, stops=stops)
+
+
+def stop_at_row(lab: Lab, row: int, shape: tuple[int, int] = (32, 8)) -> None:
+    """Publish a verdict on the running scan, and flag the tip."""
+    verdict = line_verdict(shape, row, stops=True)
+    lab.publish(line_verdict_message(verdict), "TipVerdict_line_watch")
+    lab.flag(Problem.TIP_SHAPE_CHANGED)
+
+
+def rest_series() -> ScanSeries:
+    return ScanSeries(size=(1e-6, 1e-6), pixels=(8, 32), every=900.0, scans=2, end_when_done=True, missed="rest")
+
+
+def test_rest_of_a_scan_is_taken_from_the_row_of_the_alarm(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("series")
+    lab.at(40.0, lambda: stop_at_row(lab, 20))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    with caplog.at_level("INFO"):
+        assert run(rest_series(), lab) == ExitCode.ENDED
+    assert "rows 18 to 31 are left" in caplog.text
+    rest, whole = lab.finished
+    assert rest.size_m == pytest.approx((1e-6, 13 / 31 * 1e-6))
+    assert rest.center_m == pytest.approx((0.0, (24.5 / 31 - 0.5) * 1e-6))
+    assert whole.size_m == pytest.approx((1e-6, 1e-6))
+
+
+def test_whole_scan_is_taken_again_after_an_interruption_without_a_row() -> None:
+    lab = Lab("series")
+    lab.at(40.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    assert run(rest_series(), lab) == ExitCode.ENDED
+    assert [region.size_m for region in lab.finished] == [pytest.approx((1e-6, 1e-6))] * 2
+
+
+def test_verdict_for_a_person_does_not_shorten_a_scan() -> None:
+    lab = Lab("series")
+    look = line_verdict((32, 8), 18, stops=False)
+    lab.at(30.0, lambda: lab.publish(line_verdict_message(look), "TipVerdict_line_watch"))
+    lab.at(40.0, lambda: lab.flag(Problem.TIP_SHAPE_CHANGED))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    assert run(rest_series(), lab) == ExitCode.ENDED
+    assert [region.size_m for region in lab.finished] == [pytest.approx((1e-6, 1e-6))] * 2
+
+
+def test_refused_rest_is_replaced_by_the_whole_scan() -> None:
+    lab = Lab("series")
+
+    def no_fewer_rows(request: Request) -> Response | str:
+        parameters = request.subject
+        if isinstance(parameters, ScanParameters) and parameters.shape not in (None, (32, 8)):
+            return Response(ControlResponse.PARAM_ERROR, reason="rows must be 32")
+        return "go on"
+
+    lab.intercept = no_fewer_rows
+    lab.at(40.0, lambda: stop_at_row(lab, 20))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    assert run(rest_series(), lab) == ExitCode.ENDED
+    assert [region.size_m for region in lab.finished] == [pytest.approx((1e-6, 1e-6))] * 2
+
+
+def test_rest_is_taken_once_over_a_kill(tmp_path: Path) -> None:
+    lab = Lab("series")
+    lab.at(40.0, lambda: stop_at_row(lab, 20))
+    lab.at(400.0, lambda: lab.clear(Problem.TIP_SHAPE_CHANGED))
+    port = LabPort(lab)
+    lab.at(430.0, lambda: setattr(port, "is_dead", True))
+    context = context_of(lab, tmp_path)
+    context.open_port, context.session = lambda: port, "killed"
+    with pytest.raises(Kill9):
+        rest_series().run_process(context)
+    lab.restart_component()
+    assert run(rest_series(), lab, tmp_path) == ExitCode.ENDED
+    assert [round(region.size_m[1] * 1e9) for region in lab.finished] == [419, 1000]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.components.planned_scans import RegionGrid, ScanList, ScanSeries
-from afspm.components.scan_plan import RoundSchedule, ScanPlan, grid_centers, rounds_within
+from afspm.components.scan_plan import PlanRest, PlanStep, RoundSchedule, ScanPlan, grid_centers, rounds_within
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.model import Region
 
@@ -131,3 +131,34 @@ def test_spectra_need_either_a_grid_or_positions() -> None:
     for settings in refused:
         with pytest.raises(ConfigError):
             SpectroscopyGrid(**settings)
+
+
+STEP = PlanStep(0, "scan-0", Region((1e-6, 2e-6), (1e-6, 2e-6), math.pi / 2), (101, 51), starts_round=True)
+
+
+def test_rest_of_a_scan_covers_its_last_rows_with_some_overlap() -> None:
+    part = PlanRest(0, 100).since(52, downwards=False).of(STEP)
+    assert part.key == "scan-0-rows-50-100"
+    assert part.shape == (51, 51)
+    assert part.region.size_m == pytest.approx((1e-6, 1e-6))
+    # turned by 90 degrees, later rows lie at smaller x
+    assert part.region.center_m == pytest.approx((0.5e-6, 2e-6))
+
+
+def test_rest_of_a_downward_scan_covers_its_first_rows() -> None:
+    part = PlanRest(0, 100).since(48, downwards=True).of(STEP)
+    assert (part.key, part.shape) == ("scan-0-rows-0-50", (51, 51))
+
+
+def test_rest_of_a_rest_counts_rows_of_the_whole_scan() -> None:
+    rest = PlanRest(50, 100).since(22, downwards=False)
+    assert (rest.first, rest.last) == (70, 100)
+
+
+def test_rest_has_rows_enough_to_be_judged() -> None:
+    rest = PlanRest(0, 100).since(100, downwards=False)
+    assert (rest.first, rest.last) == (93, 100)
+
+
+def test_whole_rest_is_the_step_itself() -> None:
+    assert PlanRest(0, 100).of(STEP) is STEP

@@ -28,6 +28,7 @@ class ChannelFrame:
         began_ns: the time that its lines carry; None if it arrived in one piece.
         rows: number of rows that have arrived.
         newest_row: index of the last of them; None for a finished frame.
+        changed_row: index of the first row with a changed tip, by the lines; None if none was seen.
     """
 
     number: int
@@ -39,6 +40,7 @@ class ChannelFrame:
     began_ns: int | None = None
     rows: int = 0
     newest_row: int | None = None
+    changed_row: int | None = None
 
     @property
     def complete(self) -> bool:
@@ -66,6 +68,7 @@ class FrameStore:
         self._newest: dict[str, ChannelFrame] = {}
         self._came: dict[str, NDArray[np.bool_]] = {}
         self._kept: OrderedDict[FrameKey, ChannelFrame] = OrderedDict()
+        self._changed: tuple[int | None, int] | None = None  # start of a scan, and its first row with a changed tip
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -87,8 +90,9 @@ class FrameStore:
         self._came.pop(scan.channel, None)
         began_ns = before.began_ns if before is not None and not before.complete else None
         frame = ChannelFrame(
-            self._next(), scan.channel, scan.unit, scan.region, scan.values, time_ns, began_ns, scan.shape[0]
-        )
+            self._next(), scan.channel, scan.unit, scan.region, scan.values, time_ns, began_ns, scan.shape[0],
+            changed_row=self._changed_row(began_ns),
+        )  # fmt: skip
         self._put(frame)
         self._kept[time_ns, frame.channel] = frame
         self.kept_bytes += frame.values.nbytes
@@ -119,7 +123,15 @@ class FrameStore:
         self._put(ChannelFrame(
             self._next(), lines.channel, lines.unit, lines.region, picture, None, lines.began_ns,
             rows=int(came.sum()), newest_row=lines.first_row if downwards else last - 1,
+            changed_row=self._changed_row(lines.began_ns),
         ))  # fmt: skip
+
+    def take_change(self, began_ns: int | None, row: int) -> None:
+        """Mark the first row with a changed tip in all channels of a scan, by its start."""
+        self._changed = began_ns, row
+        for frame in list(self._newest.values()):
+            if frame.began_ns is not None and frame.began_ns == began_ns:
+                self._put(replace(frame, number=self._next(), changed_row=row))
 
     def newest(self, channel: str | None = None) -> ChannelFrame | None:
         """Return the newest frame of a channel (None: the channel seen first); a growing one is copied."""
@@ -137,6 +149,10 @@ class FrameStore:
 
     def _of(self, channel: str | None) -> ChannelFrame | None:
         return next(iter(self._newest.values()), None) if channel is None else self._newest.get(channel)
+
+    def _changed_row(self, began_ns: int | None) -> int | None:
+        is_of_it = self._changed is not None and began_ns is not None and self._changed[0] == began_ns
+        return self._changed[1] if self._changed is not None and is_of_it else None
 
     def _has_room(self, lines: ScanLines) -> bool:
         # a few lines may announce a scan of millions of lines

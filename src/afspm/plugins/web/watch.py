@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from afspm.basics.clock import Clock
+from afspm.components.tip_verdict import OF_LINES, read_line_verdict
 from afspm.model import ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.model.line_levelling import Array
 from afspm.plugins.web.frames import FrameStore
@@ -120,6 +121,8 @@ class Watch:
                 self.frames.take_lines(thing)
             elif isinstance(thing, Spectrum):
                 self.spectra.take(thing, time_ns)
+            elif message == OF_LINES and (verdict := read_line_verdict(thing)) is not None:
+                self.frames.take_change(verdict.began_ns, verdict.since_row)
             elif message == "DriftMapping":
                 # without correction components use tip coordinates, so the map needs no conversion
                 is_mapping = len(thing.matrix) == 6 and thing.correcting

@@ -70,6 +70,7 @@ class RenderedFrame:
                 "time_ns": None if frame.time_ns is None else str(frame.time_ns),
                 "rows": frame.rows,
                 "newest_row": frame.newest_row,
+                "changed_row": frame.changed_row,
                 "levelling": self.look.levelling.value,
                 "palette": self.look.palette,
                 "facts": facts,

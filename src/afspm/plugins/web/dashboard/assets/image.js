@@ -216,8 +216,30 @@ export class ImageView {
       context.fillStyle = getComputedStyle(this.canvas).getPropertyValue("--accent");
       context.fillRect(box.x, at - 1, box.width, 2);
     }
+    if (this.head.changed_row !== null && this.head.changed_row !== undefined) this.#drawChange(context, box);
     context.restore();
     context.strokeRect(box.x, box.y, box.width, box.height);
+  }
+
+  /** The row since which the lines show another tip: white within black is seen on any colour. */
+  #drawChange(context, box) {
+    const at = this.geometry.toScreen(this.geometry.fromPixel([0, this.head.changed_row]))[1];
+    context.setLineDash([8, 6]);
+    for (const [colour, width] of [["rgba(0,0,0,0.7)", 4], ["#fff", 1.6]]) {
+      context.strokeStyle = colour;
+      context.lineWidth = width;
+      context.strokeRect(box.x - 10, at, box.width + 20, 0);
+    }
+    context.setLineDash([]);
+    context.font = "12px sans-serif";
+    const text = `tip changed, row ${this.head.changed_row}`;
+    const wide = context.measureText(text).width + 12;
+    const above = at - 20 > box.y ? at - 20 : at + 3;
+    context.fillStyle = "rgba(0,0,0,0.75)";
+    context.fillRect(box.x + 6, above, wide, 17);
+    context.fillStyle = "#fff";
+    context.textAlign = "left";
+    context.fillText(text, box.x + 12, above + 13);
   }
 
   #drawAxes({ context }) {

@@ -1,0 +1,512 @@
+"""Judge of running scans: sees in the lines that the tip has changed. Pure.
+
+Each line is compared with an earlier scan of the place, at the shift that the lines so far have (`registration`). What
+the earlier scan does not explain, relative to the usual difference of two good scans of this kind, goes into a CUSUM
+(Page 1954): its sum grows while lines differ more than usual, and falls back to zero while they do not. So a scar or a
+spike in one line is no alarm, and ten lines that differ a little are one. Where no earlier scan shows the place,
+nothing is judged.
+
+Thresholds are those of a kind of scan (same size, angle, pixels and setpoint; decision 0044): the sums that good scans
+reached, times a factor. A sum above the threshold is `STOP`, one above a part of it `LOOK`. Before an alarm, a wider
+search for the shift shows whether the sample has jumped: then the template explains the lines again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+
+import numpy as np
+
+from afspm.basics.plain_data import Plain
+from afspm.model import Region
+from afspm.model.snapshot import from_plain, to_plain
+from afspm.plugins.line_watch.registration import (
+    CLIP_SIGMAS,
+    Array,
+    RowFit,
+    RowRegistration,
+    RowTemplate,
+    Shift,
+    levelled,
+    robust_spread,
+)
+
+ACQUIRE = 6  # lines that only find the shift, before the first is judged
+REACH = (3, 5)  # rows and columns about the predicted shift
+JUMP_REACH = (12, 16)  # the same for a sample that has jumped
+MOST_JUMPS = 3  # in one scan
+REMEMBERED = 12  # lines for the search after a jump
+DRIFT = 1.0  # standard deviations that a line must exceed the usual by, for the sum to grow
+LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too small a misfit of steep flanks
+SPIKE = 6.0  # the same for a single pixel
+SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
+MOST = 6.0  # standard deviations that one line adds at most
+FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
+FEWEST_SUSPECT = 6  # rows since a change before a scan is stopped: fewer don't show whether the sample has jumped
+LOOK = 0.6  # share of the threshold
+GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
+FEWEST_PAIRS = 2  # of good scans, before such scans are judged
+KEPT_PAIRS, KEPT_SPEEDS = 16, 3
+MOST_KINDS, MOST_PLACES = 4, 8
+SAME_SIZE = 0.02  # relative difference within which sizes count as equal
+LEAST_COMMON = 0.5  # share of width and height that an earlier scan must cover
+
+
+class AlarmLevel(Enum):
+    """The consequence of an alarm."""
+
+    LOOK = "look"
+    STOP = "stop"
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """The lines of a running scan differ from those of a good tip.
+
+    Attributes:
+        level: see `AlarmLevel`.
+        row: index of the line that raised it.
+        since_row: index of the first line with the change, by the CUSUM.
+        evidence: the sum, relative to the threshold of this kind of scan.
+        why: for people.
+    """
+
+    level: AlarmLevel
+    row: int
+    since_row: int
+    evidence: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Scans that are compared with each other: of the same size, angle, pixels and condition.
+
+    Attributes:
+        condition: what else must be equal, such as the setpoint.
+    """
+
+    size_m: tuple[float, float]
+    angle_rad: float
+    shape: tuple[int, int]
+    condition: str = ""
+
+    @classmethod
+    def of(cls, region: Region, shape: tuple[int, int], condition: str) -> Kind:
+        return cls(region.size_m, region.angle_rad, shape, condition)
+
+    def fits(self, other: Kind) -> bool:
+        sizes = zip(self.size_m, other.size_m, strict=True)
+        turned_rad = math.remainder(self.angle_rad - other.angle_rad, math.tau)
+        return (
+            all(abs(a / b - 1.0) < SAME_SIZE for a, b in sizes)
+            and abs(turned_rad) < SAME_SIZE
+            and (self.shape, self.condition) == (other.shape, other.condition)
+        )
+
+
+@dataclass(frozen=True)
+class PairStatistics:
+    """Differences between the lines of two good scans.
+
+    Attributes:
+        flat_m: of flat pixels, standard deviation.
+        per_slope: further difference for each m per pixel of slope, in m.
+        usual, spread: of the statistic of a line.
+        highest: sum of the CUSUM.
+    """
+
+    flat_m: float
+    per_slope: float
+    usual: float
+    spread: float
+    highest: float
+
+
+@dataclass
+class Place:
+    """An earlier scan with a good tip.
+
+    Attributes:
+        at_s: time of its end.
+        templates: of trace and, where recorded, retrace.
+    """
+
+    region: Region
+    at_s: float
+    templates: tuple[RowTemplate, ...]
+
+
+@dataclass
+class KindReference:
+    """All that is known of one kind of scan.
+
+    Attributes:
+        places: earlier scans, the newest at the end.
+        pairs: of scans of one place, the newest at the end.
+        speeds: changes of the shift in (rows, columns) per second, the newest at the end.
+    """
+
+    kind: Kind
+    places: list[Place] = field(default_factory=list)
+    pairs: list[PairStatistics] = field(default_factory=list)
+    speeds: list[Shift] = field(default_factory=list)
+
+    def place(self, region: Region) -> Place | None:
+        """Return the newest earlier scan that shows at least half of a region."""
+        for place in reversed(self.places):
+            if max(abs(away) for away in self._away(place, region)) <= 1.0 - LEAST_COMMON:
+                return place
+        return None
+
+    def shift(self, place: Place, region: Region, at_s: float) -> Shift:
+        """Return the predicted shift of a place in a scan of a region."""
+        (along, down), (ny, nx) = self._away(place, region), self.kind.shape
+        passed_s = at_s - place.at_s
+        # the median: a sample that has jumped once does not drift
+        rows_per_s, columns_per_s = np.median(self.speeds, axis=0) if self.speeds else (0.0, 0.0)
+        return down * (ny - 1) + passed_s * float(rows_per_s), along * (nx - 1) + passed_s * float(columns_per_s)
+
+    def note_shift(self, place: Place, region: Region, at_s: float, found: Shift) -> None:
+        """Learn the drift from the shift at the end of a scan."""
+        passed_s = at_s - place.at_s
+        if passed_s > 0.0:
+            (along, down), (ny, nx) = self._away(place, region), self.kind.shape
+            self.speeds.append(((found[0] - down * (ny - 1)) / passed_s, (found[1] - along * (nx - 1)) / passed_s))
+            del self.speeds[:-KEPT_SPEEDS]
+
+    def _away(self, place: Place, region: Region) -> tuple[float, float]:
+        x, y = (a - b for a, b in zip(region.center_m, place.region.center_m, strict=True))
+        cos, sin = math.cos(region.angle_rad), math.sin(region.angle_rad)
+        width, height = self.kind.size_m
+        return (cos * x + sin * y) / width, (cos * y - sin * x) / height
+
+
+@dataclass
+class Cusum:
+    """Sum of what exceeds the usual, never below zero.
+
+    Attributes:
+        value: the sum.
+        since: the line at which it last left zero.
+    """
+
+    value: float = 0.0
+    since: int | None = None
+
+    def add(self, row: int, sigmas: float) -> None:
+        self.value = max(0.0, self.value + min(sigmas, MOST) - DRIFT)
+        if self.value == 0.0:
+            self.since = None
+        elif self.since is None:
+            self.since = row
+
+
+def confidence(evidence: float) -> float:
+    """Return a rough share of scans with a good tip whose evidence stays below this: an assumed exponential."""
+    return 1.0 - math.exp(-GOOD_DECAY * max(0.0, evidence))
+
+
+class LineStatistic:
+    """Turns the differences of a line into standard deviations above the usual.
+
+    Args:
+        pairs: statistics of good pairs of scans, at least one.
+    """
+
+    def __init__(self, pairs: Sequence[PairStatistics]) -> None:
+        self.flat_m, self.per_slope, self._usual, self._spread = (
+            float(np.median([getattr(pair, name) for pair in pairs]))
+            for name in ("flat_m", "per_slope", "usual", "spread")
+        )
+        highest = sorted(pair.highest for pair in pairs)
+        # the highest of many may be of a scan whose tip had changed without an alarm
+        self.threshold = max(FLOOR, FACTOR * highest[-2 if len(highest) >= FEWEST_PAIRS + 2 else -1])
+
+    def sigma_m(self, steepness: Array) -> Array:
+        return np.asarray(np.hypot(self.flat_m, self.per_slope * steepness))
+
+    def sigmas(self, fits: Sequence[RowFit]) -> float:
+        return (line_statistic(fits, self.flat_m, self.per_slope) - self._usual) / self._spread
+
+
+def line_statistic(fits: Sequence[RowFit], flat_m: float, per_slope: float) -> float:
+    """Return the mean squared difference of a line, in units of the usual one at each pixel, with a limit for each."""
+    means = []
+    for fit in fits:
+        square = (fit.residual / np.hypot(flat_m, per_slope * fit.steepness)) ** 2
+        means.append(float(np.nanmean(np.minimum(square, CLIP_SIGMAS**2))))
+    return float(np.mean(means))
+
+
+@dataclass
+class _Comparer:
+    place: Place
+    registration: RowRegistration
+
+    def follow(self, row: int, line: Sequence[Array]) -> None:
+        self.registration.follow(row, line[0])
+
+    def fits(self, row: int, line: Sequence[Array]) -> list[RowFit]:
+        found = []
+        for template, values in zip(self.place.templates, line, strict=True):
+            fit = self.registration.fit(row, values, template)
+            if fit is not None:
+                found.append(fit)
+        return found
+
+
+class RunningScan:
+    """Judges the lines of one scan, in the order of their arrival; see `LineJudge.begin`.
+
+    Attributes:
+        alarm: the last one.
+    """
+
+    def __init__(self, comparer: _Comparer, statistic: LineStatistic, what: str) -> None:
+        self.alarm: Alarm | None = None
+        self._comparer, self._statistic, self._what = comparer, statistic, what
+        self._cusum = Cusum()
+        self._followed = 0
+        self._recent: list[tuple[int, list[Array]]] = []
+        self._jumps = 0
+
+    @property
+    def evidence(self) -> float:
+        """Return the sum of the CUSUM relative to the threshold."""
+        return self._cusum.value / self._statistic.threshold
+
+    def add(self, row: int, line: Sequence[Array]) -> Alarm | None:
+        """Judge a line; return an alarm of a higher level than before.
+
+        Args:
+            row: its index in the scan.
+            line: heights in m of trace and, where recorded, retrace.
+        """
+        level = [levelled(values)[0] for values in line]
+        if not all(np.isfinite(values).all() for values in level):
+            return None  # a missing line says nothing of the tip
+        self._comparer.follow(row, level)
+        self._recent = [*self._recent, (row, level)][-REMEMBERED:]
+        self._followed += 1
+        # the scanner still creeps from its last move: the first lines only find the shift
+        fits = self._comparer.fits(row, level) if self._followed > ACQUIRE else []
+        if not fits:
+            return None
+        self._cusum.add(row, self._statistic.sigmas(fits))
+        found = self._level()
+        if found is None or (self.alarm is not None and self.alarm.level in (found, AlarmLevel.STOP)):
+            return None
+        if self._has_jumped():
+            self._cusum = Cusum()
+            return None
+        since = row if self._cusum.since is None else self._cusum.since
+        self.alarm = Alarm(found, row, since, self.evidence, f"{self._what} since row {since}")
+        return self.alarm
+
+    def _level(self) -> AlarmLevel | None:
+        if self.evidence >= 1.0 and sum(self._is_suspect(row) for row, _ in self._recent) >= FEWEST_SUSPECT:
+            return AlarmLevel.STOP
+        return AlarmLevel.LOOK if self.evidence >= LOOK else None
+
+    def _has_jumped(self) -> bool:
+        place, registration = self._comparer.place, self._comparer.registration
+        if self._jumps >= MOST_JUMPS:
+            return False
+        # since the change, for a sample that has jumped; all lines, for a lattice that was matched one period away
+        suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
+        for lines in (suspects, self._recent):
+            wide = RowRegistration(place.templates[0], registration.shift, JUMP_REACH, steady=1.0)
+            for row, line in lines:
+                wide.follow(row, line[0])
+            again = _Comparer(place, wide)
+            sigmas = [self._statistic.sigmas(fits) for row, line in lines if (fits := again.fits(row, line))]
+            newer = len(sigmas) // 2  # the older half may lie before the jump
+            if sigmas and float(np.median(sigmas[newer:])) < DRIFT:
+                self._jumps += 1
+                self._comparer.registration = RowRegistration(place.templates[0], wide.shift, REACH)
+                for row, line in lines[newer:]:
+                    self._comparer.follow(row, line)
+                return True
+        return False
+
+    def _is_suspect(self, row: int) -> bool:
+        numbers = [number for number, _ in self._recent]
+        since = self._cusum.since
+        return since is None or since not in numbers or numbers.index(row) >= numbers.index(since)
+
+
+@dataclass
+class _OddRows:
+    # rows of a good scan with a scar, and single pixels with a spike: no measure of later scans
+    doubtful: set[int] = field(default_factory=set)
+    spikes: list[tuple[int, int, Array]] = field(default_factory=list)
+
+    def note(self, row: int, fits: Sequence[RowFit], statistic: LineStatistic, sigmas: float) -> None:
+        if sigmas > SCAR:
+            self.doubtful.add(row)
+        for channel, fit in enumerate(fits):
+            off = np.nan_to_num(np.abs(fit.residual) / statistic.sigma_m(fit.steepness))
+            beside = np.maximum(np.append(off[1:], 0.0), np.append(0.0, off[:-1]))
+            alone = (off > SPIKE) & (beside < 0.5 * off)
+            if alone.any():
+                self.spikes.append((channel, row, np.where(alone, fit.residual, 0.0)))
+
+    def cleaned(self, values: Array, channel: int) -> Array:
+        clean = values.copy()
+        for of, row, spike in self.spikes:
+            if of == channel:
+                clean[row] -= spike
+        return clean
+
+
+class LineJudge:
+    """Learns from scans with a good tip, and judges the lines of running ones."""
+
+    def __init__(self) -> None:
+        self._kinds: list[KindReference] = []
+
+    def pairs(self, kind: Kind) -> int:
+        """Return the number of good pairs known of a kind."""
+        known = self._known(kind)
+        return 0 if known is None else len(known.pairs)
+
+    def begin(self, region: Region, kind: Kind, at_s: float, *, channels: int) -> RunningScan | None:
+        """Return the judge of a scan that begins at `at_s`; None while too little is known of its kind.
+
+        Args:
+            channels: 2 with retrace, 1 without.
+        """
+        known = self._known(kind)
+        if known is None:
+            return None
+        place = known.place(region)
+        if place is not None and len(place.templates) == channels and len(known.pairs) >= FEWEST_PAIRS:
+            registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
+            what = "lines differ from the earlier scan of this place"
+            return RunningScan(_Comparer(place, registration), LineStatistic(known.pairs), what)
+        return None
+
+    def learn(
+        self,
+        picture: Sequence[Array],
+        region: Region,
+        kind: Kind,
+        at_s: float,
+        *,
+        downwards: bool = False,
+        again: bool = False,
+    ) -> None:
+        """Learn from a complete scan with a good tip.
+
+        Args:
+            picture: heights in m, [y, x], of trace and, where recorded, retrace.
+            at_s: time of its end.
+            downwards: whether its lines came from the last to the first.
+            again: an earlier life of the process has learnt from it: it becomes a place only.
+        """
+        known = self._known(kind) or self._new(kind)
+        self._kinds.remove(known)
+        self._kinds.append(known)
+        place = known.place(region)
+        odd = _OddRows() if again else self._compare(known, place, picture, region, at_s, downwards=downwards)
+        templates = tuple(RowTemplate.of(odd.cleaned(values, n), odd.doubtful) for n, values in enumerate(picture))
+        known.places = [one for one in known.places if one is not place]
+        known.places.append(Place(region, at_s, templates))
+        del known.places[:-MOST_PLACES]
+
+    def _compare(
+        self,
+        known: KindReference,
+        place: Place | None,
+        picture: Sequence[Array],
+        region: Region,
+        at_s: float,
+        *,
+        downwards: bool,
+    ) -> _OddRows:
+        odd = _OddRows()
+        lines = [(row, [levelled(values[row])[0] for values in picture]) for row in range(len(picture[0]))]
+        lines = [(row, line) for row, line in lines if all(np.isfinite(values).all() for values in line)]
+        if downwards:
+            lines.reverse()
+        if len(lines) <= ACQUIRE:
+            return odd
+        if place is not None and len(place.templates) == len(picture):
+            registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
+            _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs, odd))
+            known.note_shift(place, region, at_s, registration.shift)
+        return odd
+
+    def state(self) -> Plain:
+        """Return the statistics of each kind, to save, in JSON's types. The earlier scans are not in it."""
+        return {"kinds": [to_plain(replace(one, places=[], speeds=[]), lists=True) for one in self._kinds]}
+
+    def restore(self, state: Plain) -> None:
+        self._kinds = [from_plain(KindReference, kept) for kept in state["kinds"]]
+
+    def forget_places(self) -> None:
+        """Forget all earlier scans: the tip is another one now. The statistics of each kind are kept."""
+        for kind in self._kinds:
+            kind.places.clear()
+
+    def _known(self, kind: Kind) -> KindReference | None:
+        return next((one for one in reversed(self._kinds) if one.kind.fits(kind)), None)
+
+    def _new(self, kind: Kind) -> KindReference:
+        if len(self._kinds) >= MOST_KINDS:
+            # the rest of a stopped scan is a kind that never returns: it must not cost a known one its place
+            unknown = (one for one in self._kinds if len(one.pairs) < FEWEST_PAIRS)
+            self._kinds.remove(next(unknown, self._kinds[0]))
+        self._kinds.append(KindReference(kind))
+        return self._kinds[-1]
+
+
+def _append(pairs: list[PairStatistics], found: PairStatistics | None) -> None:
+    if found is not None:
+        pairs.append(found)
+        del pairs[:-KEPT_PAIRS]
+
+
+def _statistics(
+    comparer: _Comparer,
+    lines: Sequence[tuple[int, list[Array]]],
+    before: Sequence[PairStatistics],
+    odd: _OddRows,
+) -> PairStatistics | None:
+    fitted: list[tuple[int, list[RowFit]]] = []
+    for number, (row, line) in enumerate(lines):
+        comparer.follow(row, line)
+        if number >= ACQUIRE:
+            fitted.append((row, comparer.fits(row, line)))
+    fitted = [(row, fits) for row, fits in fitted if fits]
+    if len(fitted) < len(lines) // 2:
+        return None
+    flat_m, per_slope = _expected([fit for _, fits in fitted for fit in fits])
+    own = np.array([line_statistic(fits, flat_m, per_slope) for _, fits in fitted])
+    usual = float(np.median(own))
+    spread = max(float(np.quantile(own, 0.84)) - usual, 0.05)
+    pair = PairStatistics(flat_m, per_slope, usual, spread, 0.0)
+    # judged by the other pairs, as a running scan is
+    statistic, cusum, highest = LineStatistic(before or [pair]), Cusum(), 0.0
+    for row, fits in fitted:
+        sigmas = statistic.sigmas(fits)
+        odd.note(row, fits, statistic, sigmas)
+        cusum.add(row, sigmas)
+        highest = max(highest, cusum.value)
+    return PairStatistics(flat_m, per_slope, usual, spread, highest)
+
+
+def _expected(fits: Sequence[RowFit]) -> tuple[float, float]:
+    residual = np.concatenate([fit.residual for fit in fits])
+    steepness = np.concatenate([fit.steepness for fit in fits])
+    there = np.isfinite(residual)
+    residual, steepness = residual[there], steepness[there]
+    flat = steepness <= np.quantile(steepness, 0.4)
+    steep = steepness >= np.quantile(steepness, 0.9)
+    flat_m = robust_spread(residual[flat])
+    beyond = max(0.0, robust_spread(residual[steep]) ** 2 - flat_m**2)
+    return flat_m, max(LEAST_PER_SLOPE, math.sqrt(beyond) / max(float(np.median(steepness[steep])), 1e-15))

@@ -1,0 +1,256 @@
+"""`LineWatch`: sees in the lines of a running scan that the tip has changed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from afspm.basics.clock import NS_PER_S
+from afspm.basics.errors import UnitError
+from afspm.basics.units import convert
+from afspm.client.component import Component
+from afspm.components import tip_verdict
+from afspm.components.channel_pairs import ChannelPairing, HeightPair, MissingChannels
+from afspm.model import ControlState, Feedback, Scan, ScanLines, ScopeState
+from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge, RunningScan, confidence
+from afspm.plugins.line_watch.registration import Array
+
+KEPT_TIMES = 16  # of scans learnt from, which a restarted process may receive again
+
+
+@dataclass
+class _Lines:
+    """The lines of the running scan.
+
+    Attributes:
+        began_ns: the time that they carry.
+        judge: None if the scan is not judged.
+        pictures: by channel, [y, x] in m; NaN where not received.
+        taken: indices of the rows that were judged, in this order.
+        is_disturbed: a setting of the feedback has changed since its start.
+    """
+
+    began_ns: int | None
+    judge: RunningScan | None
+    pictures: dict[str, Array] = field(default_factory=dict)
+    taken: list[int] = field(default_factory=list)
+    is_disturbed: bool = False
+
+    @property
+    def downwards(self) -> bool:
+        return len(self.taken) > 1 and self.taken[-1] < self.taken[0]
+
+
+@dataclass
+class _Finished:
+    """The newest complete scan, from which is learnt when the next one begins.
+
+    Attributes:
+        is_whole: without an alarm, and under the same conditions from the first line to the last.
+        is_trusted: its tip counts as good so far.
+    """
+
+    pair: HeightPair
+    kind: Kind
+    downwards: bool = False
+    is_whole: bool = True
+    is_trusted: bool = True
+
+
+class LineWatch(Component):
+    """Flags `tip-shape-changed` while a scan is running, as soon as its lines show that the tip has changed.
+
+    The scheduler then stops the scan, so its remaining time is saved. Each line is compared with an earlier scan of the
+    place at the predicted drift; where there is none, nothing is judged. It learns
+    from the first scans of each size, number of pixels and setting of the feedback, so the tip must be good then: scans
+    are judged from the fourth of a place on. It learns nothing from a scan with an alarm, from one during which a
+    problem was flagged or the feedback was changed, or from one that a `TipClassifier` calls bad.
+
+    It publishes a `TipVerdict` with the row of the alarm and the first row with the change. A `ScanSeries` with
+    `missed = "rest"` then measures only the rest of the scan. The microscope must publish lines of running scans. After
+    an alarm, a component that judges complete scans (the `TipClassifier`) finds when the tip is good again.
+
+    Args:
+        channel: of the heights.
+        retrace_channel: their retrace; empty if not recorded.
+        action: "stop" flags the problem; "look" only publishes the verdict, for a person.
+        problem: the problem to flag.
+    """
+
+    flags: ClassVar = ("tip-shape-changed",)
+    publishes: ClassVar = (tip_verdict.OF_LINES,)
+    listens: ClassVar = ("ScanLines", "Scan2d", "ControlState", "ZCtrlParameters", tip_verdict.MESSAGE)
+
+    def __init__(
+        self,
+        channel: str = "Height",
+        retrace_channel: str = "Height Retrace",
+        action: Literal["stop", "look"] = "stop",
+        problem: str = "tip-shape-changed",
+    ) -> None:
+        self.channels = tuple(filter(None, (channel, retrace_channel)))
+        self.pairing = ChannelPairing(channel, retrace_channel)
+        self.action, self.problem = action, problem
+        self.judge = LineJudge()
+        self._lines: _Lines | None = None
+        self._finished: _Finished | None = None
+        self._problems: tuple[int, ...] | None = None  # not known yet
+        self._condition = ""
+        self._refused: set[str] = set()
+
+    def on_start(self) -> None:
+        self.expected = MissingChannels(self.channels, self.log)
+        if "judge" in self.memory:
+            self.judge.restore(self.memory["judge"])
+
+    def on_control(self, control_state: ControlState) -> None:
+        was, before = self._is_flagged, self._problems
+        self._problems = control_state.problems
+        if was and not self._is_flagged:
+            self.log.info("the tip is another one now: earlier scans are no measure of it")
+            self.judge.forget_places()
+        if self._problems and not before and self._lines is not None:
+            self._lines.is_disturbed, self._lines.judge = True, None
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        condition = "/".join(
+            f"{value:.6g}"
+            for value in (feedback.setpoint, feedback.proportional_gain, feedback.integral_gain)
+            if value is not None
+        )
+        if self._lines is not None and condition != self._condition and not self._lines.is_disturbed:
+            self.log.info("the feedback was changed during the scan: its further lines are not judged")
+            self._lines.is_disturbed, self._lines.judge = True, None
+        self._condition = condition
+
+    def on_spatial_roi_with_score_list(self, message: Any) -> None:
+        verdict, finished = tip_verdict.read_verdict(message), self._finished
+        if verdict is None or finished is None or finished.pair.trace.time_ns != verdict[0]:
+            return
+        if verdict[1] == tip_verdict.BAD:
+            finished.is_trusted = False
+        elif verdict[1] == tip_verdict.GOOD:
+            finished.is_trusted = finished.is_whole  # also of a test scan that ends a repair
+
+    def on_scan_lines(self, lines: ScanLines) -> None:
+        if lines.channel not in self.channels:
+            return
+        try:
+            values = lines.values * convert(1.0, lines.unit, "m")
+        except UnitError as error:
+            self._refuse(lines.channel, error)
+            return
+        if self._lines is None or self._lines.began_ns != lines.began_ns:
+            self._begin(lines)
+        running = self._lines
+        assert running is not None
+        picture = running.pictures.setdefault(lines.channel, np.full(lines.shape, np.nan))
+        if picture.shape != lines.shape:
+            return  # of a scan whose lines carry no time
+        picture[lines.first_row : lines.first_row + len(values)] = values
+        self._judge(lines, running)
+
+    def on_scan(self, scan: Scan) -> None:
+        self.expected.see(scan)
+        pair = self.pairing.add(scan)
+        if pair is None:
+            return
+        running, self._lines = self._lines, None
+        if scan.time_ns is not None and scan.time_ns <= self.memory.get("newest_ns", -1):
+            if scan.time_ns in self.memory.get("learnt_ns", ()):
+                self._learn(_Finished(pair, self._kind(pair.trace)), again=True)
+            return
+        self._learn_finished()
+        is_whole = running is None or not (running.is_disturbed or (running.judge is not None and running.judge.alarm))
+        downwards = running is not None and running.downwards
+        self._finished = _Finished(pair, self._kind(scan), downwards, is_whole, is_whole and self._problems == ())
+
+    @property
+    def _is_flagged(self) -> bool:
+        return self.scope.problems.number(self.problem) in (self._problems or ())
+
+    def _begin(self, lines: ScanLines) -> None:
+        self._learn_finished()
+        self._lines = _Lines(lines.began_ns, None)
+        if self._problems == ():  # the scans of a repair are not the experiment's
+            kind = Kind.of(lines.region, lines.shape, self._condition)
+            self._lines.judge = self.judge.begin(
+                lines.region, kind, self._time_s(lines.began_ns), channels=len(self.channels)
+            )
+
+    def _judge(self, lines: ScanLines, running: _Lines) -> None:
+        # a line is judged when all its channels have come; lines come in the order of the scan
+        newest = range(lines.first_row, lines.first_row + len(lines.values))
+        downwards = running.taken and newest.stop <= running.taken[-1]
+        for row in reversed(newest) if downwards else newest:
+            line = [running.pictures[channel][row] for channel in self.channels if channel in running.pictures]
+            if row in running.taken or len(line) < len(self.channels) or not all(map(_is_there, line)):
+                continue
+            running.taken.append(row)
+            alarm = None if running.judge is None else running.judge.add(row, line)
+            if alarm is not None:
+                self._announce(lines, running, alarm)
+
+    def _announce(self, lines: ScanLines, running: _Lines, alarm: Alarm) -> None:
+        stops = alarm.level is AlarmLevel.STOP and self.action == "stop"
+        self.log.warning(
+            "row %d: %s%s", alarm.row, alarm.why, "; the scan is not worth finishing" if stops else "; have a look"
+        )
+        verdict = tip_verdict.LineVerdict(
+            lines.region,
+            lines.shape,
+            lines.channel,
+            lines.began_ns,
+            alarm.row,
+            alarm.since_row,
+            running.downwards,
+            confidence(alarm.evidence),
+            stops,
+            alarm.why,
+        )
+        # published first: a series that loses its scan looks for the row
+        self.publish(tip_verdict.line_verdict_message(verdict), f"{tip_verdict.OF_LINES}_{self.name}")
+        if not stops:
+            return
+        # on a busy computer lines wait here, while the scan may end, and others find and repair the tip
+        if self.scope.state is not ScopeState.SCANNING or self.scope.control_state.problems:
+            self.log.warning("row %d came late: the scan is over already, and nothing is flagged", alarm.row)
+            return
+        self.scope.flag(self.problem)
+
+    def _learn_finished(self) -> None:
+        finished, self._finished = self._finished, None
+        if finished is not None and finished.is_trusted:
+            self._learn(finished)
+
+    def _learn(self, finished: _Finished, *, again: bool = False) -> None:
+        trace, retrace = finished.pair.trace, finished.pair.retrace
+        try:
+            picture = [one.values * convert(1.0, one.unit, "m") for one in (trace, retrace) if one is not None]
+        except UnitError as error:
+            self._refuse(trace.channel, error)
+            return
+        at_s = self._time_s(trace.time_ns)
+        self.judge.learn(picture, trace.region, finished.kind, at_s, downwards=finished.downwards, again=again)
+        if not again and trace.time_ns is not None:
+            self.memory["newest_ns"] = trace.time_ns
+            self.memory["learnt_ns"] = [*self.memory.get("learnt_ns", ()), trace.time_ns][-KEPT_TIMES:]
+            self.memory["judge"] = self.judge.state()
+            self.memory.save()
+
+    def _kind(self, scan: Scan) -> Kind:
+        return Kind.of(scan.region, scan.shape, self._condition)
+
+    def _time_s(self, time_ns: int | None) -> float:
+        return self.clock.now_s() if time_ns is None else time_ns / NS_PER_S
+
+    def _refuse(self, channel: str, error: UnitError) -> None:
+        if channel not in self._refused:
+            self._refused.add(channel)
+            self.log.error("%s is not a height, so nothing is judged: %s", channel, error)
+
+
+def _is_there(values: Array) -> bool:
+    return bool(np.isfinite(values).any())

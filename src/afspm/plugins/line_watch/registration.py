@@ -1,0 +1,239 @@
+"""Registration of single rows against an earlier scan of the same place. Pure.
+
+The rows of a scan arrive one by one, while the sample drifts. A row alone fixes its place badly (a flat terrace, one
+particle), so the cost of every shift in a window is summed over rows, and older rows count less. The remainder of a
+shift below a pixel is fitted with offset and tilt of the row: to first order it adds the template's two slopes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Array = NDArray[np.float64]
+Shift = tuple[float, float]
+"""(rows, columns) from the running scan to the same feature in the template."""
+
+FORGET = 0.85  # weight of the older rows in the cost of a shift
+LEAST_OVERLAP = 0.4  # share of a row that the template must cover
+PRIOR_PX = 0.7  # standard deviation of the remainder of a shift
+MOST_MOVED_PX = 1.5
+ITERATIONS = 2  # the template's slopes are those at the place that the first one finds
+PULL = 0.02  # cost of each squared pixel from the predicted shift, on ground too flat to show a shift
+STEADY = 0.75  # share of the cost that a shift elsewhere must stay below: on a lattice many shifts are nearly as good
+CLIP_SIGMAS = 4.0  # of a slope in the cost of a shift, and of a pixel in a residual
+MAD_TO_SIGMA = 1.4826  # of normally distributed values
+
+
+@dataclass(frozen=True, eq=False)
+class RowTemplate:
+    """An earlier scan, prepared for comparison with rows.
+
+    Attributes:
+        heights: in m, [y, x], rows levelled, without holes.
+        slopes: along the rows, [y, x - 1].
+        row_slopes, column_slopes: the gradient, in m per pixel.
+        spline: coefficients of the heights: linear interpolation would change sharp features with the part of a pixel.
+        spread: typical size of a slope.
+        trusted: by row; False: a scar, say, which another scan does not show.
+    """
+
+    heights: Array
+    slopes: Array
+    row_slopes: Array
+    column_slopes: Array
+    spline: Array
+    spread: float
+    trusted: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, heights: Array, doubtful: Collection[int] = ()) -> RowTemplate:
+        """Prepare a scan; rows without values are filled from their neighbours.
+
+        Args:
+            doubtful: rows that are compared with nothing.
+        """
+        level = levelled(heights)
+        rows = np.arange(len(level))
+        there = np.isfinite(level).all(axis=1)
+        if not there.all() and there.any():
+            nearest = rows[there][np.abs(rows[:, None] - rows[there][None, :]).argmin(axis=1)]
+            level = level[nearest]
+        slopes = np.diff(level, axis=1)
+        row_slopes, column_slopes = (np.asarray(np.gradient(level, axis=axis)) for axis in (0, 1))
+        spline = np.asarray(ndimage.spline_filter(level, order=3))
+        trusted = there & ~np.isin(rows, list(doubtful))
+        # the spread is not robust: on particles most of the ground is flat, and only flanks show a shift
+        return cls(level, slopes, row_slopes, column_slopes, spline, float(np.std(slopes)) or 1e-15, trusted)
+
+
+@dataclass(frozen=True)
+class RowFit:
+    """A row less its template.
+
+    Attributes:
+        residual: in m, NaN where not comparable.
+        steepness: of the template at each pixel, in m per pixel.
+    """
+
+    residual: Array
+    steepness: Array
+
+
+class RowRegistration:
+    """Follows the shift between the running scan and its template.
+
+    Args:
+        template: the earlier scan.
+        expected: predicted shift.
+        reach: largest deviation from it that is searched, (rows, columns).
+        steady: see `STEADY`; 1: the best shift, wherever it is, without `PULL`.
+    """
+
+    def __init__(self, template: RowTemplate, expected: Shift, reach: tuple[int, int], steady: float = STEADY) -> None:
+        self._template = template
+        self._reach, self._steady = reach, steady
+        self._middle = (round(expected[0]), round(expected[1]))
+        rows, columns = (
+            np.arange(-far, far + 1) + m - e for far, m, e in zip(reach, self._middle, expected, strict=True)
+        )
+        self._away = PULL * (rows[:, None] ** 2 + columns[None, :] ** 2) * float(steady < 1.0)
+        self._cost: Array | None = None
+        self.shift: Shift = expected
+
+    def follow(self, number: int, row: Array) -> None:
+        """Take a levelled row (its index in the scan) into the shift."""
+        cost = self._costs(number, np.diff(row))
+        if cost is None:
+            return
+        self._cost = cost if self._cost is None else FORGET * self._cost + cost
+        self.shift = self._best(self._cost)
+
+    def fit(self, number: int, row: Array, template: RowTemplate | None = None) -> RowFit | None:
+        """Return what the template does not explain of a levelled row; None where it does not cover the row.
+
+        Args:
+            template: another channel of the same scan.
+        """
+        template, (down, along) = template or self._template, self.shift
+        ny, nx = template.heights.shape
+        columns = np.arange(nx, dtype=np.float64)
+        moved = np.zeros(2)
+        for _ in range(ITERATIONS):
+            at, beside = number + down + moved[0], columns + along + moved[1]
+            inside = (beside >= 0) & (beside <= nx - 1) & np.isfinite(row)
+            if not 0.0 <= at <= ny - 1 or not template.trusted[math.floor(at) : math.ceil(at) + 1].all():
+                return None
+            if inside.mean() < LEAST_OVERLAP:
+                return None
+            expected = _row_at(template.spline, at, beside, order=3)
+            down_slope, along_slope = (
+                _row_at(picture, at, beside, order=1) for picture in (template.row_slopes, template.column_slopes)
+            )
+            basis = np.stack([np.ones(nx), np.linspace(-1.0, 1.0, nx), down_slope, along_slope], axis=1)
+            residual, more = _unexplained(row - expected, basis, inside, moved)
+            moved = np.clip(moved + more, -MOST_MOVED_PX, MOST_MOVED_PX)
+        return RowFit(residual, np.hypot(down_slope, along_slope))
+
+    def _costs(self, number: int, slopes: Array) -> Array | None:
+        template, (rows, columns) = self._template, self._reach
+        ny, nx = template.slopes.shape
+        first_row, first_column = number + self._middle[0] - rows, self._middle[1] - columns
+        if first_row + 2 * rows < 0 or first_row >= ny:
+            return None
+        part = _cut(template.slopes, first_row, first_column, 2 * rows + 1, nx + 2 * columns)
+        windows = np.lib.stride_tricks.sliding_window_view(part, nx, axis=1)
+        off = np.minimum(np.abs(windows - slopes), CLIP_SIGMAS * template.spread)
+        counted = np.isfinite(off)
+        share = counted.mean(axis=-1)
+        total = np.where(counted, off * off, 0.0).sum(axis=-1)
+        # a shift that leaves the template is as bad as a row that has nothing to do with it
+        usual = template.spread**2 * nx
+        return np.asarray(np.where(share >= LEAST_OVERLAP, total / np.maximum(share, LEAST_OVERLAP), 4.0 * usual))
+
+    def _best(self, cost: Array) -> Shift:
+        cost = cost + float(np.median(cost)) * self._away
+        origin = (self._middle[0] - self._reach[0], self._middle[1] - self._reach[1])
+        near = [round(at) - first for at, first in zip(self.shift, origin, strict=True)]
+        rows, columns = (
+            slice(max(0, at - 1), at + 2) if 0 <= at < size else slice(0, size)
+            for at, size in zip(near, cost.shape, strict=True)
+        )
+        local = cost[rows, columns]
+        row, column = (int(one) for one in np.unravel_index(int(local.argmin()), local.shape))
+        row, column = row + rows.start, column + columns.start
+        if cost.min() < self._steady * cost[row, column]:
+            row, column = (int(one) for one in np.unravel_index(int(cost.argmin()), cost.shape))
+        return origin[0] + row + _vertex(cost[:, column], row), origin[1] + column + _vertex(cost[row, :], column)
+
+
+def levelled(rows: Array) -> Array:
+    """Return rows without offset and tilt, which drift in z and the mounting of the sample cause."""
+    rows = np.array(rows, dtype=np.float64, ndmin=2)
+    there = np.isfinite(rows)
+    for row, good in zip(rows, there, strict=True):
+        if good.mean() <= 0.5:
+            row[:] = np.nan
+        elif not good.all():
+            x = np.arange(len(row))
+            row[~good] = np.interp(x[~good], x[good], row[good])
+    if not np.isfinite(rows).any():
+        return rows
+    with np.errstate(invalid="ignore"):
+        tilt = np.nanmedian(np.diff(rows, axis=1))
+        level = rows - tilt * np.arange(rows.shape[1])
+        return np.asarray(level - np.median(level, axis=1, keepdims=True))
+
+
+def robust_spread(values: Array) -> float:
+    """Return the standard deviation by the median of absolute values, never zero."""
+    there = values[np.isfinite(values)]
+    spread = MAD_TO_SIGMA * float(np.median(np.abs(there))) if there.size else 0.0
+    return spread or float(there.std() if there.size else 0.0) or 1e-15
+
+
+def _cut(picture: Array, row: int, column: int, rows: int, columns: int) -> Array:
+    # NaN outside
+    part = np.full((rows, columns), np.nan)
+    ny, nx = picture.shape
+    top, left = max(row, 0), max(column, 0)
+    bottom, right = min(row + rows, ny), min(column + columns, nx)
+    if top < bottom and left < right:
+        part[top - row : bottom - row, left - column : right - column] = picture[top:bottom, left:right]
+    return part
+
+
+def _row_at(picture: Array, at: float, columns: Array, order: Literal[1, 3]) -> Array:
+    places = [np.full(columns.shape, at), columns]
+    return np.asarray(ndimage.map_coordinates(picture, places, order=order, mode="nearest", prefilter=False))
+
+
+def _vertex(cost: Array, at: int) -> float:
+    # of the parabola through the minimum and its neighbours
+    if not 0 < at < len(cost) - 1:
+        return 0.0
+    below, here, above = cost[at - 1 : at + 2]
+    bend = below - 2.0 * here + above
+    return float(np.clip(0.5 * (below - above) / bend, -0.5, 0.5)) if bend > 0 else 0.0
+
+
+def _unexplained(difference: Array, basis: Array, inside: NDArray[np.bool_], moved: Array) -> tuple[Array, Array]:
+    # three times, with less weight for outliers: pixels that a scar moved must not move the fit
+    weights, residual, found = inside.astype(np.float64), difference, np.zeros(4)
+    prior = np.array([0.0, 0.0, 1.0 / PRIOR_PX**2, 1.0 / PRIOR_PX**2])
+    for _ in range(3):
+        unit = robust_spread(residual[inside])
+        weighted = basis * (weights / unit**2)[:, None]
+        matrix = weighted.T @ basis + np.diag(prior)
+        moment = weighted.T @ difference - prior * np.array([0.0, 0.0, *moved])
+        size = np.sqrt(np.diag(matrix))
+        found = np.linalg.solve(matrix / np.outer(size, size), moment / size) / size
+        residual = difference - basis @ found
+        weights = np.where(inside, 1.0 / np.maximum(1.0, np.abs(residual) / (2.0 * unit)), 0.0)
+    return np.where(inside, residual, np.nan), found[2:]

@@ -1,0 +1,140 @@
+"""The judge of running scans, over simulated scans line by line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from tests.plugins.line_watch.line_scans_lab import (
+    CHANGED_ROW,
+    CHANNELS,
+    HOME,
+    LEARNT,
+    PERIOD_S,
+    ROWS,
+    Picture,
+    night,
+)
+
+from afspm.model import Region
+from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge
+
+Heights = list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]
+KIND = Kind.of(HOME, (ROWS, ROWS), "")
+
+
+def heights(picture: Picture) -> Heights:
+    return [picture[channel].copy() for channel in CHANNELS]
+
+
+def taught(pictures: Sequence[Picture] | None = None) -> LineJudge:
+    judge = LineJudge()
+    for number, picture in enumerate((pictures or night())[:LEARNT]):
+        judge.learn(heights(picture), HOME, KIND, number * PERIOD_S)
+    return judge
+
+
+def stopped(judge: LineJudge, picture: Heights, at_s: float = LEARNT * PERIOD_S) -> Alarm | None:
+    """Return the alarm that stops a scan from the first row to the last."""
+    running = judge.begin(HOME, KIND, at_s, channels=2)
+    assert running is not None
+    for row in range(ROWS):
+        alarm = running.add(row, [values[row] for values in picture])
+        if alarm is not None and alarm.level is AlarmLevel.STOP:
+            return alarm
+    return None
+
+
+@pytest.mark.parametrize("flaw", ["double", "blunt", "contaminated"])
+def test_changed_tip_stops_the_scan_within_twenty_rows(flaw: str) -> None:
+    pictures = night(flaw)
+    alarm = stopped(taught(pictures), heights(pictures[-1]))
+    assert alarm is not None
+    assert CHANGED_ROW <= alarm.row <= CHANGED_ROW + 20
+    assert abs(alarm.since_row - CHANGED_ROW) <= 5
+    assert alarm.evidence >= 1.0
+
+
+def test_good_scan_on_a_drifting_sample_is_not_stopped() -> None:
+    assert stopped(taught(), heights(night()[LEARNT])) is None
+
+
+def test_first_scans_of_a_kind_are_not_judged() -> None:
+    judge = LineJudge()
+    for number in range(LEARNT):
+        assert judge.begin(HOME, KIND, number * PERIOD_S, channels=2) is None
+        judge.learn(heights(night()[number]), HOME, KIND, number * PERIOD_S)
+    assert judge.begin(HOME, KIND, LEARNT * PERIOD_S, channels=2) is not None
+
+
+def test_scan_at_another_setpoint_is_another_kind() -> None:
+    other = Kind.of(HOME, (ROWS, ROWS), "0.5")
+    assert taught().begin(HOME, other, LEARNT * PERIOD_S, channels=2) is None
+
+
+def test_missing_rows_are_no_change() -> None:
+    picture = heights(night()[LEARNT])
+    for values in picture:
+        values[[20, 21, 40]] = np.nan
+        values[33, :10] = np.nan
+    assert stopped(taught(), picture) is None
+
+
+def test_scar_in_one_row_is_no_change() -> None:
+    picture = heights(night()[LEARNT])
+    for values in picture:
+        values[25, 10:50] += 20e-9
+    assert stopped(taught(), picture) is None
+
+
+def test_scan_with_spikes_is_a_measure_of_the_next_one() -> None:
+    judge, spiky = taught(), heights(night()[LEARNT])
+    for values in spiky:
+        values[[12, 13, 14, 15, 40], [9, 30, 17, 44, 50]] += 60e-9
+    assert stopped(judge, spiky) is None
+    judge.learn(spiky, HOME, KIND, LEARNT * PERIOD_S)
+    moved = [np.roll(values, (1, 1), axis=(0, 1)) for values in heights(night()[LEARNT])]
+    assert stopped(judge, moved, LEARNT * PERIOD_S + 1.0) is None
+
+
+def test_sample_that_jumps_is_registered_again() -> None:
+    picture = heights(night()[LEARNT])
+    for values in picture:
+        values[30:] = np.roll(values, (-4, 6), axis=(0, 1))[30:]
+        values[-4:] = np.nan
+    assert stopped(taught(), picture) is None
+
+
+def test_rows_from_the_last_to_the_first_are_judged_alike() -> None:
+    pictures = night("double", "down")
+    judge = LineJudge()
+    for number, picture in enumerate(pictures[:LEARNT]):
+        judge.learn(heights(picture), HOME, KIND, number * PERIOD_S, downwards=True)
+    running = judge.begin(HOME, KIND, LEARNT * PERIOD_S, channels=2)
+    assert running is not None
+    alarms = [running.add(row, [v[row] for v in heights(pictures[-1])]) for row in reversed(range(ROWS))]
+    row = next(alarm.row for alarm in alarms if alarm is not None and alarm.level is AlarmLevel.STOP)
+    assert ROWS - 1 - CHANGED_ROW - 20 <= row <= ROWS - 1 - CHANGED_ROW
+
+
+def test_scan_of_a_new_place_is_not_judged() -> None:
+    elsewhere = Region((3e-6, 0.0), HOME.size_m)
+    assert taught().begin(elsewhere, KIND, LEARNT * PERIOD_S, channels=2) is None
+
+
+def test_state_that_was_saved_judges_alike() -> None:
+    judge, again = taught(), LineJudge()
+    again.restore(judge.state())
+    again.learn(heights(night()[LEARNT - 1]), HOME, KIND, (LEARNT - 1) * PERIOD_S, again=True)
+    found = stopped(again, heights(night()[-1]))
+    assert found is not None
+    assert found.row >= CHANGED_ROW
+
+
+def test_rests_of_stopped_scans_do_not_displace_a_known_kind() -> None:
+    judge = taught()
+    for rows in range(20, 28):
+        rest = Kind.of(HOME, (rows, ROWS), "")
+        judge.learn([values[:rows] for values in heights(night()[0])], HOME, rest, 500.0)
+    assert judge.pairs(KIND) == LEARNT - 1

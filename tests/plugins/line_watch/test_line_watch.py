@@ -1,0 +1,145 @@
+"""`LineWatch` in the in-memory laboratory: flag, verdict, and scans that are no measure."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from tests.plugins.line_watch.line_scans_lab import (
+    CHANGED_ROW,
+    HOME,
+    LEARNT,
+    LINE_S,
+    PERIOD_S,
+    ROWS,
+    Picture,
+    began_ns,
+    night,
+    publish_lines,
+    publish_scan,
+)
+from tests.unit.client.client_lab import Lab, run
+
+from afspm import wire
+from afspm.basics.exit_codes import ExitCode
+from afspm.components.tip_verdict import BAD, LineVerdict, read_line_verdict, verdict_message
+from afspm.model import ControlRequest, Feedback, Problem, Scan, ScopeState, ScopeStatus
+from afspm.plugins.line_watch.line_watch import LineWatch
+
+TIP = Problem.TIP_SHAPE_CHANGED
+
+
+def tell(lab: Lab, number: int, picture: Picture, *, complete: bool = True) -> None:
+    """Publish the lines of a scan, and its end."""
+    at_s = 100.0 + number * PERIOD_S
+    lab.at(at_s, partial(lab.publish, ScopeStatus(ScopeState.SCANNING)))
+    publish_lines(lab, picture, number, range(ROWS), at_s)
+    if complete:
+        publish_scan(lab, picture, number, at_s + 30.0)
+
+
+def whole_night(lab: Lab) -> None:
+    for number, picture in enumerate(night()):
+        tell(lab, number, picture, complete=number <= LEARNT)
+    lab.at(900.0, lab.kill)
+
+
+def verdicts(lab: Lab) -> list[LineVerdict]:
+    found = [read_line_verdict(wire.decode("TipVerdict", p)) for e, p in lab.published if e == f"TipVerdict_{lab.name}"]
+    return [one for one in found if one is not None]
+
+
+def flags(lab: Lab) -> int:
+    return sum(request.kind == ControlRequest.ADD_EXP_PRBLM for request in lab.requests)
+
+
+def test_changed_tip_is_flagged_while_the_scan_is_running() -> None:
+    lab = Lab("line_watch")
+    whole_night(lab)
+    assert run(LineWatch(), lab) == ExitCode.ENDED
+    assert flags(lab) == 1
+    last = verdicts(lab)[-1]
+    assert last.stops
+    assert (last.began_ns, last.shape, last.downwards) == (began_ns(LEARNT + 1), (ROWS, ROWS), False)
+    assert CHANGED_ROW <= last.row <= CHANGED_ROW + 20
+    assert last.confidence > 0.98
+
+
+def test_look_publishes_the_row_and_flags_nothing() -> None:
+    lab = Lab("line_watch")
+    whole_night(lab)
+    action: Literal["look"] = "look"
+    run(LineWatch(action=action), lab)
+    assert flags(lab) == 0
+    assert verdicts(lab)
+    assert not any(one.stops for one in verdicts(lab))
+
+
+def test_scan_during_which_the_setpoint_was_changed_is_not_judged() -> None:
+    lab = Lab("line_watch")
+    lab.at(50.0, lambda: lab.publish(Feedback(True, 1.0, 1.0, 0.7)))
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    last, at_s = LEARNT + 1, 100.0 + (LEARNT + 1) * PERIOD_S
+    publish_lines(lab, night()[-1], last, range(CHANGED_ROW - 2), at_s)
+    lab.at(at_s + 10.0, lambda: lab.publish(Feedback(True, 1.0, 1.0, 0.5)))
+    publish_lines(lab, night()[-1], last, range(CHANGED_ROW - 2, ROWS), at_s + 20.0)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(), lab)
+    assert verdicts(lab) == []
+
+
+def test_scan_that_the_classifier_calls_bad_is_no_measure() -> None:
+    lab, watch = Lab("line_watch"), LineWatch()
+    for number, picture in enumerate(night()[:LEARNT]):
+        tell(lab, number, picture)
+        scan = Scan(HOME, "Height", "m", picture["Height"], began_ns(number) + round(ROWS * LINE_S * 1e9))
+        lab.at(140.0 + number * PERIOD_S, partial(lab.publish, verdict_message(scan, BAD)))
+    tell(lab, LEARNT, night()[-1], complete=False)
+    lab.at(900.0, lab.kill)
+    run(watch, lab)
+    assert verdicts(lab) == []
+    assert "learnt_ns" not in watch.memory
+
+
+def test_lines_of_a_repair_are_not_judged() -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    lab.at(100.0 + (LEARNT + 0.9) * PERIOD_S, lambda: lab.flag(TIP))
+    tell(lab, LEARNT + 1, night()[-1], complete=False)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(), lab)
+    assert verdicts(lab) == []
+
+
+def test_restarted_watch_learns_no_scan_twice(tmp_path: Path) -> None:
+    first = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(first, number, picture)
+    first.at(900.0, first.kill)
+    watch = LineWatch()
+    run(watch, first, tmp_path)
+    learnt = list(watch.memory["learnt_ns"])
+    second, again = Lab("line_watch"), LineWatch()
+    for number, picture in enumerate(night()[:LEARNT]):
+        publish_scan(second, picture, number, 10.0)
+    tell(second, LEARNT + 1, night()[-1], complete=False)
+    second.at(900.0, second.kill)
+    run(again, second, tmp_path)
+    assert again.memory["learnt_ns"] == learnt
+    assert verdicts(second)[-1].stops, "judged with what the earlier life learnt"
+
+
+def test_alarm_that_comes_after_the_scan_flags_nothing() -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    at_s = 100.0 + (LEARNT + 1) * PERIOD_S
+    lab.at(at_s - 1.0, partial(lab.publish, ScopeStatus(ScopeState.FREE)))
+    publish_lines(lab, night()[-1], LEARNT + 1, range(ROWS), at_s)
+    lab.at(900.0, lab.kill)
+    run(LineWatch(), lab)
+    assert verdicts(lab)
+    assert flags(lab) == 0
