@@ -31,13 +31,13 @@ _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
 
 
 class BadReply(ControllerLost):
-    """The received bytes can't be the reply: nothing that follows on this connection can be trusted."""
+    """Received bytes that can't be the reply: later bytes of the connection can't be trusted either."""
 
     code = "nanonis-reply"
 
 
 class NanonisError(AfspmError):
-    """Nanonis reports an error, with its own text."""
+    """An error reported by Nanonis, with its own text."""
 
     code = "nanonis"
 

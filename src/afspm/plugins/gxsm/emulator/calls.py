@@ -61,7 +61,7 @@ def _fits(signature: inspect.Signature, arguments: tuple[object, ...]) -> bool:
 
 
 class NoAnswer(Exception):
-    """GXSM never answers this call, nor any later one until it is restarted."""
+    """A call that blocks GXSM: neither this call nor a later one is answered until GXSM is restarted."""
 
 
 class WrongArguments(SystemError):
