@@ -91,7 +91,7 @@ class Sweep(Component):
 
     @property
     def planned_parameters(self) -> dict[str, tuple[Parameter, ...]]:
-        """Every value that is set, by the setting that gives it: `afspm check` holds them against the limits."""
+        """All values to be set, by the setting that contains them: `afspm check` compares them with the limits."""
         return {
             "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values)))
         }
