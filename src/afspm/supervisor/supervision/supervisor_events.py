@@ -137,7 +137,7 @@ class ProcessAction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessCommand:
-    """Carry out an action on a process."""
+    """The effect that carries out an action on a process."""
 
     action: ProcessAction
     name: str
@@ -145,22 +145,22 @@ class ProcessCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseComponents:
-    """Let components that wait for the scheduler begin."""
+    """The effect that lets components begin which wait for the scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
 class AskUse:
-    """Ask the scheduler whether the microscope is in use; `UseReported` follows if the scheduler knows."""
+    """The effect that asks the scheduler if the microscope is in use; `UseReported` follows if the scheduler knows."""
 
 
 @dataclass(frozen=True, slots=True)
 class EndExperiment:
-    """Ask the scheduler to end the experiment; `EndRefused` follows if it refuses."""
+    """The effect that asks the scheduler to end the experiment; `EndRefused` follows if it refuses."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriteLog:
-    """Log a line under the name of a process; `level` is a name of `logging`."""
+    """The effect that logs a line under the name of a process; `level` is a name of `logging`."""
 
     name: str
     level: str
