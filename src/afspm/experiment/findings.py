@@ -46,7 +46,7 @@ class Finding:
 
 @dataclass
 class Findings:
-    """Collects findings, so that one check reports them all."""
+    """A collection of findings, so that one check reports them all."""
 
     found: list[Finding] = field(default_factory=list)
 

@@ -46,7 +46,7 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Whether it follows a plan of its own: a script that solves no problems does; True for a command (unknown)."""
+        """Whether it follows a plan of its own, like a script that solves no problems; True for a command (unknown)."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves
