@@ -204,7 +204,7 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """Answer the peer `name` over `connection`, which is open and the newest of that name.
+    """The effect that answers the peer `name` over `connection`, the newest open one of that name.
 
     Attributes:
         asked: the kind of the answered request.
@@ -218,7 +218,7 @@ class Reply:
 
 @dataclass(slots=True)
 class Forward:
-    """Send a request to the translator, marked with `number`.
+    """The effect that sends a request to the translator, marked with `number`.
 
     A client's `request.payload` is sent as it came. A request of the scheduler itself has no payload: its subject is
     encoded.
@@ -230,11 +230,11 @@ class Forward:
 
 @dataclass(slots=True)
 class Publish:
-    """Publish a packet to the subscribers of its envelope.
+    """The effect that publishes a packet to the subscribers of its envelope.
 
     Attributes:
-        source_ns: the translator's own time of it; None for a packet of the scheduler.
-        history: how many packets of this envelope the cache keeps over a restart; 0: this one is not cached.
+        source_ns: the packet's time by the translator; None for a packet of the scheduler.
+        history: number of packets of this envelope kept over a restart; 0: this packet is not cached.
     """
 
     packet: Packet
@@ -244,7 +244,7 @@ class Publish:
 
 @dataclass(slots=True)
 class Replay:
-    """Send these packets to one subscriber, in this order, and then the message that it has caught up."""
+    """The effect that sends packets in order to one subscriber, then the message that it has caught up."""
 
     subscriber: Hashable
     packets: tuple[Packet, ...]
@@ -252,14 +252,14 @@ class Replay:
 
 @dataclass(slots=True)
 class SaveState:
-    """Save `state`, so that it survives a kill, before the effects that follow are carried out."""
+    """The effect that saves `state`, so that it survives a kill, before the following effects are carried out."""
 
     state: SavedState
 
 
 @dataclass(slots=True)
 class Log:
-    """Write to the log. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
+    """The effect that logs a line; `level` is a name of `logging`: "INFO", "WARNING", "ERROR"."""
 
     level: str
     text: str
@@ -278,7 +278,7 @@ class Kill:
 
 @dataclass(slots=True)
 class Delegate:
-    """Hand a job to the worker of the coordinate frame; its result is the input `FrameReported`."""
+    """The effect that gives a job to the coordinate frame's worker; the result is the input `FrameReported`."""
 
     job: object
 
@@ -287,7 +287,7 @@ Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill | Delegate
 
 
 class Codec(Protocol):
-    """Objects to and from bytes, as decisions need them; simulated nights use a table in place of the wire format."""
+    """The conversion of objects to and from bytes; simulated nights use a table in place of the wire format."""
 
     def encode(self, thing: object) -> bytes:
         """Return a model object as the payload of a packet or an answer."""
