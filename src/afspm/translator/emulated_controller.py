@@ -40,7 +40,7 @@ class Listening:
 
 
 class AddressNotice:
-    """Publishes the address of an emulated controller, as long as the emulator's process lives.
+    """The published address of an emulated controller, valid as long as the emulator's process lives.
 
     Args:
         file: see `notice_file`.
