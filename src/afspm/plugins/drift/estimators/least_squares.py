@@ -54,7 +54,7 @@ class LeastSquares:
        according to their `noise`.
     4. `covariance`: the uncertainty from noise, enlarged by doubt; `nuisances`: the average over possible shear,
        rotation, calibration and creep.
-    5. `acceptance`: refuse what may be no match.
+    5. `acceptance`: refuse likely false matches.
 
     Args:
         wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled where a

@@ -94,7 +94,7 @@ class Similarity:
         return replace(self, straight=undone @ self.straight, pivot_m=position_m, error=error)
 
     def with_scan(self) -> Similarity:
-        """Add a scan of now, straightened as it was registered."""
+        """Add the newest scan, straightened as it was registered."""
         now = [*range(len(self.error)), 0]
         return replace(self, error=self.error[now], covariance=self.covariance[np.ix_(now, now)])
 
