@@ -33,7 +33,7 @@ USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
 class Survey(Component):
-    """Takes a wide scan, finds targets in it, and takes a zoom and curves at each target.
+    """A wide scan, a search for targets in it, and a zoom and curves at each target.
 
     It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture: the
     survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
