@@ -19,21 +19,21 @@ from afspm.scheduler.saved_state import SavedState
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """A peer connected to the control socket. `connection` numbers grow and are never used again."""
+    """The event that a peer connected to the control socket. `connection` numbers grow and are never reused."""
 
     connection: int
 
 
 @dataclass(frozen=True, slots=True)
 class Disconnected:
-    """A connection to the control socket is gone."""
+    """The event that a connection to the control socket is lost."""
 
     connection: int
 
 
 @dataclass(frozen=True, slots=True)
 class Greeted:
-    """A peer sent its name and nothing else (the empty first message of ZMQ_PROBE_ROUTER)."""
+    """The event that a peer sent only its name (the empty first message of ZMQ_PROBE_ROUTER)."""
 
     connection: int
     name: str
@@ -58,7 +58,7 @@ class RequestIn:
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """A message from the peer `name` could not be decoded as a request, and was refused with `response`."""
+    """A message from the peer `name` that could not be decoded as a request, and was refused with `response`."""
 
     name: str
     response: Response
@@ -66,7 +66,7 @@ class Unreadable:
 
 @dataclass(frozen=True, slots=True)
 class PacketIn:
-    """The translator published a packet."""
+    """The event that the translator published a packet."""
 
     packet: Packet
     header: PacketHeader
@@ -87,22 +87,22 @@ class ReplayRequested:
 
 @dataclass(frozen=True, slots=True)
 class TranslatorUp:
-    """The translator is connected: requests can be sent."""
+    """The event that the translator is connected: requests can be sent."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorDown:
-    """The connection to the translator is lost."""
+    """The event that the connection to the translator is lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorCaughtUp:
-    """All packets that the translator published during the scheduler's absence have been received."""
+    """The event that all packets published by the translator during the scheduler's absence have been received."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorReply:
-    """The translator answered the request that was forwarded under `number`."""
+    """The translator's answer to the request that was forwarded under `number`."""
 
     number: int
     response: Response
@@ -110,7 +110,7 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ProblemSeen:
-    """The scheduler's process found that a problem has appeared, or disappeared.
+    """The event that the scheduler's process found a problem, or its disappearance.
 
     Attributes:
         name: the component in whose name it is flagged.
@@ -123,7 +123,7 @@ class ProblemSeen:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """The coordinate frame publishes a packet of its own.
+    """A packet that the coordinate frame publishes itself.
 
     Attributes:
         before_ns: the translator's time of a packet that must come after this one; None: published with the current
@@ -137,17 +137,17 @@ class Announced:
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """The run is stopped before the end of the experiment: the last input of this scheduler."""
+    """The event that the run is stopped before the end of the experiment: the last input of this scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A deadline (`SchedulerCore.deadline_s`) has passed."""
+    """The event that a deadline (`SchedulerCore.deadline_s`) has passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameReported:
-    """The worker of the coordinate frame has a result, or has ended; only the frame reads its content."""
+    """A report of the coordinate frame's worker: a result, or its end; only the frame reads the content."""
 
     report: object
 
@@ -157,12 +157,12 @@ class FrameReported:
 
 @dataclass(frozen=True, slots=True)
 class Started:
-    """The scheduler starts, for the first time or after a restart."""
+    """The event that the scheduler starts, for the first time or after a restart."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameAnswered:
-    """A request of the coordinate frame was answered."""
+    """The answer to a request of the coordinate frame."""
 
     purpose: object
     response: Response
@@ -170,7 +170,7 @@ class FrameAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ControlChanged:
-    """This step changed the holder, the mode or the problems."""
+    """The event that this step changed the holder, the mode or the problems."""
 
     before: ArbitrationState
     after: ArbitrationState
@@ -267,7 +267,7 @@ class Log:
 
 @dataclass(slots=True)
 class Kill:
-    """The experiment ends: publish the signal KILL, and close.
+    """The effect that ends the experiment: the signal KILL is published, and the sockets are closed.
 
     Attributes:
         tip_is_safe: the translator may leave; if False, it retracts the tip itself when it is stopped.

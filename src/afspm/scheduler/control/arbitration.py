@@ -51,7 +51,7 @@ class ControlChange(Enum):
 
 
 class Cause(Enum):
-    """Why control was taken from its holder."""
+    """The reason why control was taken from its holder."""
 
     RELEASED = "released"
     PROBLEM = "problem"

@@ -24,7 +24,7 @@ _OTHERS = ("scheduler", "translator")
 
 @dataclass(frozen=True)
 class StartupBarrier:
-    """Delays the first control state, and requests that may change it, until missed packets are published.
+    """A delay of the first control state, and of requests that may change it, until missed packets are published.
 
     Without it, a packet that the translator repeats would get a time after the change, and pass for a new one.
 
