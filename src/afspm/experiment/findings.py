@@ -9,7 +9,7 @@ from enum import Enum
 
 
 class Level(Enum):
-    """An error keeps the experiment from starting; a warning does not."""
+    """The severity of a finding: an error keeps the experiment from starting; a warning does not."""
 
     ERROR = "error"
     WARNING = "warning"

@@ -52,7 +52,7 @@ class ResolvedProcess:
         return self.component.run is not Component.run and not self.declared.solves
 
     def declares(self, attribute: str) -> bool:
-        """Return whether a flag of its class is true."""
+        """Return whether the flag `attribute` of the process's class is true."""
         return getattr(self.component, attribute, False) is True
 
     @property

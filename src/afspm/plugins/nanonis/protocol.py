@@ -170,7 +170,7 @@ def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object
 
 
 class _Reader:
-    """Reads one field after the other from a body, never beyond its end."""
+    """A reader of one field after the other from a body, never beyond its end."""
 
     def __init__(self, body: memoryview) -> None:
         self._body = body

@@ -131,7 +131,7 @@ class Session:
 
 @dataclass(frozen=True)
 class ScanEnded:
-    """A scan was completed or stopped.
+    """The event that a scan was completed or stopped.
 
     Attributes:
         path: file path on Nanonis' computer; empty: not saved.
@@ -142,7 +142,7 @@ class ScanEnded:
 
 @dataclass(frozen=True)
 class CurveEnded:
-    """A spectrum was completed.
+    """The event that a spectrum was completed.
 
     Attributes:
         names: channel names with units.

@@ -334,7 +334,7 @@ class Bench:
     # --- for the processes ---
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
-        """See `StepObserver`."""
+        """Observe a step of the scheduler; see `StepObserver`."""
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         """Keep each packet that the scheduler publishes."""

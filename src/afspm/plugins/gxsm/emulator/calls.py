@@ -65,7 +65,7 @@ class NoAnswer(Exception):
 
 
 class WrongArguments(SystemError):
-    """The arguments can't be converted to C types.
+    """The error that arguments can't be converted to C types.
 
     Attributes:
         value: result that Gxsm4 returns instead through its shared memory.
