@@ -314,9 +314,9 @@ class DriverBase(ABC):
         """
 
     def followed(self) -> bool | None:
-        """Return the outcome of a measurement whose end `status` never reported, since another followed at once.
+        """Return the outcome of a measurement whose end `status` missed, since another one followed at once.
 
-        To be written where a panel can repeat scans. Called after `results`, which must list the measurement by then.
+        Override where a panel can repeat scans. Called after `results`, which must list the measurement by then.
 
         Returns:
             once for each such measurement: True if it was complete, False if it was interrupted; None: there was none.

@@ -412,7 +412,7 @@ class MemoryServerPort:
         self._host.reply(frames)
 
     def is_connected(self, connection: bytes) -> bool:
-        """Return True: its scheduler has no epoch, so the result is not used."""
+        """Return True: the simulated scheduler has no epoch, so the result is not used."""
         return True
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:

@@ -16,7 +16,7 @@ _STRICT = {"extra": "forbid"}
 
 @dataclass(frozen=True)
 class RescanRule:
-    """The rule by which a rescan is requested from the Rescanner.
+    """The rule for requests to the Rescanner.
 
     Attributes:
         rule: "tolerance": the sample is further off than `tolerance`, with two standard deviations added; "paper": scan
