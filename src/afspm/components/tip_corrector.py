@@ -262,4 +262,4 @@ def _unpacked(frame: Frame) -> tuple[Region, tuple[int, int] | None]:
 
 
 class _Blind(AfspmError):
-    """The error that the state of the tip can't be determined."""
+    """The state of the tip can't be determined."""

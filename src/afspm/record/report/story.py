@@ -56,7 +56,7 @@ class RunStory:
         frame: of all positions.
         problems: spans of all problems except routine ones, in the order of time.
         actions: treatments of the tip, e.g. pulses.
-        seen_late: for each problem flagged only after the end, the first request to flag it.
+        seen_late: the first request to flag each problem that was only noticed after the end.
         comparisons: planned and measured work of each component with a plan.
     """
 
