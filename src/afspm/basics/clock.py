@@ -78,9 +78,9 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 @cache
 def monotonic_id() -> str:
-    """Return an identity of the zero of time.monotonic(): of the computer, its boot, and the clock that Python reads.
+    """Return an id of the origin of time.monotonic(): this computer, this boot, and the clock that Python reads.
 
-    In one boot all processes count from one zero: the function is "system-wide" by Python's documentation (since 3.5;
+    In one boot all processes share one origin: the function is "system-wide" by Python's documentation (since 3.5;
     on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Only Linux gives a
     boot an identity. Elsewhere the computer's name must do: no run hands times on to a run after it.
     """

@@ -194,12 +194,12 @@ class MeasurementFailed(NoResponse):
 
 
 class ControlLost(RequestError):
-    """Control was taken away, and the caller does not wait for its return."""
+    """The error that control was taken away from a caller that does not wait for its return."""
 
     code = "control-lost"
 
 
 class ExperimentEnded(AfspmError):
-    """The experiment has ended: the microscope takes no more requests."""
+    """The error that the experiment has ended: the microscope takes no more requests."""
 
     code = "ended"

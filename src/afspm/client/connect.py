@@ -85,7 +85,7 @@ def _log_of(name: str) -> logging.Logger:
 
 
 def guest_facts(launch: Launch) -> Plain:
-    """Return the guest's entry in run.json: a component's launch line without the fields of that component."""
+    """Return the guest's entry in run.json: a component's launch line, without class, settings and envelopes."""
     sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
     guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
     facts: Plain = json.loads(guest.to_json())

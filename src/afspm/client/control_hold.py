@@ -81,7 +81,7 @@ class ControlHold:
             self.is_unbroken = was_unbroken
 
     def regain(self, until_s: float | None = None) -> None:
-        """Return in control: at once if it is held, else request it after each change of the control state.
+        """Return once control is held; until then, request control after each change of the control state.
 
         Raises:
             ControlLost: not until `until_s`, or the problem has been solved, or the block is unbroken.

@@ -53,7 +53,7 @@ class Cycle:
         self.other: Any = None
 
     def control_was_lost(self) -> None:
-        """Take into account that others may measure from now on."""
+        """Register the loss of control: others may measure from now on."""
         self._resumed = True
 
     def on_state(self, state: ScopeState, time_ns: int | None) -> None:

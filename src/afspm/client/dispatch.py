@@ -42,7 +42,7 @@ class HostedComponent(Protocol):
 
 
 class MessageDispatcher:
-    """Calls the handlers of `component` for packets; handlers inherited from `base` are empty.
+    """The calls of `component`'s handlers for packets; handlers inherited from `base` are empty.
 
     Args:
         prefixes: prefixes of the envelopes that the component subscribed to; None: all. More packets arrive: `Scope`

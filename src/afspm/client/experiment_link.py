@@ -79,7 +79,7 @@ class RequestTracker:
         return f"{self._name}/{self._session}/{self._requests}"
 
     def expect(self, request_id: str) -> None:
-        """Wait for the answer to this request; an empty id: for none."""
+        """Select the request whose answer is waited for; an empty id selects none."""
         self._asked, self.answer = request_id, None
 
     def send_only(self, kind: int, subject: object = None) -> str:
@@ -206,7 +206,7 @@ class ExperimentLink:
         self.check()
 
     def check(self) -> None:
-        """Raise the reason why waiting makes no more sense, if there is one.
+        """Raise an error if waiting is useless.
 
         Raises:
             ExperimentEnded, StopRequested: the experiment has ended, or the process is being stopped.

@@ -1,4 +1,4 @@
-"""What Ctrl-C and the stop button of a notebook do during a call: `KeyboardInterrupt` where the call waits."""
+"""Ctrl-C and a notebook's stop button during a call: `KeyboardInterrupt` is raised where the call waits."""
 
 from __future__ import annotations
 

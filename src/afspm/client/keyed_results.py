@@ -80,7 +80,7 @@ class KeyedResults:
         return None if kept is None else [Parameter(**one) for one in kept]
 
     def keep_before_sweep(self, key: str, before: Sequence[Parameter] | None) -> None:
-        """Write down the parameters as they are before a sweep sets the first; None: they are in force again."""
+        """Save the parameters before a sweep sets the first; None: they are in force again."""
         kept = self._memory.setdefault("before_sweep", {})
         if before is None:
             kept.pop(key, None)

@@ -92,7 +92,7 @@ class _MeasurementTask:
 
 
 class MeasurementRunner:
-    """Takes measurements over one link, one at a time."""
+    """A runner of measurements over one link, one at a time."""
 
     def __init__(
         self,

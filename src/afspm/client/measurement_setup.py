@@ -9,7 +9,7 @@ from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePositio
 
 
 class MeasurementSetup:
-    """Sets up the microscope for measurements, if the settings are not yet in force. Control must be held around each
+    """The setup of the microscope for measurements; settings in force are skipped. Control must be held around each
     call.
 
     Args:

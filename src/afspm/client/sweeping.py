@@ -46,7 +46,7 @@ class SweepPoint:
 
 
 class ParameterSweep:
-    """Measures the points of a plan. The values before the first are kept until they are in force again.
+    """The measurement of a plan's points. Values before the first point are kept until they are in force again.
 
     A sweep with a key keeps them on disk: a component that is killed and started again goes on with the point after
     the last, and sets the parameters back to what they were before its first life.

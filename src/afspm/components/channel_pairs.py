@@ -32,7 +32,7 @@ class HeightPair:
 
 
 class ChannelPairing:
-    """Collects channels until trace and retrace of one scan are there.
+    """A collector of channels until trace and retrace of one scan are there.
 
     Args:
         channel, retrace_channel: names of the height channels; the second is empty if retrace is not recorded.
@@ -59,7 +59,7 @@ class ChannelPairing:
 
 
 class MissingChannels:
-    """Warns once if scans arrive but none has a required channel.
+    """A single warning if scans arrive but none has a required channel.
 
     Args:
         channels: names of the required channels; empty names are ignored.

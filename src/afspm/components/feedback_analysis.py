@@ -15,7 +15,7 @@ MESSAGE = "FeedbackAnalysis"
 
 
 class FeedbackAnalysis(FeedbackObserver):
-    """Publishes after each scan the shares of pixels with too large an error, as a `FeedbackAnalysis` message.
+    """A component that publishes a `FeedbackAnalysis` after each scan: the shares of pixels with too large an error.
 
     Flags `feedback-non-optimal` when several scans in a row leave too much in the error, and clears the flag when scans
     leave less than half of that; while a component has control to solve the problem, that component decides. If the

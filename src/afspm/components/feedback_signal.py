@@ -20,9 +20,9 @@ _CURRENT_DECAY_M = 0.05e-9  # a tenth of the current for 0.1 nm: work functions 
 
 
 class FeedbackSignal:
-    """Compares a channel with the setpoint, which is published without a unit.
+    """The comparison of a channel with the setpoint, which is published without a unit.
 
-    Whether the channel's unit fits the setpoint is asked once for each unit.
+    The microscope is asked once for each unit whether the unit fits the setpoint.
 
     Args:
         threshold: of the error, as a share of the setpoint (of a current: of its logarithm); None: 0.1, and 0.5 for a
@@ -43,7 +43,7 @@ class FeedbackSignal:
 
         Raises:
             InvalidValue: the channel's unit does not fit the setpoint (an amplitude in m where the setpoint is in V),
-                the translator does not answer just now, the channel has no value, or the setpoint is zero.
+                the translator does not answer at present, the channel has no value, or the setpoint is zero.
         """
         if setpoint is not None:
             if signal.unit not in self._reasons:

@@ -15,7 +15,7 @@ BACK_WITHIN_S = 60.0
 
 
 class FeedbackTuner(FeedbackObserver):
-    """Solves `feedback-non-optimal`: scans the current region, and searches a good integral gain.
+    """A solver of `feedback-non-optimal`: it scans the current region, and searches a good integral gain.
 
     It raises the gain while the feedback is too slow, and lowers it while it oscillates. If no gain is good, it
     restores the original gain, logs that, and clears the flag, so that the experiment continues as before. The original

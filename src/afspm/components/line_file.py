@@ -17,7 +17,7 @@ _log = logging.getLogger("afspm.records")
 
 
 class LineFile:
-    """Appends lines to a text file. An incomplete last line, left by a kill, is removed before the next is written.
+    """A text file that grows by lines. An incomplete last line, left by a kill, is removed before the next is written.
 
     Args:
         path: created with the first line.

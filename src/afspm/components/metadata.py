@@ -22,7 +22,7 @@ _BUSY = {ScopeState.SCANNING: "scan", ScopeState.SPEC: "spectrum"}
 
 
 class Metadata(Component):
-    """Writes `metadata.csv` in the run folder: a row for each channel of each scan, each spectrum and each note.
+    """The writer of `metadata.csv` in the run folder: a row for each channel of a scan, each spectrum and each note.
 
     Columns: end time (UTC); `scan`, `spectrum` or `note`; file; channel (or kind); place in metres; pixels; units; and,
     as they were when the measurement began, holder of control, mode, flagged problems and the microscope's state; for a

@@ -17,7 +17,7 @@ from afspm.record.night_record import NightRecord, control_entry, mark_entry, sc
 
 
 class NightPicture(Component):
-    """Draws `night.png` when the experiment ends: the scans in a row, control and problems over time.
+    """The picture `night.png`, drawn when the experiment ends: the scans in a row, control and problems over time.
 
     A simulated microscope is marked in the picture. The component subscribes to all packets, and saves as it goes:
     killed and restarted, it draws the same picture.

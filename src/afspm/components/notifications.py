@@ -31,7 +31,7 @@ Way = Literal["command", "webhook"]
 
 
 class NotDelivered(AfspmError):
-    """A notification could not be delivered; it may be retried."""
+    """The error that a notification could not be delivered; the delivery may be retried."""
 
 
 @dataclass(frozen=True)

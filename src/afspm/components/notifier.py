@@ -32,7 +32,7 @@ LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 
 class Notifier(Component):
-    """Calls a command, a webhook or both when a problem stays unsolved, a component is given up or logs CRITICAL.
+    """Calls of a command or a webhook when a problem stays unsolved, a component is given up or logs CRITICAL.
 
     [notify] of the experiment file adds it to an experiment. It only subscribes, and delays no other process. A failed
     delivery is retried at growing intervals for half an hour; retries continue after a restart, and a delivered

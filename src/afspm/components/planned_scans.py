@@ -37,7 +37,7 @@ _MISSED: dict[Missed, str] = {
 
 
 class PlannedScans(Component):
-    """Takes the scans of a plan. Derive from it for a plan of your own, and set `plan` (and `beat_s`) in `__init__`.
+    """The scans of a plan. Derive from this class for a plan of your own; set `plan` (and `beat_s`) in `__init__`.
 
     Each scan has a key, so no scan is left out or taken twice, even if processes are killed. While control is lost (to
     the repair of a tip, to a person) the scan waits; an interruption is logged.

@@ -30,7 +30,7 @@ SIGNS_OF_LIFE = ("ControlState",)
 
 
 class Recorder(Component):
-    """Writes `journal.sqlite`, and every scan and spectrum as an HDF5 file, into the folder of the run.
+    """The writer of `journal.sqlite`, and of an HDF5 file for every scan and spectrum, in the run folder.
 
     It follows the scheduler's packet log at low processor priority. Even if all processes are killed at once, the
     record of a resumed run has each published packet exactly once. A full disk is logged; the experiment goes on, and

@@ -46,13 +46,13 @@ class SourcedPacket(NamedTuple):
 
 
 class RecordWriter:
-    """Records packets of the log, and packets given by `put`, in a thread.
+    """A thread that records packets of the log, and packets given by `put`.
 
     Args:
         folder: of the run.
         log: folder of the packet log; without one, all packets are given by `put`.
-        step: entered around everything that takes time.
-        wake: called when `check` or `wants_replay` has news.
+        step: context manager entered around every slow operation.
+        wake: called when the result of `check` or `wants_replay` may have changed.
     """
 
     def __init__(
@@ -248,7 +248,7 @@ class RecordInbox:
         self._until_s = 0.0
 
     def put(self, packet: SourcedPacket, *, is_disk_full: bool) -> None:
-        """Queue a packet. If too many wait for room on the disk, all are dropped, to be asked for again later."""
+        """Queue a packet. If too many wait for room on the disk, all are dropped, and requested again later."""
         with self._changed:
             self._queue.append(packet)
             self._bytes += len(packet.packet.payload)
@@ -265,7 +265,7 @@ class RecordInbox:
             return queued, self._ending
 
     def end(self, until_s: float, *, ended: bool) -> None:
-        """Let the writing end until `until_s`; `ended`: the experiment has ended, too."""
+        """Let the writing end by `until_s`; `ended`: the experiment has ended, too."""
         with self._changed:
             self._ending, self._until_s = ended, until_s
             self._changed.notify()
@@ -330,7 +330,7 @@ class LogProgress:
         return max(0, self._reader.newest - self._reader.position.segment - 1) * SEGMENT_BYTES
 
     def took(self, batch: list[SourcedPacket], waiting: list[Packet]) -> None:
-        """Note packets that will be recorded only after later ones have arrived."""
+        """Register packets that will be recorded only after later packets have arrived."""
         for packet, _, before in batch:
             if before is not None:
                 self._waiting.setdefault((packet.time_ns, packet.envelope), before)
@@ -338,7 +338,7 @@ class LogProgress:
         self._waiting = {key: before for key, before in self._waiting.items() if key in still}
 
     def commit(self, sync: Callable[[], None]) -> None:
-        """Commit the position up to which all is recorded, after `sync` has put it on the disk. Raises OSError."""
+        """Commit the position up to which all packets are recorded, after `sync` to the disk. Raises OSError."""
         position = min(self._waiting.values(), default=self._reader.position)
         if self._stopped or position <= self._committed or committed(self._log) is None:
             return

@@ -75,7 +75,7 @@ class ScanPlan:
 class RoundSchedule:
     """Due times of the rounds of a plan: multiples of a period after the start, in experiment time.
 
-    A round is missed if its time passes while another is taken, or waits for the repair of a tip; the next one is due
+    A round is missed if its time passes while another round is taken or waits for a tip repair; the next one is due
     at the next multiple.
 
     Attributes:

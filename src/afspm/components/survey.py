@@ -33,7 +33,7 @@ USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
 class Survey(Component):
-    """Takes a wide scan, finds targets in it, and takes a zoom and curves at each target.
+    """A wide scan, a search for targets in it, and a zoom and curves at each target.
 
     It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture: the
     survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
@@ -344,7 +344,7 @@ Finder = Callable[[Scan], Iterable[object]]
 
 @dataclass(frozen=True)
 class TargetFinder:
-    """Finds targets in a survey, and each of them again in its zoom.
+    """The search for targets in a survey, and for each target in its zoom.
 
     Attributes:
         function: the user's, "module.name"; None: find particles.
@@ -373,7 +373,7 @@ class TargetFinder:
         return self._of_function(self.function, survey)[: self.count]
 
     def again(self, zoom: Scan, target: Target) -> XY:
-        """Return the position of a target in its zoom, or that in the survey if it is not found."""
+        """Return a target's position in its zoom, or its position in the survey if the zoom does not show it."""
         if not self.refines:
             return target.position_m
         if self.function is None:

@@ -21,7 +21,7 @@ _PROBE = (names.PROBE_POS_X, names.PROBE_POS_Y)
 
 
 class Sweep(Component):
-    """Takes a scan or a spectrum at each combination of the values of some parameters.
+    """A scan or a spectrum at each combination of the values of some parameters.
 
     At the end the parameters are set back to their values before the sweep, also where a process was killed in
     between. Each point is measured once, whichever process is killed. Control is kept over the whole sweep; a point
@@ -91,7 +91,7 @@ class Sweep(Component):
 
     @property
     def planned_parameters(self) -> dict[str, tuple[Parameter, ...]]:
-        """Every value that is set, by the setting that gives it: `afspm check` holds them against the limits."""
+        """All values to be set, by the setting that contains them: `afspm check` compares them with the limits."""
         return {
             "parameters": tuple(axis.parameter(place) for axis in self.sweep.axes for place in range(len(axis.values)))
         }

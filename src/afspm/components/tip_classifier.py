@@ -15,7 +15,7 @@ _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion
 
 
 class TipClassifier(Component):
-    """Flags `tip-shape-changed` when scans show that the tip is blunt, double or carries debris, and clears it again.
+    """A judge of scans: it flags `tip-shape-changed` for a blunt or double tip or one with debris, and clears the flag.
 
     It learns the reference from the first scans of each size and number of pixels, so the tip must be good then; it
     learns nothing while a problem is flagged or after a scan that was not good. It judges best at places that it has

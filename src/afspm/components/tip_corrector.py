@@ -33,7 +33,7 @@ VERDICT_WITHIN_S = 20.0  # real time: after that no verdict is expected
 
 
 class TipCorrector(Component):
-    """Solves `tip-shape-changed` by pulses of the bias, one after the other, then by ever deeper controlled crashes.
+    """A solver of `tip-shape-changed`: it applies bias pulses one after the other, then ever deeper controlled crashes.
 
     After each treatment it takes a test scan, with the region and pixels of the scan last judged bad, since the fault
     was seen there; without such a verdict, of the current region. A component that judges scans (the `TipClassifier`)

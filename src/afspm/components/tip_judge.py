@@ -170,7 +170,7 @@ class TipReference:
         return None
 
     def note(self, place: KnownPlace | None, region: Region, seen: TipMetrics, correlation: Array) -> None:
-        """Add a scan with a good tip to a place; None: begin a new place."""
+        """Add a scan with a good tip to a place; None as `place` begins a new place."""
         if place is not None:
             place.follow(seen, correlation)
             return
@@ -205,7 +205,7 @@ class JudgeState:
 
 
 class TipJudge:
-    """Learns a reference from the first scans of each kind, then judges that kind.
+    """A judge that learns a reference from the first scans of each kind, and compares later scans with it.
 
     Args:
         reference_scans: number of scans to learn from. The tip must be good then, which the scans alone can't show.
@@ -225,7 +225,7 @@ class TipJudge:
         return tuple(self._state.kinds)
 
     def knows(self, region: Region, shape: tuple[int, int]) -> bool:
-        """Return whether such a scan is compared rather than learnt from."""
+        """Return whether a scan of this region and shape is compared with a reference rather than learnt from."""
         return any(self._is_known(kind) and kind.fits(region, shape) for kind in self._state.kinds)
 
     def state(self) -> Plain:
@@ -362,7 +362,7 @@ class TipJudge:
 
 
 class VerdictCounter:
-    """Turns opinions into a flag: a number of bad ones in a row sets it, a number of good ones clears it."""
+    """A counter of opinions: a number of bad ones in a row sets the flag, a number of good ones clears it."""
 
     def __init__(self, flag_after: int, clear_after: int) -> None:
         if flag_after < 1 or clear_after < 1:

@@ -18,7 +18,7 @@ DONE_ACTION = "ActionMsg"
 
 
 class TipWorkshop:
-    """Treats the tip for a component, which must hold control around every call.
+    """Treatments of the tip for a component, which must hold control around every call.
 
     Args:
         center: about which the places lie.
@@ -45,7 +45,7 @@ class TipWorkshop:
         self._frame: Region | None = None  # the frame set about a place
 
     def treat(self, number: int, treatment: Treatment, safe: tuple[Region, ...]) -> bool:
-        """Do the `number`-th treatment at a fresh place, in one tenure of control with the move there.
+        """Do the `number`-th treatment at a fresh place, without losing control between move and treatment.
 
         Return whether it was done. Raises FileError if the state can't be saved.
         """

@@ -54,7 +54,7 @@ class ComponentDeclaration:
 
 
 class Unloadable(Exception):
-    """The class can't be loaded; message and hint are for the user."""
+    """The error that a class can't be loaded; message and hint are for the user."""
 
     def __init__(self, what: str, hint: str = "") -> None:
         super().__init__(what)

@@ -9,7 +9,7 @@ from enum import Enum
 
 
 class Level(Enum):
-    """An error keeps the experiment from starting; a warning does not."""
+    """The severity of a finding: an error keeps the experiment from starting; a warning does not."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -46,7 +46,7 @@ class Finding:
 
 @dataclass
 class Findings:
-    """Collects findings, so that one check reports them all."""
+    """A collection of findings, so that one check reports them all."""
 
     found: list[Finding] = field(default_factory=list)
 

@@ -68,7 +68,7 @@ _OWN: Final = (*LimitsSection.model_fields, "actions")
 
 @dataclass(frozen=True)
 class LimitsReader:
-    """Reads the section for a microscope's capabilities.
+    """A reader of the section [limits] for a microscope's capabilities.
 
     Args:
         parameters: known generic names with their SI units (None: it depends on the operating mode).

@@ -72,7 +72,7 @@ class ExperimentParts:
 
 
 class Converter(Protocol):
-    """Converts components of another form of files."""
+    """A converter of components from another form of files."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
         """Return the components in afspm's form, by name; components already in it are returned unchanged.
@@ -174,7 +174,7 @@ def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -
 
 
 class VariableReferences:
-    """Replaces references: a text that equals a top-level key stands for that key's value, as in the paper.
+    """The replacement of references: a text that equals a top-level key stands for that key's value, as in the paper.
 
     Only whole texts count, and only keys of variables and intermediary tables. Components and sections are no values,
     so a component can be named (in a role, in a limit) without its table being pasted in.

@@ -47,13 +47,13 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Whether it follows a plan of its own: a script that solves no problems does; True for a command (unknown)."""
+        """Whether it follows a plan of its own, like a script that solves no problems; True for a command (unknown)."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves
 
     def declares(self, attribute: str) -> bool:
-        """Return whether a flag of its class is true."""
+        """Return whether the flag `attribute` of the process's class is true."""
         return getattr(self.component, attribute, False) is True
 
     @property

@@ -17,7 +17,7 @@ def text_width(text: str, size: float, *, bold: bool = False) -> float:
 
 
 class Svg:
-    """Collects shapes; lines come first, then boxes, then texts, so that no line covers a text."""
+    """A drawing of lines, then boxes, then texts, so that no line covers a text."""
 
     def __init__(self) -> None:
         self._lines: list[str] = []

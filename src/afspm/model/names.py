@@ -1,4 +1,4 @@
-"""Names of actions and parameters. Names that begin with `x-` are extensions to those of the paper."""
+"""Names of actions and parameters. Names that begin with `x-` are extensions to the paper's names."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ENGAGE: Final = "x-engage"
 EXTENSION_ACTIONS: Final = (PULSE, CRASH, RETRACT, ENGAGE)
 
 AT_PROBE: Final = frozenset({START_SPEC, PULSE, CRASH})
-"""The kind of spectroscopy at the probe position."""
+"""The actions that take place at the probe position."""
 
 SCAN_TOP_LEFT_X: Final = "scan-top-left-x"
 SCAN_TOP_LEFT_Y: Final = "scan-top-left-y"

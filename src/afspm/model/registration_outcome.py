@@ -8,7 +8,7 @@ from enum import IntEnum
 
 
 class RegistrationOutcome(IntEnum):
-    """How the position of a scan is known; numbers as on the wire."""
+    """The way in which a scan's position was determined; numbers as on the wire."""
 
     REGISTERED = 1
     """Matched with an earlier scan, or the first scan of all."""

@@ -157,7 +157,7 @@ def film_of(
     """Return the film of scans of one place.
 
     Args:
-        rows: the scans, in the order of the film; interrupted ones come as far as they were taken.
+        rows: the scans, in the order of the film; interrupted scans show the lines taken.
         channel: None: the first of the first scan.
         drift: of `recorded_drift`; None: read from the run.
 

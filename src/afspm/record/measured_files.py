@@ -27,7 +27,7 @@ PART = ".part"
 
 
 class MeasuredFiles:
-    """Writes measurements, in the open transaction.
+    """A writer of measurements, in the open transaction.
 
     Args:
         folder: of the run.

@@ -113,7 +113,7 @@ class DriftPoint:
 
 
 class MeasurementHistory:
-    """Reduces measurements to summaries, in the order of arrival; the oldest are dropped beyond `MOST_MEASURED`.
+    """Summaries of measurements, in the order of arrival; the oldest are dropped beyond `MOST_MEASURED`.
 
     Attributes:
         running: the running scan, or None.

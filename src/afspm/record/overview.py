@@ -119,7 +119,7 @@ class ProcessHistory:
 
 
 class Overview:
-    """Reduces packets to the present state and the history of an experiment. Pure: no clock, socket or file.
+    """The present state and the history of an experiment, reduced from packets. Pure: no clock, socket or file.
 
     A packet older than the newest of its envelope is ignored, so replayed packets may be given as they arrive.
 
@@ -234,7 +234,7 @@ class Overview:
     def silent_ns(self, name: str, speed: float) -> int | None:
         """Return the time since the last report on a process; None while reports on it come.
 
-        Other packets arrive meanwhile: the computer of the process is gone.
+        If other packets arrive meanwhile, the computer of the process is unreachable.
 
         Args:
             speed: experiment seconds in a real second.

@@ -41,7 +41,7 @@ T = TypeVar("T", bound=Timed)
 
 
 class RecordPlayback(Generic[T]):
-    """Yields recorded items when they are due, oldest first, to a page or to components.
+    """The playback of recorded items when they are due, oldest first, to a page or to components.
 
     The caller provides the time: a running clock, or the moment chosen by a viewer.
     """

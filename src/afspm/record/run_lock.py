@@ -51,7 +51,7 @@ def other_computer(folder: Path) -> str:
 
 
 def goes_on(folder: Path) -> bool:
-    """Return whether a run goes on, as far as this computer can know: it has not ended, and was not cut off."""
+    """Return whether a run is still going on, as far as this computer can know: not ended, and not cut off."""
     return not run_json_or_empty(folder).get(ENDED) and not cut_off_message(folder)
 
 

@@ -61,7 +61,7 @@ Assembled = AssembledScan | AssembledSpectrum
 
 
 class ScanAssembler:
-    """Groups packets by measurement, in the order of publication.
+    """The grouping of packets by measurement, in the order of publication.
 
     Args:
         state: the last published state of the microscope.

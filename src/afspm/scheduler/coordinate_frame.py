@@ -46,14 +46,14 @@ class MappedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Reconsider:
-    """Step again with an input that was kept, through the frame first."""
+    """The output that steps again with a kept input, through the frame first."""
 
     event: Input
 
 
 @dataclass(frozen=True, slots=True)
 class AskMicroscope:
-    """Send a request in the scheduler's own name; `FrameAnswered` returns the answer with the same purpose."""
+    """The output that sends a request in the scheduler's own name; `FrameAnswered` has the answer and `purpose`."""
 
     request: Request
     purpose: object
@@ -61,12 +61,12 @@ class AskMicroscope:
 
 @dataclass(frozen=True, slots=True)
 class SaveNow:
-    """Save the state before the effects of this step are carried out."""
+    """The output that saves the state before the effects of this step are carried out."""
 
 
 @dataclass(frozen=True, slots=True)
 class HoldControl:
-    """Delay the first control state after a restart until `until_s` (real): earlier packets are still missing."""
+    """The output that delays the first control state after a restart to `until_s` (real): packets are missing."""
 
     until_s: float
 
@@ -76,7 +76,7 @@ FrameOutput = Input | Reconsider | AskMicroscope | SaveNow | HoldControl | Deleg
 
 
 class CoordinateFrame(Protocol):
-    """Maps between the coordinates of components and those of the microscope. Immutable.
+    """An immutable map between the coordinates of components and the coordinates of the microscope.
 
     Attributes:
         is_moving: whether the microscope may have to be moved before an action. The scheduler then remembers a sent
@@ -88,7 +88,7 @@ class CoordinateFrame(Protocol):
     def step(
         self, event: Input, control: ArbitrationState, now_s: float, now_ns: int
     ) -> tuple[CoordinateFrame, Sequence[FrameOutput]]:
-        """Look at an input before the scheduler does.
+        """Process an input before the scheduler does.
 
         Args:
             control: as it is before the input.

@@ -19,21 +19,21 @@ from afspm.scheduler.saved_state import SavedState
 
 @dataclass(frozen=True, slots=True)
 class Connected:
-    """A peer connected to the control socket. `connection` numbers grow and are never used again."""
+    """The event that a peer connected to the control socket. `connection` numbers grow and are never reused."""
 
     connection: int
 
 
 @dataclass(frozen=True, slots=True)
 class Disconnected:
-    """A connection to the control socket is gone."""
+    """The event that a connection to the control socket is lost."""
 
     connection: int
 
 
 @dataclass(frozen=True, slots=True)
 class Greeted:
-    """A peer sent its name and nothing else (the empty first message of ZMQ_PROBE_ROUTER)."""
+    """The event that a peer sent only its name (the empty first message of ZMQ_PROBE_ROUTER)."""
 
     connection: int
     name: str
@@ -58,7 +58,7 @@ class RequestIn:
 
 @dataclass(frozen=True, slots=True)
 class Unreadable:
-    """A message from the peer `name` could not be decoded as a request, and was refused with `response`."""
+    """A message from the peer `name` that could not be decoded as a request, and was refused with `response`."""
 
     name: str
     response: Response
@@ -66,7 +66,7 @@ class Unreadable:
 
 @dataclass(frozen=True, slots=True)
 class PacketIn:
-    """The translator published a packet."""
+    """The event that the translator published a packet."""
 
     packet: Packet
     header: PacketHeader
@@ -87,22 +87,22 @@ class ReplayRequested:
 
 @dataclass(frozen=True, slots=True)
 class TranslatorUp:
-    """The translator is connected: requests can be sent."""
+    """The event that the translator is connected: requests can be sent."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorDown:
-    """The connection to the translator is lost."""
+    """The event that the connection to the translator is lost."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorCaughtUp:
-    """All packets that the translator published during the scheduler's absence have been received."""
+    """The event that all packets published by the translator during the scheduler's absence have been received."""
 
 
 @dataclass(frozen=True, slots=True)
 class TranslatorReply:
-    """The translator answered the request that was forwarded under `number`."""
+    """The translator's answer to the request that was forwarded under `number`."""
 
     number: int
     response: Response
@@ -110,7 +110,7 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ProblemSeen:
-    """The scheduler's process found that a problem has appeared, or disappeared.
+    """The event that the scheduler's process found a problem, or its disappearance.
 
     Attributes:
         name: the component in whose name it is flagged.
@@ -123,7 +123,7 @@ class ProblemSeen:
 
 @dataclass(frozen=True, slots=True)
 class Announced:
-    """The coordinate frame publishes a packet of its own.
+    """A packet that the coordinate frame publishes itself.
 
     Attributes:
         before_ns: the translator's time of a packet that must come after this one; None: published with the current
@@ -137,17 +137,17 @@ class Announced:
 
 @dataclass(frozen=True, slots=True)
 class Stopped:
-    """The run is stopped before the end of the experiment: the last input of this scheduler."""
+    """The event that the run is stopped before the end of the experiment: the last input of this scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A deadline (`SchedulerCore.deadline_s`) has passed."""
+    """The event that a deadline (`SchedulerCore.deadline_s`) has passed."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameReported:
-    """The worker of the coordinate frame has a result, or has ended; only the frame reads its content."""
+    """A report of the coordinate frame's worker: a result, or its end; only the frame reads the content."""
 
     report: object
 
@@ -157,12 +157,12 @@ class FrameReported:
 
 @dataclass(frozen=True, slots=True)
 class Started:
-    """The scheduler starts, for the first time or after a restart."""
+    """The event that the scheduler starts, for the first time or after a restart."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameAnswered:
-    """A request of the coordinate frame was answered."""
+    """The answer to a request of the coordinate frame."""
 
     purpose: object
     response: Response
@@ -170,7 +170,7 @@ class FrameAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ControlChanged:
-    """This step changed the holder, the mode or the problems."""
+    """The event that this step changed the holder, the mode or the problems."""
 
     before: ArbitrationState
     after: ArbitrationState
@@ -204,7 +204,7 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """Answer the peer `name` over `connection`, which is open and the newest of that name.
+    """The effect that answers the peer `name` over `connection`, the newest open one of that name.
 
     Attributes:
         asked: the kind of the answered request.
@@ -218,7 +218,7 @@ class Reply:
 
 @dataclass(slots=True)
 class Forward:
-    """Send a request to the translator, marked with `number`.
+    """The effect that sends a request to the translator, marked with `number`.
 
     A client's `request.payload` is sent as it came. A request of the scheduler itself has no payload: its subject is
     encoded.
@@ -230,11 +230,11 @@ class Forward:
 
 @dataclass(slots=True)
 class Publish:
-    """Publish a packet to the subscribers of its envelope.
+    """The effect that publishes a packet to the subscribers of its envelope.
 
     Attributes:
-        source_ns: the translator's own time of it; None for a packet of the scheduler.
-        history: how many packets of this envelope the cache keeps over a restart; 0: this one is not cached.
+        source_ns: the packet's time by the translator; None for a packet of the scheduler.
+        history: number of packets of this envelope kept over a restart; 0: this packet is not cached.
     """
 
     packet: Packet
@@ -244,7 +244,7 @@ class Publish:
 
 @dataclass(slots=True)
 class Replay:
-    """Send these packets to one subscriber, in this order, and then the message that it has caught up."""
+    """The effect that sends packets in order to one subscriber, then the message that it has caught up."""
 
     subscriber: Hashable
     packets: tuple[Packet, ...]
@@ -252,14 +252,14 @@ class Replay:
 
 @dataclass(slots=True)
 class SaveState:
-    """Save `state`, so that it survives a kill, before the effects that follow are carried out."""
+    """The effect that saves `state`, so that it survives a kill, before the following effects are carried out."""
 
     state: SavedState
 
 
 @dataclass(slots=True)
 class Log:
-    """Write to the log. `level` is a name of the logging module: "INFO", "WARNING", "ERROR"."""
+    """The effect that logs a line; `level` is a name of `logging`: "INFO", "WARNING", "ERROR"."""
 
     level: str
     text: str
@@ -267,7 +267,7 @@ class Log:
 
 @dataclass(slots=True)
 class Kill:
-    """The experiment ends: publish the signal KILL, and close.
+    """The effect that ends the experiment: the signal KILL is published, and the sockets are closed.
 
     Attributes:
         tip_is_safe: the translator may leave; if False, it retracts the tip itself when it is stopped.
@@ -278,7 +278,7 @@ class Kill:
 
 @dataclass(slots=True)
 class Delegate:
-    """Hand a job to the worker of the coordinate frame; its result is the input `FrameReported`."""
+    """The effect that gives a job to the coordinate frame's worker; the result is the input `FrameReported`."""
 
     job: object
 
@@ -287,7 +287,7 @@ Effect = Reply | Forward | Publish | Replay | SaveState | Log | Kill | Delegate
 
 
 class Codec(Protocol):
-    """Objects to and from bytes, as decisions need them; simulated nights use a table in place of the wire format."""
+    """The conversion of objects to and from bytes; simulated nights use a table in place of the wire format."""
 
     def encode(self, thing: object) -> bytes:
         """Return a model object as the payload of a packet or an answer."""

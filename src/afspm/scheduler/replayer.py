@@ -25,7 +25,7 @@ MOST_AT_ONCE = 200
 
 
 class Replayer:
-    """Publishes packets at the times at which they were published.
+    """A publisher of recorded packets, each at its recorded time.
 
     Args:
         recorded: the packets.

@@ -47,7 +47,7 @@ class Coordinates:
 
 
 class Scheduler:
-    """Lets one component at a time command the microscope, and republishes all packets.
+    """The arbiter that lets one component at a time command the microscope, and republishes all packets.
 
     It continues after a kill and a restart. Mode, holder, problems and packets are on disk before they are published.
 

@@ -35,7 +35,7 @@ AdjustableParameter = Literal["zctrl-setpoint", "zctrl-pgain", "zctrl-igain", "t
 
 @dataclass(frozen=True)
 class ControlSettings:
-    """How control is given and taken away.
+    """The rules for giving control and taking it away.
 
     Attributes:
         lease_s: experiment time after which an idle holder loses control.

@@ -13,7 +13,7 @@ from afspm.storage.atomic import CheckpointFile, OutageLog, load_checkpoint
 
 
 class StateFile:
-    """Stores mode, holder, problems …, each time before they are published.
+    """The file of mode, holder, problems …, saved each time before they are published.
 
     Args:
         path: of the file; None: nothing is stored.

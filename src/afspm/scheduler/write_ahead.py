@@ -17,7 +17,7 @@ _CLOSED_WITHIN_S = 5.0  # real; a hanging disk must not keep the process from en
 
 
 class WriteAhead:
-    """Writes in a thread, and waits only for a moment: a slow disk must not delay control.
+    """A thread that writes, with a short wait for the disk: a slow disk must not delay control.
 
     A full or hanging disk is logged, and the experiment goes on. Entries that could not be written are written later,
     as far as they are still cached.

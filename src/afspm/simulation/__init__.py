@@ -1,6 +1,6 @@
 """The simulated instrument: world, tip, feedback and noise; its driver; and the base of all emulated controllers.
 
-**Theory of operation.** A simulated night is a function of its settings and its seed. No clock is here: every call
+**Theory of operation.** A simulated night is a function of its settings and its seed. There is no clock: every call
 gets its time.
 
     comes in      settings, a seed, commands with their times, faults on demand

@@ -28,7 +28,7 @@ class ScanValues(Protocol):
 
 @dataclass(frozen=True)
 class Occupied:
-    """The instrument is busy with `what` until `end_s` (a move, an approach …)."""
+    """An activity `what` (a move, an approach …) that keeps the instrument busy until `end_s`."""
 
     what: str
     start_s: float
@@ -90,7 +90,7 @@ class ScanActivity:
         return Course(self.region, self.shape, self.line_s, self.start_s, "up" if self.upwards else "down")
 
     def draw(self, values: ScanValues) -> None:
-        """Set the values, for which `channels` waits."""
+        """Set the values; `channels` waits for them."""
         self._drawn.set_result(values)
 
     def wait(self) -> None:
@@ -98,7 +98,7 @@ class ScanActivity:
         wait([self._drawn])
 
     def redrawn(self, adjusted: tuple[Adjustment, ...]) -> None:
-        """Discard the values, which are computed again with these adjustments."""
+        """Discard the values, so that they are computed again with these adjustments."""
         self.adjusted, self._whole, self._drawn = adjusted, None, Future()
 
     @property
@@ -114,11 +114,11 @@ class ScanActivity:
 
     @property
     def drawing(self) -> bool:
-        """True while its values are being computed; the scan does not end before, however fast time passes."""
+        """True while the values are being computed; the scan can't end earlier, at any speed of the clock."""
         return not self._drawn.done()
 
     def running(self, now_s: float) -> bool:
-        """True until it has ended, also while paused."""
+        """True until the scan has ended, also while paused."""
         if self.stopped_s is not None:
             return False
         return self.paused or now_s < self.end_s or self.drawing
@@ -219,7 +219,7 @@ class SpectrumActivity:
         return now_s < self.end_s
 
     def both_ways(self) -> tuple[Channels, Channels]:
-        """Return the variables forward and backward; one without a backward sweep has equal values."""
+        """Return the variables forward and backward; a variable without a backward sweep has equal values in both."""
         table = dict(zip(self.names, zip(self.units, self.values.T, strict=True), strict=True))
         there = {name: data for name, data in table.items() if not name.endswith(RETRACE)}
         back = {

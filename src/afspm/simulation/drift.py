@@ -130,7 +130,7 @@ class Drift:
 
 
 class ScannerCompensation:
-    """The displacement of a scanner that follows the sample by itself, at velocities set from time to time."""
+    """The displacement of a scanner with its own drift compensation, at velocities set from time to time."""
 
     def __init__(self, turns: Iterable[tuple[float, float, float, float, float]] = ()) -> None:
         self.turns = list(turns)  # (time, x, y at that time, velocity from then on)

@@ -111,7 +111,7 @@ def reach_m(tip: TipShape, height_range_m: float) -> float:
 
 
 def felt(height_m: Array, grid: SampleGrid, tip: TipShape, blur_steps: tuple[float, float]) -> tuple[Single, float]:
-    """Return the apex's path over a surface, on the same grid, band limited.
+    """Return the path of the tip's apex over a surface, on the same grid, band limited.
 
     Args:
         blur_steps: standard deviation of the whole blur (y, x) in grid steps, including the blur of `Sampler.spline`.

@@ -47,7 +47,7 @@ _STATE_VERSION = 2
 
 
 class InstrumentBusy(AfspmError):
-    """Another activity is running; it must end or be stopped first."""
+    """The error that another activity is running, which must end or be stopped first."""
 
     code = "instrument-busy"
 
@@ -105,7 +105,7 @@ class Instrument:
         setup: the settings in force.
         drawing: of scans.
         engaged: the tip is at the sample; otherwise all channels show noise.
-        scan, spectrum: the last started one, also after its end; None before the first.
+        scan, spectrum: the scan and the spectrum started last, also after their end; None before the first.
         world: the physics, with its ground truth (`world.truth`).
         ledger: the damage so far, counted up to the last call.
     """
@@ -163,7 +163,7 @@ class Instrument:
         return doing.end_s
 
     def next_change_s(self, now_s: float) -> float | None:
-        """Return the time at which it becomes free; None if free or paused, or if `drawing.wake` will be called."""
+        """Return the time at which the instrument becomes free; None if free, paused or awaiting `drawing.wake`."""
         ends_s = self.ends_s
         return None if ends_s is None or ends_s <= now_s else ends_s
 
@@ -337,7 +337,7 @@ class Instrument:
             self._probe_m, self._doing = self.probe_at(now_s), None
 
     def shift_sample(self, by_m: tuple[float, float], lasts_s: float, now_s: float) -> None:
-        """Move the sample with a coarse stage, so that the tip is over another position of it, (x, y) further.
+        """Move the sample with a coarse stage, so that the tip is `by_m` (x, y) further on the sample.
 
         Raises:
             InstrumentBusy. InvalidValue: distance or duration is not finite.
@@ -351,7 +351,7 @@ class Instrument:
             self.world.compensate((0.0, 0.0), now_s + lasts_s)
 
     def follow(self, velocity_m_per_s: tuple[float, float], now_s: float) -> None:
-        """Move the scanner at this velocity (x, y) from now on, also during a running scan, to follow the sample.
+        """Move the scanner at this velocity (x, y) from now on to follow the sample, also during a scan.
 
         Raises:
             InvalidValue: faster than any drift.

@@ -150,7 +150,7 @@ class Measured:
     pressed_m: float
 
     def continued(self, anew: Measured, rows: NDArray[np.bool_]) -> Measured:
-        """Return the measurement with these rows of a later one, which continues it."""
+        """Return the measurement with `rows` taken from its continuation, the first argument."""
         channels = {
             name: (unit, np.where(rows[:, None], anew.channels[name][1], values))
             for name, (unit, values) in self.channels.items()

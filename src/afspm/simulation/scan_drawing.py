@@ -23,7 +23,7 @@ def run_at_once(work: Callable[[], None]) -> None:
 
 
 class ScanDrawing:
-    """Computes one scan at a time, with exclusive use of the world meanwhile.
+    """The computation of one scan at a time, with exclusive use of the world meanwhile.
 
     Args:
         units: returns the unit of each channel.
@@ -41,7 +41,7 @@ class ScanDrawing:
         self.log = logging.getLogger(__name__)
 
     def start(self, scan: ScanActivity, draw: Draw) -> None:
-        """Start to compute a scan that was `prepared`."""
+        """Start the computation that `prepared` returned."""
 
         def work() -> None:
             try:
@@ -57,7 +57,7 @@ class ScanDrawing:
 
     @property
     def goes_on(self) -> bool:
-        """True while a scan is being computed, also a stopped one."""
+        """True while a scan is being computed, even if the scan was stopped."""
         return self._newest is not None and self._newest.drawing
 
     def wait(self) -> None:

@@ -80,7 +80,7 @@ class TipRepairSettings:
     """The repairs of `TipChangeSettings`.
 
     Attributes:
-        pulse_threshold_v: a pulse below has no effect.
+        pulse_threshold_v: a pulse below this voltage has no effect.
         pulse_cures, pulse_worsens: probability for a pulse far above the threshold that lasts `pulse_duration_s`.
         pulse_duration_s: a longer pulse has more effect, up to twice; a shorter one has less.
         crash_cures, crash_worsens: probability for a crash `crash_depth_m` deep.
@@ -158,7 +158,7 @@ class TipChange:
 
 
 class TipMaker:
-    """Draws random tips: sharp ones, and changed ones."""
+    """A generator of random tips: sharp tips, and tips after a change."""
 
     def __init__(self, settings: TipSettings) -> None:
         self._s = settings
@@ -291,13 +291,13 @@ class SimulatedTip:
         return [change for change in self.history if start_s < change.t_s <= end_s]
 
     def begin(self, t_s: float) -> None:
-        """Go to a time, and revoke later changes."""
+        """Revoke all changes later than `t_s`, which becomes the present."""
         self.history = [c for c in self.history if c.t_s <= t_s or c.cause == "start"]
         self.scheduled_until_s = min(self.scheduled_until_s, t_s)
         self.advance(t_s)
 
     def schedule(self, condition: str, t_s: float) -> None:
-        """Add a change to the schedule: also scans that are drawn again have it."""
+        """Add a change to the schedule, so that it also affects scans that are computed again."""
         change = (t_s - self._start_s, condition)
         self._settings = replace(self._settings, schedule=(*self._settings.schedule, change))
 
@@ -310,7 +310,7 @@ class SimulatedTip:
         self.scheduled_until_s = max(self.scheduled_until_s, until_s)
 
     def foresee(self, course: Course, loop: Loop, call: int) -> None:
-        """Add the scheduled and random changes during a scan."""
+        """Predict and add the scheduled and random changes during a scan."""
         s, start_s, end_s = self._settings, course.start_s, course.end_s
         hardness = loop.force**s.hardness_exponent if loop.on and loop.engages else float(not loop.on)
         rate = (s.per_hour / 3600.0 + s.per_metre * course.length_m / (end_s - start_s)) * hardness

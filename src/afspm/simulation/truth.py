@@ -14,9 +14,9 @@ from afspm.storage.disk import DiskThread, DiskTimeout
 
 
 class Truth:
-    """Appends one JSON object a line: `n`, `time_s` (experiment), `event` and its facts.
+    """A file of JSON objects, one a line: `n`, `time_s` (experiment), `event` and its facts.
 
-    A hanging disk gets the lines later: the microscope does not wait for it.
+    While the disk hangs, lines are queued: the microscope does not wait for the disk.
 
     Args:
         kept: storage for the number of the last line, so that it survives a kill. The last event may then be written

@@ -138,7 +138,7 @@ class World:
 
     @classmethod
     def from_settings(cls, settings: Mapping[str, object], seed: int, start_s: float) -> World:
-        """Return the world of tables: `surface`, and the fields of `WorldSettings`.
+        """Return the world described by tables: `surface`, and the fields of `WorldSettings`.
 
         Raises:
             ConfigError: unknown names or invalid values. FileError: the surface's file.
@@ -210,7 +210,7 @@ class World:
     ) -> dict[str, float]:
         """Return the value of each channel while the tip stands still, without any effect on the world.
 
-        With the feedback off, z is the one of `hold` or of the end of the last scan.
+        With the feedback off, z is the value set by `hold`, or z at the end of the last scan.
 
         Args:
             random: for the noise, so that other measurements stay the same.
@@ -290,10 +290,10 @@ class World:
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
 
     def compensate(self, velocity_m_per_s: tuple[float, float], t_s: float) -> None:
-        """Set the velocity (x, y) at which the scanner follows the sample by itself, from a time on.
+        """Set the velocity (x, y) of the scanner's own drift compensation from `t_s` on.
 
         Raises:
-            InvalidValue: a time before the last change of velocity.
+            InvalidValue: `t_s` is before the last change of velocity.
         """
         if not all(map(math.isfinite, (*velocity_m_per_s, t_s))):
             raise InvalidValue(f"a velocity of {velocity_m_per_s} m/s from {t_s} s on")

@@ -32,7 +32,7 @@ _log = logging.getLogger("afspm.disk")
 
 
 class DiskTimeout(OSError):
-    """The disk did not answer in time."""
+    """The error that the disk did not answer in time."""
 
     def __init__(self, within_s: float = DEADLINE_S) -> None:
         super().__init__(f"the disk did not answer within {within_s:g} s")

@@ -43,7 +43,7 @@ Look = Callable[[int], ActivitySample | None]
 
 
 class ActivityMonitor:
-    """Samples one process repeatedly, and judges by the latest samples whether it works.
+    """A monitor that samples one process repeatedly, and decides by the latest samples whether it works.
 
     Args:
         pid: process to sample.

@@ -56,7 +56,7 @@ class OutputLimit:
         self.pausing = False
 
     def passes(self, line: bytes, now_s: float) -> bool:
-        """Return whether a line passes now; otherwise it is kept aside, as it may be among the last.
+        """Return whether a line passes now; otherwise it is withheld, since it may be the last line.
 
         Args:
             now_s: real monotonic time.
@@ -86,7 +86,7 @@ class OutputLimit:
 
 
 class ChildOutput:
-    """Reports the lines of a child's stream, within the limit.
+    """The output lines of a child, reported within the limit.
 
     The child never waits for the supervisor: a driver that logs much must not slow down.
     """
@@ -110,7 +110,7 @@ class ChildOutput:
                 self._pause.start()
 
     def end(self) -> None:
-        """Report what was kept aside: the stream has ended."""
+        """Report the withheld lines, at the end of the stream."""
         if self._pause is not None:
             self._pause.cancel()
         self._go_on()

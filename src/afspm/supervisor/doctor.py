@@ -133,7 +133,7 @@ def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
 
 
 class _Connections:
-    """Examines the addresses of an experiment, then talks to its scheduler."""
+    """The examination of an experiment's addresses, then of its scheduler."""
 
     def __init__(self, experiment: Experiment, into: Examination) -> None:
         self._experiment, self._into = experiment, into

@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> int:
 
 
 class _ForeignProgram:
-    """Passes standard input on to the child, and ends the child.
+    """A child program that gets this process's standard input, and is ended with it.
 
     Attributes:
         stopped: whether the child was terminated or killed because it outlived its standard input.

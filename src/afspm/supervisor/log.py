@@ -34,11 +34,11 @@ _LEVELLED = re.compile(rf"(?P<level>{'|'.join(_LEVELS)})\b:?\s*(?P<text>.*)", re
 
 
 class LineReader:
-    """Reads the levels of the lines of one process.
+    """A reader of the log levels of one process's lines.
 
     On stderr a line may begin with its level ("WARNING the tip is blunt"), as afspm's own do. Lines without a level
     belong to the line before: a traceback below an ERROR. Lines before the first level are warnings, since a program
-    that writes to stderr before its log is set up has a reason. Lines on stdout are information.
+    that writes to stderr before its log is set up reports a problem. Lines on stdout are information.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class LineReader:
 
 
 class RunLog:
-    """Writes every line to `file`, and lines of `level` and above to the terminal; `names` are padded to one width.
+    """The log of a run: all lines in `file`, lines from `level` up in the terminal; `names` are padded to one width.
 
     Neither a terminal that has gone or blocks (text marked in it, Ctrl-S) nor a disk that is full or hangs may stop a
     measurement, so each has a thread of its own. A line that one of them loses is still in the other.
@@ -123,7 +123,7 @@ Show = Callable[[str, str, int, str], None]
 
 
 class _Shown:
-    """Writes lines from a thread of its own, which may wait for the terminal or the disk."""
+    """A writer of lines in a thread of its own, which may wait for the terminal or the disk."""
 
     def __init__(self, show: Show, finish: Callable[[], None] = lambda: None) -> None:
         self._show = show

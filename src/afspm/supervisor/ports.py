@@ -41,7 +41,7 @@ _held: deque[int] = deque()  # descriptors, open as long as this process lives
 
 
 class FreePorts:
-    """Hands out free ports of this computer, each once.
+    """An allocator of free ports of this computer, each used once.
 
     A port is chosen here and bound by the child, so that a restarted child has the same address. On Linux the port is
     held meanwhile: other programs that look for free ports, such as a second experiment, skip it before the child has

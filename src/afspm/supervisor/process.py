@@ -88,7 +88,7 @@ def from_start(start: ProcessStart) -> Task:
 
 
 class ChildProcess:
-    """A running child. Calls `tell` with its output and its exit, from threads of this object.
+    """A running child, whose output and exit are passed to `tell`, from threads of this object.
 
     The child has a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing includes
     the child's own children. Its standard input stays open until `close_stdin`; when it ends, the parent wants the

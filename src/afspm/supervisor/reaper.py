@@ -24,7 +24,7 @@ CLOSED_WITHIN_S = 1.0
 
 
 class Reaper:
-    """Sends the living process groups of a supervisor to the reaper process.
+    """The supervisor's connection to the reaper process, which gets its living process groups.
 
     Windows has a job object instead, see `process`.
     """

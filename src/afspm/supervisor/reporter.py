@@ -67,7 +67,7 @@ _MOST_FAILURES = 100
 
 @dataclass(frozen=True, slots=True)
 class ReportFailed:
-    """The scheduler does not accept reports."""
+    """The error that the scheduler does not accept reports."""
 
     text: str
 
@@ -139,7 +139,7 @@ class ReportQueue:
 
 
 class Reporter:
-    """Reports states and lines to the scheduler, from `start` to `close`, in a thread of its own.
+    """A thread that reports states and lines to the scheduler, from `start` to `close`.
 
     Args:
         launch: launch line for requests to the scheduler; its name is "supervisor:" and the name of this supervisor.

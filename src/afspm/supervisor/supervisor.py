@@ -77,7 +77,7 @@ class RunOutcome:
 
 
 class Supervisor:
-    """Runs tasks until the experiment ends, all are done, an essential process is lost, or a person stops it."""
+    """A runner of tasks until the experiment ends, all are done, an essential process is lost, or a person stops it."""
 
     def __init__(
         self,
@@ -260,7 +260,7 @@ TOLERANCE_S = 5.0
 
 
 class ClockCheck:
-    """Warns once if experiment time and wall clock differ; time that is simulated at another speed is not checked."""
+    """A single warning if experiment time and wall clock differ; time simulated at another speed is not checked."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock

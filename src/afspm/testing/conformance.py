@@ -51,13 +51,13 @@ class CheckOutcome(Enum):
 
 
 class CheckEnded(Exception):
-    """Ends a check that has not passed; the text is the line of its result."""
+    """The exception that ends a check that has not passed; its text is the line of the result."""
 
     outcome: ClassVar[CheckOutcome]
 
 
 class Failed(CheckEnded, AssertionError):
-    """The program under test behaves differently from the requirement.
+    """The exception that the program under test behaves differently from the requirement.
 
     Args:
         expected, came: in a physicist's words, without a full stop.
@@ -70,25 +70,25 @@ class Failed(CheckEnded, AssertionError):
 
 
 class Skipped(CheckEnded):
-    """The check is impossible here; the text gives the reason."""
+    """The exception that a check is impossible here; its text gives the reason."""
 
     outcome = CheckOutcome.SKIPPED
 
 
 class Unsupported(CheckEnded):
-    """The program lacks a feature that the check needs; the text names it."""
+    """The exception that the program lacks a feature that the check needs; its text names the feature."""
 
     outcome = CheckOutcome.UNSUPPORTED
 
 
 class Declined(CheckEnded):
-    """The person did not confirm; nothing was done."""
+    """The exception that the person did not confirm; nothing was done."""
 
     outcome = CheckOutcome.DECLINED
 
 
 class Lost(Exception):
-    """No further check is possible: a process has ended, or control was taken away."""
+    """The exception that no further check is possible: a process has ended, or control was taken away."""
 
 
 @dataclass(frozen=True)

@@ -130,7 +130,7 @@ class Activity(ABC):
         return ScopeStatus(ScopeState.INTERRUPTED if failed or self._results.broken_off else state)
 
     def fail(self, reason: str, *values: object) -> ScopeStatus:
-        """Log why a request came to nothing, and return the state INTERRUPTED."""
+        """Log why a request failed, and return the state INTERRUPTED."""
         self._log.error(reason, *values)
         return ScopeStatus(ScopeState.INTERRUPTED)
 
@@ -164,7 +164,7 @@ class Activity(ABC):
 
 
 class TipWay:
-    """The time that the tip needs to its target, for programs that do not report its arrival.
+    """The expected arrival of the tip at its target, for programs that do not report arrival.
 
     Args:
         kept: a JSON dict on disk: the tip moves on after the connection is lost.
@@ -179,12 +179,12 @@ class TipWay:
         return float(self._kept.get("arrives_s", 0.0))
 
     def sets_out(self, lasts_s: float, *, after_last_way: bool = False) -> None:
-        """Record that the tip was sent somewhere: now, or after its present way."""
+        """Record a move of `lasts_s` that starts now, or after the move in progress (`after_last_way`)."""
         now_s = self._clock.now_s()
         self._kept["arrives_s"] = (max(now_s, self.arrives_s) if after_last_way else now_s) + lasts_s
 
     def give_up(self) -> None:
-        """Record that the tip does not move on."""
+        """Record that the tip has stopped."""
         self._kept["arrives_s"] = 0.0
 
     @property

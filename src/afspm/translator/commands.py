@@ -41,7 +41,7 @@ class CommandOutcome:
 
 
 class Commands:
-    """Executes requests at one microscope.
+    """The executor of requests at one microscope.
 
     Args:
         sequence: knows whether the microscope is free, and in which order states are published.

@@ -18,7 +18,7 @@ _STARTUP_RETRY_S = 0.1
 
 
 class Connection:
-    """Connects a driver to its controller, and decides which errors mean that the controller is lost.
+    """The connection of a driver to its controller; it decides which errors mean that the controller is lost.
 
     Args:
         controller: the emulator of this run, in whose place no other controller is ever reached; None: the driver

@@ -20,7 +20,7 @@ _LOCKED_BYTES = 1  # Windows lets no other process read locked bytes: the holder
 
 
 class ControllerTaken(AfspmError):
-    """Another run commands the controller."""
+    """The error that another run commands the controller."""
 
     code = "controller-taken"
 

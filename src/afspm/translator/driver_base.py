@@ -26,7 +26,7 @@ MEASURING = frozenset({ScopeState.SCANNING, ScopeState.SPEC})
 
 
 class ControllerLost(AfspmError):
-    """The controller can't be reached: the translator refuses requests with this reason, and reconnects."""
+    """The error that the controller can't be reached: the translator refuses requests with this reason, and retries."""
 
     code = "controller-lost"
 
@@ -314,9 +314,9 @@ class DriverBase(ABC):
         """
 
     def followed(self) -> bool | None:
-        """Return the outcome of a measurement whose end `status` never reported, since another followed at once.
+        """Return the outcome of a measurement whose end `status` missed, since another one followed at once.
 
-        To be written where a panel can repeat scans. Called after `results`, which must list the measurement by then.
+        Override where a panel can repeat scans. Called after `results`, which must list the measurement by then.
 
         Returns:
             once for each such measurement: True if it was complete, False if it was interrupted; None: there was none.
@@ -396,7 +396,7 @@ class DriverBase(ABC):
         return self.table[name].same(a, b)
 
     def in_force(self, wanted: Collection[str]) -> dict[str, Value]:
-        """Return the values of `read`; where they equal the value set last, to the controller's precision, the latter.
+        """Return the values of `read`; one that equals the value set last, within the precision, is replaced by it.
 
         Raises:
             InvalidValue: the controller returned a number that is not finite, which can't be published.

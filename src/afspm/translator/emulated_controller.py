@@ -40,7 +40,7 @@ class Listening:
 
 
 class AddressNotice:
-    """Publishes the address of an emulated controller, as long as the emulator's process lives.
+    """The published address of an emulated controller, valid as long as the emulator's process lives.
 
     Args:
         file: see `notice_file`.
@@ -54,7 +54,7 @@ class AddressNotice:
         self.tell("")
 
     def tell(self, address: str) -> None:
-        """Write the address of the controller; empty: it does not listen now."""
+        """Write the address of the controller; an empty one means that the controller does not listen."""
         text = json.dumps({"address": address, "run": self._run, "life": os.urandom(8).hex()})
         self._file.truncate(0)
         self._file.write(b" " * _LOCKED_BYTES + text.encode())

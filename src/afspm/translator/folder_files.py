@@ -73,7 +73,7 @@ class FolderFiles(ResultFiles):
         return str(path)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return the files of a measurement with their times of writing, ns; empty: some are missing."""
+        """Return the files of a measurement with their modification times in ns; empty if files are missing."""
         path = self._file(measured)
         return [] if path is None else [(str(path), modified_ns(path))]
 

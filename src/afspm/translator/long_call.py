@@ -10,7 +10,7 @@ class LongLink(Protocol):
     """A connection on which a command is running."""
 
     def reply(self, what: str) -> tuple[bool, Any]:
-        """Return whether the reply has come, and its content. Raises the controller's error, or ControllerLost."""
+        """Return whether the reply has arrived, and its content. Raises the controller's error, or ControllerLost."""
 
     def close(self) -> None:
         """Close the connection."""
@@ -34,7 +34,7 @@ class LongCall:
         self._came = False
 
     def running(self) -> bool:
-        """Return whether the command goes on. Raises the controller's error if it failed, or ControllerLost."""
+        """Return whether the command is still running. Raises the controller's error, or ControllerLost."""
         if not self._came:
             self._came, self.value = self._link.reply(self.what)
         return not self._came or self._is_unfinished(self.value)

@@ -25,7 +25,7 @@ from afspm.transport.port import ServerPort
 
 
 class Observer:
-    """Reads values, status and results of the controller, and publishes them in order.
+    """The observer that reads values, status and results of the controller, and publishes them in order.
 
     Attributes:
         values: in force at the last look.
@@ -223,7 +223,7 @@ def _live_lines_s(microscope: DriverBase) -> float | None:
 
 
 class LiveLines:
-    """Reads the new lines of the running scan. Times are of the experiment.
+    """A reader of new lines of the running scan. Times are in experiment seconds.
 
     Args:
         microscope: its `live_lines_s` decides how often its lines are read.
@@ -244,7 +244,7 @@ class LiveLines:
             self.due_s = now_ns / NS_PER_S + self._every_s
 
     def end(self) -> None:
-        """Stop: the scan is over, and only its file comes."""
+        """Stop reading: the scan is over, and only its file follows."""
         self.due_s = None
 
     def look(self, now_s: float) -> list[tuple[str, bytes]]:

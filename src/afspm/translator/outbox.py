@@ -29,7 +29,7 @@ class Outgoing(NamedTuple):
 
 
 class Outbox:
-    """Finds new results, reads them and makes packets of them.
+    """New results of the controller, read and made into packets.
 
     Args:
         microscope: has the results.
@@ -52,7 +52,7 @@ class Outbox:
         self._complained: set[str] = set()
 
     def start(self) -> list[Outgoing]:
-        """Return the packets to publish again after connecting. Results of before the experiment are ignored.
+        """Return the packets to publish again after connecting. Results from before the experiment are ignored.
 
         Returns:
             the packets of the last results, which an earlier process has published or was going to.

@@ -33,7 +33,7 @@ class ExpectedEnd:
 
 
 class AdaptivePolling:
-    """Learns how long measurements take, and returns the time until the next look. All times are real seconds.
+    """The learnt durations of measurements, which give the time until the next look. All times are real seconds.
 
     Args:
         idle_s: between two looks when no change is expected.

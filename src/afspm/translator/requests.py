@@ -38,7 +38,7 @@ _CAPACITY = 300
 
 
 class RequestHandler:
-    """Answers the requests to one microscope.
+    """The handler of requests to one microscope.
 
     Args:
         fence: decides which scheduler is obeyed.
@@ -73,7 +73,7 @@ class RequestHandler:
         self._last_refusal = ""
 
     def refuses(self, arrived: RequestReceived) -> bool:
-        """Refuse a request of a peer that is not obeyed, and return True; False: the peer is obeyed."""
+        """Refuse a request unless its sender is the scheduler in command; return whether it was refused."""
         before, epoch = self._commander, Epoch.decode(arrived.epoch)
         why = self._fence.refusal(epoch, _run_of(arrived.frames), lambda: self._is_connected(before))
         if not why:

@@ -101,7 +101,7 @@ class ResultFiles(ABC):
 
 @dataclass(frozen=True)
 class FilePrecision:
-    """The precision of a controller's files: how much the numbers in a file differ from the ones that were set.
+    """The precision of a controller's files: the difference between the numbers in a file and those set.
 
     Attributes:
         part: the rounding of a length, as a part of the largest length.
@@ -156,7 +156,7 @@ def as_list(region: Region) -> list[float]:
 
 
 def as_region(kept: Sequence[float]) -> Region:
-    """Return the frame that `as_list` gave."""
+    """Return the frame that `as_list` converted; the reverse of `as_list`."""
     x, y, width, height, angle_rad = kept
     return Region((x, y), (width, height), angle_rad)
 

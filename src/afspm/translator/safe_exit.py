@@ -20,7 +20,7 @@ little less than `transport.process.parent` allows."""
 
 
 class SafeExit:
-    """Stops the running measurement, and retracts the tip where that is owed.
+    """The end of a run: it stops the running measurement, and retracts a tip left without feedback.
 
     Args:
         retracts: True to retract the tip when a request has switched the feedback off and no process is left to switch

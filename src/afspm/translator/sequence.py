@@ -14,24 +14,24 @@ from afspm.translator.driver_base import MEASURING
 
 @dataclass(frozen=True)
 class PublishStatus:
-    """Publish this status."""
+    """The step that publishes a status."""
 
     status: ScopeStatus
 
 
 @dataclass(frozen=True)
 class PublishResults:
-    """Publish the new results."""
+    """The step that publishes the new results."""
 
 
 @dataclass(frozen=True)
 class DiscardResults:
-    """Drop new results, if any: they belong to an interrupted measurement."""
+    """The step that drops new results, if any: they belong to an interrupted measurement."""
 
 
 @dataclass(frozen=True)
 class LogError:
-    """Write an error to the log."""
+    """The step that logs an error."""
 
     text: str
 
@@ -42,7 +42,7 @@ _INTERRUPTED = ScopeStatus(ScopeState.INTERRUPTED)
 
 
 class StatusSequence:
-    """Turns observed states of the controller into published ones.
+    """The conversion of observed states of the controller into published states.
 
     Args:
         published: the status published last (by an earlier process of this translator).

@@ -14,7 +14,7 @@ Kept = Plain
 
 
 class FeedbackWatch:
-    """Remembers whether a request, rather than a person at the panel, has switched the feedback off.
+    """A record of whether a request, rather than a person at the panel, has switched the feedback off.
 
     Args:
         kept: JSON values that outlive a kill.

@@ -58,7 +58,7 @@ class TranslatorRun:
 
 
 class Translator:
-    """Answers requests to a microscope and publishes its states, settings and results.
+    """The process that answers requests to a microscope and publishes its states, settings and results.
 
     Args:
         driver: constructed with its settings, not yet connected.

@@ -35,7 +35,7 @@ class ReplyReceived:
 
 @dataclass(frozen=True, slots=True)
 class CaughtUp:
-    """The publisher at `source` has sent all its cached packets; live packets follow.
+    """The event that the publisher at `source` has sent all its cached packets; live packets follow.
 
     It comes again after every reconnection.
     """
@@ -45,17 +45,17 @@ class CaughtUp:
 
 @dataclass(frozen=True, slots=True)
 class Killed:
-    """The signal KILL: the experiment has ended, close."""
+    """The signal KILL: the experiment has ended, and the process closes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParentGone:
-    """The parent process is gone or stops this one: close."""
+    """The event that the parent process has ended, or stops this process, which closes."""
 
 
 @dataclass(frozen=True, slots=True)
 class ControlConnected:
-    """The scheduler is connected, for the first time or again.
+    """The event that the scheduler is connected, for the first time or again.
 
     Earlier requests without an answer may be lost: repeat them with the same id.
     """
@@ -63,7 +63,7 @@ class ControlConnected:
 
 @dataclass(frozen=True, slots=True)
 class ControlDisconnected:
-    """The scheduler is disconnected; the socket connects again by itself."""
+    """The event that the scheduler is disconnected; the socket reconnects by itself."""
 
 
 Incoming = PacketReceived | ReplyReceived | CaughtUp | Killed | ParentGone | ControlConnected | ControlDisconnected

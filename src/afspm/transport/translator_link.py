@@ -15,11 +15,11 @@ _LONGEST_NUMBER = 18
 
 
 class LinkUp(NamedTuple):
-    """The translator is connected."""
+    """The event that the translator is connected."""
 
 
 class LinkDown(NamedTuple):
-    """The translator is disconnected."""
+    """The event that the translator is disconnected."""
 
 
 class LinkReply(NamedTuple):

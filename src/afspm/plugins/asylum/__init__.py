@@ -216,7 +216,7 @@ class Asylum(Driver):
 
     @action(names.START_SPEC)
     def start_spec(self) -> None:
-        """Take a force curve where the tip was sent; where the tip is if it was never sent."""
+        """Take a force curve at the spot where the tip was sent, or at its present place if it was never sent."""
         # ScanStatus and FMapStatus do not show single force curves
         if self._igor().doing().bits is None:
             reason = "Igor lacks ARGetStatus, without which the end of a force curve can't be detected"

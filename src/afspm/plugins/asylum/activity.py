@@ -92,7 +92,7 @@ class AsylumActivity(Activity):
         return as_region(self._kept["image"])
 
     def find_image(self) -> None:
-        """Take the frame in force for the open image's, unless an earlier run has stored one."""
+        """Use the frame in force as the open image's frame, unless an earlier run has stored one."""
         self._kept.setdefault("image", as_list(self._frame_in_force()))
 
     def _image_begins(self) -> None:
@@ -140,7 +140,7 @@ class AsylumActivity(Activity):
         return local(self._session.text("GS", _SAVED_TO[what]), self._folders)
 
     def call_files(self, base: str) -> None:
-        """Set the base name of files, with a number above those of existing files: Asylum overwrites files."""
+        """Set the files' base name, and a number above all existing ones: Asylum overwrites files."""
         self._session.do("SetBaseName", base)
         self._session.put("BaseSuffix", max(free_suffix(self.folder(what), base) for what in _SAVED_TO))
         try:
@@ -170,7 +170,7 @@ class AsylumActivity(Activity):
 
     @property
     def was_led_away(self) -> bool:
-        """True if a scan has moved the tip away from the spot where it was sent."""
+        """True if a scan has moved the tip away from the requested spot."""
         return bool(self._kept.get("led_away"))
 
     def _target(self, what: str) -> Target:

@@ -47,7 +47,7 @@ Parameter = bool | int | float | str
 
 
 class XopError(AfspmError):
-    """Igor reports an error.
+    """An error reported by Igor.
 
     Attributes:
         number: error number of ZeroMQ-XOP.
@@ -62,7 +62,7 @@ class XopError(AfspmError):
 
 
 class BadReply(ControllerLost):
-    """The received bytes are not a valid reply: the peer can't be trusted."""
+    """Received bytes that are not a valid reply: the peer can't be trusted."""
 
     code = "igor-bad-reply"
 

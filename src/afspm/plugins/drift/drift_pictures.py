@@ -32,7 +32,7 @@ _ALBUM = "afspm.plugins.drift.figures.album"
 
 
 class DriftTable(Component):
-    """Writes `drift_correction.csv`: for each scan the offset between tip and sample coordinates, and its rate.
+    """The writer of `drift_correction.csv`: for each scan the offset of tip and sample coordinates, and its rate.
 
     The offset is x_sample - x_tip. The columns from `scan` to `failures` are those of `drift.record`, which reads the
     table. `outcome` is how the position of a scan was determined: registered, coarse, or by dead reckoning (refused,
@@ -124,7 +124,7 @@ class _SavedScans(Sequence["DriftScan"]):
 
 
 class DriftPictures(DriftTable):
-    """Writes the table of `DriftTable`, and draws the figures of drift in the run folder when the experiment ends.
+    """The table of `DriftTable`, and figures of drift drawn in the run folder when the experiment ends.
 
     During the experiment each scan is compared with the first scan of its part, without and with correction. This
     estimates the remaining drift independently of the scheduler's tracker. For a simulated microscope the true errors

@@ -27,7 +27,7 @@ def followed(scans: Sequence[DriftScan], tracker: Tracker) -> Iterator[Update]:
 
 
 def against_first(record: DriftRecord, scans: Sequence[DriftScan], pairs: Sequence[Registration]) -> DriftRecord:
-    """Return the displacements from the first scan to each later one, from their pair alone, as a record.
+    """Return the displacement from the first scan to each later one, by registration of that pair only, as a record.
 
     A registration holds in the middle of the overlap, which was not taken in the middle of either scan. The drift in
     between is subtracted, with the rates of the tracker.

@@ -91,7 +91,7 @@ class Matches:
 
 @dataclass(frozen=True, eq=False)
 class LinearSeen:
-    """The linear part from the scans alone; `Registration.linear` may be pulled towards its prior.
+    """The linear part estimated without a prior; `Registration.linear` may be pulled towards its prior.
 
     Attributes:
         linear: (2, 2).
@@ -156,7 +156,7 @@ class Registration:
 
     @property
     def outcome(self) -> RegistrationOutcome:
-        """How the position is determined, as far as this pair matters."""
+        """The outcome for the position of the scan, by this pair only."""
         if self.accepted:
             return RegistrationOutcome.COARSE if self.failure else RegistrationOutcome.REGISTERED
         return RegistrationOutcome.FAILED if self.failure else RegistrationOutcome.REFUSED
@@ -168,7 +168,7 @@ class Registration:
 
 
 class Estimator(Protocol):
-    """Registers two scans of the same channel. Keeps no state between calls."""
+    """A stateless method to register two scans of the same channel."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         """Return the displacement of the features of `reference` in `scan`.

@@ -1,4 +1,4 @@
-"""The overview of today, found in the overview of an earlier night: a sample that was taken out and mounted again.
+"""Registration of today's overview with the overview of an earlier night, after the sample was mounted again.
 
 The sample may be turned by any angle, but estimators expect scans that are turned by a degree or two. So coarse images
 are correlated at all angles first; at the best of them the whole images are registered by least squares.
@@ -92,10 +92,10 @@ def overview_of(run: Run, number: int | None = None) -> tuple[ScanRow, Scan]:
 
 
 def find(earlier: Scan, now: Scan, within_rad: float = math.pi) -> Remount:
-    """Find the sample of an earlier scan in a scan of now.
+    """Find the sample of an earlier scan in a present scan.
 
     Args:
-        within_rad: the largest turn between them.
+        within_rad: the largest rotation between the two scans.
 
     Raises:
         InvalidValue: a scan without enough pixels, or an angle that is not above 0 and at most 180°.

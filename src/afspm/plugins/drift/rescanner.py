@@ -25,7 +25,7 @@ _IN_WORDS = {
 
 
 class Rescanner(Component):
-    """Scans a region again on a `DriftRescan`: unchanged, in the other direction, or wider.
+    """A component that scans a region again on a `DriftRescan`: unchanged, in the other direction, or wider.
 
     Meanwhile thermal-drift is flagged, so that no other component scans. After some attempts without success it logs an
     error and the experiment goes on. If the sample is not found again, it flags device-malfunction and a person is

@@ -22,8 +22,8 @@ TRUTH_FILE = "truth.jsonl"
 def true_drift(run_dir: Path, scans: Sequence[DriftScan]) -> Array | None:
     """Return the displacement of the sample (n, 2) at the centre of each scan since the first; None if unknown.
 
-    It includes the displacement by rotation and expansion of the sample. The drift that the controller itself
-    compensates is subtracted: tip coordinates move with it. It is known at the ends of each scan.
+    The result includes displacement by rotation and expansion of the sample. The drift that the controller itself
+    compensates is subtracted, since tip coordinates move with it; it is interpolated between the ends of scans.
 
     Raises:
         FileError: there is such a file, but not of a simulated run.

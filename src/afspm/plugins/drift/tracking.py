@@ -49,7 +49,7 @@ class Forecast(Protocol):
     """A tracker's knowledge for other times: small, immutable, JSON-able, without the scans."""
 
     def at(self, time_s: float) -> Prediction:
-        """Return the prediction for any time; before the newest scan it is the estimate of that scan, moved back."""
+        """Return the prediction for any time; before the newest scan, its estimate is extrapolated backwards."""
         ...
 
     def to_dict(self) -> Plain:
@@ -104,7 +104,7 @@ def require_newer(scan: DriftScan, newest_s: float | None) -> None:
 
 
 class Tracker(Protocol):
-    """Follows the drift from scan to scan. Deterministic: the same scans give the same numbers."""
+    """A method to follow drift from scan to scan. Deterministic: the same scans give the same numbers."""
 
     @property
     def forecast(self) -> Forecast:

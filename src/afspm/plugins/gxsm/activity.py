@@ -77,7 +77,7 @@ class ScanProgress:
         name: name of its first file, whose number rises with each scan; empty before the first poll.
         watch: direction of its lines; None before the first poll.
         goes_up: True if the top row of the picture is scanned last; None: unknown.
-        settles_until_s, ended_ns: end of GXSM's own work on it, and end of the scan.
+        settles_until_s, ended_ns: end of GXSM's own work after the scan, and end of the scan.
         y_before, y_moved: last line of the previous scan, and whether GXSM has reported another line since.
         follows: True if it started before the end of the previous scan was seen.
     """

@@ -7,7 +7,7 @@ from afspm.translator.driver_base import ControllerLost
 
 
 class GxsmError(AfspmError):
-    """GXSM, or the script in its console, reports an error of a call."""
+    """An error of a call, reported by GXSM or by the script in its console."""
 
     code = "gxsm"
 

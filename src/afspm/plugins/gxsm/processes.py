@@ -15,7 +15,7 @@ _SIGUSR1_BIT: Final = 1 << 9  # signal 10, counted from 1
 
 
 class NoProcess(ControllerLost):
-    """No process has this name or number."""
+    """The error that no process has this name or number."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class GxsmProcess:
     started: str | None
 
     def lives(self) -> bool:
-        """Return True if it still runs. Without psutil, which is ten times slower: each poll asks."""
+        """Return True if the process still runs. psutil would be ten times slower, and each poll checks."""
         return self.started is not None and _started(self.pid) == self.started
 
     def working_folder(self) -> Path | None:

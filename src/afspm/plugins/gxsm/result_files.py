@@ -92,7 +92,7 @@ class GxsmFiles(ResultFiles):
         return None if found is None else (found["rows"], found["line"])
 
     def looked(self, rows: Rows, line: int | None) -> None:
-        """Keep rows for `before`."""
+        """Store rows for `before`."""
         self._kept["running"]["before"] = {"rows": rows, "line": line}
 
     def is_written(self, file: Path) -> bool:
@@ -191,7 +191,7 @@ class GxsmFiles(ResultFiles):
         super().forget()
 
     def next_s(self) -> float | None:
-        """Return the time of the next necessary look."""
+        """Return the time of the next necessary poll."""
         ended = self._kept["ended"]
         return None if ended is None else float(ended["until_s"])
 

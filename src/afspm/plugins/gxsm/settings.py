@@ -113,7 +113,7 @@ class FrameSettings(SettingsGroup):
     """The frame of the next scan, as a group of settings.
 
     Args:
-        is_led: True if the tip moves with its frame without being reported as moving.
+        is_led: True if a change of the frame moves the tip, which GXSM does not report as a move.
     """
 
     names = FRAME

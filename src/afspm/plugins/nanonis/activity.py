@@ -166,7 +166,7 @@ class NanonisActivity(Activity):
         """Return the present state; register measurements that have ended, whose files are then awaited.
 
         Raises:
-            ControllerLost: one of both connections failed.
+            ControllerLost: a connection failed.
         """
         for event in self._listener.events():
             self._take(event)

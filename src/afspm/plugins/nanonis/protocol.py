@@ -31,13 +31,13 @@ _NUMBERS: Final = {code: struct.Struct(">" + code) for code in "HIifd"}
 
 
 class BadReply(ControllerLost):
-    """The received bytes can't be the reply: nothing that follows on this connection can be trusted."""
+    """Received bytes that can't be the reply: later bytes of the connection can't be trusted either."""
 
     code = "nanonis-reply"
 
 
 class NanonisError(AfspmError):
-    """Nanonis reports an error, with its own text."""
+    """An error reported by Nanonis, with its own text."""
 
     code = "nanonis"
 
@@ -170,7 +170,7 @@ def _parsed(body: bytes | bytearray, codes: Sequence[str]) -> tuple[tuple[object
 
 
 class _Reader:
-    """Reads one field after the other from a body, never beyond its end."""
+    """A reader of one field after the other from a body, never beyond its end."""
 
     def __init__(self, body: memoryview) -> None:
         self._body = body

@@ -67,7 +67,7 @@ class NanonisFiles(ResultFiles):
         return self._kept["running"] is not None and bool(self._kept["running"].get("seen", True))
 
     def seen(self) -> None:
-        """Note that the running measurement was seen running."""
+        """Record that a poll has shown the measurement running."""
         if self._kept["running"] is not None:
             self._kept["running"]["seen"] = True
 

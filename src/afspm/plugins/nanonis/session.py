@@ -67,7 +67,7 @@ class Link:
 
 
 class Session:
-    """Two connections to Nanonis, proved, with all available modules open.
+    """Two verified connections to Nanonis, with all available modules open.
 
     Args:
         driver: the driver that uses them.
@@ -131,7 +131,7 @@ class Session:
 
 @dataclass(frozen=True)
 class ScanEnded:
-    """A scan was completed or stopped.
+    """The event that a scan was completed or stopped.
 
     Attributes:
         path: file path on Nanonis' computer; empty: not saved.
@@ -142,7 +142,7 @@ class ScanEnded:
 
 @dataclass(frozen=True)
 class CurveEnded:
-    """A spectrum was completed.
+    """The event that a spectrum was completed.
 
     Attributes:
         names: channel names with units.
@@ -161,7 +161,7 @@ class Listener:
     """Thread for blocking calls on the second connection, one at a time.
 
     Args:
-        wake: called from that thread when `events` has something new.
+        wake: called from that thread when `events` has new entries.
     """
 
     def __init__(self, link: Link, wake: Callable[[], None]) -> None:

@@ -98,7 +98,7 @@ class StudioActivity(Activity):
         self.started(SCAN, lambda: self._session.do(commands.START), is_seen)
 
     def start_curve(self) -> None:
-        """Take a force curve where the tip was sent; the tip moves there first, as a scan moves it. Raises Refused."""
+        """Take a force curve where the tip was sent. A scan moves the tip, so it moves back first. Raises Refused."""
         self._stopping = False
         self._place.go()
         self.curve_awaited = FORCE

@@ -22,7 +22,7 @@ _HINTS: Final = (
 
 
 class StudioError(AfspmError):
-    """Studio reports an error of a script, with its own text."""
+    """An error of a script, reported by Studio with its own text."""
 
     code = "nanosurf-error"
 

@@ -23,7 +23,7 @@ _DEEPEST: Final = 50
 
 
 class BadLua(AfspmError):
-    """The text is not a Lua value."""
+    """The error that a text is not a Lua value."""
 
     code = "bad-reply"
 

@@ -85,7 +85,7 @@ class SmartScanActivity(Activity):
         self.started(SCAN, lambda: self._session.do(START), lambda: self._session.scanning() or self._files.has_file())
 
     def start_curve(self, kind: str, place_m: XY) -> None:
-        """Take a curve where the tip was sent; the tip moves there first, as a scan moves it."""
+        """Take a curve where the tip was sent. A scan moves the tip, so it moves back first."""
         self._stopping = False
         # The scanner is where the scan has left it: the curve needs a move first.
         self.watch(self._session.begin(kind, way_to(place_m)))

@@ -31,7 +31,7 @@ OK, ERROR = "ok", "error"
 
 
 class SmartScanError(AfspmError):
-    """SmartScan reports an error of a script, with its own text."""
+    """An error of a script, reported by SmartScan with its own text."""
 
     code = "park-error"
 

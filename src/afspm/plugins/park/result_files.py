@@ -31,7 +31,7 @@ class ParkFiles(FolderFiles):
         self._seen: tuple[list[tuple[str, int]], float] = ([], 0.0)
 
     def files_of(self, measured: Entry) -> list[tuple[str, int]]:
-        """Return all new files once no more appear; before that an empty list."""
+        """Return all new files once no further file appears; before that an empty list."""
         listed = [(str(path), modified_ns(path)) for path in self._files(Path(measured["folder"]))]
         # By time and not by name: SmartScan's names can be chosen freely.
         files = sorted(one for one in listed if one[1] > measured["newest_ns"])

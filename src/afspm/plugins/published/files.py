@@ -415,7 +415,7 @@ def _wires_of(table: Table) -> Settings:
 
 @dataclass(frozen=True)
 class _Conversion:
-    """Converts the components of one file, and notes the result for each of its lines."""
+    """The conversion of one file's components, with the result for each line of the file."""
 
     channels: Mapping[str, str]
     parts: ExperimentParts

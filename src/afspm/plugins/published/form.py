@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class PublishedForm:
-    """See `experiment.forms.FileForm`."""
+    """The published implementation's file form; see `experiment.forms.FileForm`."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
         """Return the components of a file in afspm's form."""

@@ -46,7 +46,7 @@ _NAMELESS = b"a client without a name: set the socket's identity to the componen
 
 
 class PublishedPeers:
-    """Lets components of the published implementation join, by playing the scheduler that they expect.
+    """The entry for components of the published implementation: it acts as the scheduler that they expect.
 
     The afspm scheduler sees each of them as a client with its own name.
 
@@ -328,7 +328,7 @@ class _PeersPort(BasePort[Incoming]):
 
 
 class _Outlet:
-    """Publishes to SUB sockets: first a replay to late joiners, then paced packets.
+    """A publisher to SUB sockets: first a replay to late joiners, then paced packets.
 
     Attributes:
         pacing: the queue of packets to publish.

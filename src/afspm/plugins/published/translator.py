@@ -178,7 +178,7 @@ def _is_connected(launch: Launch, address: str, stop: _Stop) -> bool:
 
 
 class _TranslatorPort(ZmqServerPort):
-    """A translator's sockets inside, a scheduler's outside."""
+    """A port with a translator's sockets towards afspm, and a scheduler's sockets towards the published translator."""
 
     def __init__(self, context: ProcessContext, memory: Memory, serve: str, publish: str, *, by_variable: bool) -> None:
         launch = context.launch

@@ -23,7 +23,7 @@ KEPT = 6
 
 
 class Archive:
-    """Reads the recorder's files in the run's folder. From any thread.
+    """A thread-safe reader of the recorder's files in the run's folder.
 
     Args:
         folder: of the run; None if it is on another computer.
@@ -90,7 +90,7 @@ def allowed_region(folder: Path) -> Region | None:
 
 
 def adjustable_parameters(folder: Path) -> tuple[str, ...]:
-    """Return [control] adjustable of the expanded experiment file; the scheduler decides about its use."""
+    """Return [control] adjustable of the expanded experiment file; the scheduler enforces the list."""
     offered = _section(folder, "control").get("adjustable", ())
     return tuple(map(str, offered)) if isinstance(offered, list) else ()
 

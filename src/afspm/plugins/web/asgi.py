@@ -19,7 +19,7 @@ def wrong_origin(
 ) -> str | None:
     """Return the reason for refusing a request, from its Host and Origin; None if it is allowed.
 
-    Another site's page open in the same browser must not steer a microscope, nor a page whose name resolves to this
+    Pages of other sites in the same browser must not steer a microscope, nor pages whose host name resolves to this
     server's address (DNS rebinding).
 
     Args:

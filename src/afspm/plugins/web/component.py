@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class WebComponent(Component):
-    """Keeps published messages and serves them. Other processes have the processor first.
+    """A component that stores published messages and serves them, at low processor priority.
 
     Attributes:
         served: name of the server, in log lines and errors.

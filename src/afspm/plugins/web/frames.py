@@ -55,7 +55,7 @@ class ChannelFrame:
 
 
 class FrameStore:
-    """Keeps frames for pictures. Not for several threads at once.
+    """A store of frames for pictures. Not thread-safe.
 
     Args:
         memory_bytes: bound for finished frames besides the newest of each channel, and for growing ones.

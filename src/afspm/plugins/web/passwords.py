@@ -60,16 +60,16 @@ def check_name(name: str) -> str:
 
 
 class Passwords:
-    """Decides whether a viewer may look, and whether a name is believed.
+    """The check whether a viewer may look, and whether a claimed name is accepted.
 
-    On loopback without passwords every viewer may look, and any name is believed. With a common password, a viewer
+    On loopback without passwords every viewer may look, and any name is accepted. With a common password, a viewer
     needs it to look. With persons, only they have names, each with a password.
 
     Args:
         host: the address to listen at.
         password_hash: of the common password, see `hashed`.
         people: the hash of each person's password.
-        now_s: the time in real seconds, for the rate of tries.
+        now_s: the time in real seconds, for the rate limit of attempts.
 
     Raises:
         ConfigError: a malformed hash or name.
@@ -163,13 +163,13 @@ _Prover = tuple[str, str | None]
 
 
 class _Tries:
-    """The last tries, in real seconds."""
+    """The times of the last attempts, in real seconds."""
 
     def __init__(self) -> None:
         self._at_s: deque[float] = deque(maxlen=_TRIES + 1)
 
     def wait_s(self, now_s: float) -> float:
-        """Return how long the next try has to wait; 0: not at all."""
+        """Return the seconds until the next attempt is allowed; 0: now."""
         lately = [at_s for at_s in self._at_s if now_s - at_s < _TRIES_WITHIN_S]
         return max(0.0, lately[-1] + AGAIN_S - now_s) if len(lately) > _TRIES else 0.0
 

@@ -35,7 +35,7 @@ SETTLED_S = 2.0  # a changed setting is published within this time
 
 
 class PersonCommands:
-    """The requests of one person, for one thread. Each returns the response, also a refusal."""
+    """The requests of one person, for use in one thread. Each returns the response, also if it is a refusal."""
 
     def __init__(self, link: ExperimentLink, watch: Watch) -> None:
         self._link = link
@@ -71,7 +71,7 @@ class PersonCommands:
         return self._ask(RESTART_REQUEST, process)
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> Response:
-        """Write a note on a scan, on a moment, or on now."""
+        """Write a note on a scan or on a time; default: the present."""
         now_ns = self._link.clock.now_ns()
         about_ns = next(one for one in (time_ns, scan_ns, now_ns) if one is not None)
         note = Note(about_ns, self._link.name, text, scan_ns, now_ns)
@@ -94,7 +94,7 @@ class PersonCommands:
         return self._ask(ControlRequest.ACTION, action)
 
     def prepare_scan(self, region: Region | None, shape: tuple[int, int] | None) -> Response | None:
-        """Set the place of the next scan, and wait for its publication. Returns a refusal; None: it is set."""
+        """Set the place of the next scan, and wait for its publication. Returns None, or a refusal."""
         if region is None and shape is None:
             return None
         wanted = ScanParameters(region, shape)
@@ -105,7 +105,7 @@ class PersonCommands:
         return None
 
     def prepare_spectrum(self, at_m: XY | None) -> Response | None:
-        """Move the probe to (x, y), and wait for its publication. Returns a refusal; None: it is there."""
+        """Move the probe to (x, y), and wait for its publication. Returns None, or a refusal."""
         if at_m is None:
             return None
         response = self._ask(ControlRequest.SET_PROBE_POS, ProbePosition(at_m))
@@ -115,7 +115,7 @@ class PersonCommands:
         return None
 
     def act_when_free(self, action: str, next_id: Callable[[], str] = str) -> Response:
-        """Ask for an action, again and again while the microscope is not free.
+        """Request an action, and repeat the request while the microscope is not free.
 
         Args:
             next_id: returns the id of the next attempt, under which it is executed once even if it is repeated.

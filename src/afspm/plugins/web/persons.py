@@ -41,7 +41,7 @@ class _Person:
 
 
 class Persons:
-    """Sends requests of persons to the scheduler, each under the person's name and in order. From any thread.
+    """Thread-safe connections that send each person's requests to the scheduler in order, under the person's name.
 
     Args:
         launch: of the component; persons reach the scheduler by its addresses, with its keys.

@@ -1,4 +1,4 @@
-"""Serves an ASGI application, in a thread of its own."""
+"""A server for an ASGI application, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class _TlsListener(socket.socket):
         return connection, address
 
     def finished(self, descriptor: int) -> None:
-        """Note that a connection has finished its handshake."""
+        """Register the end of a connection's handshake."""
         self._unfinished.pop(descriptor, None)
 
     def _end(self, descriptor: int, connection: socket.socket) -> None:
@@ -196,7 +196,7 @@ def _limited(app: AsgiApp, most: int) -> AsgiApp:
 
 
 class WebServer:
-    """Serves an ASGI application until it is stopped.
+    """A server for an ASGI application.
 
     Args:
         certificate, key: PEM files, for https; None: http.

@@ -23,7 +23,7 @@ MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
 
 
 class SpectrumStore:
-    """The newest spectra, in the order of their arrival. Not for several threads at once."""
+    """The newest spectra, in the order of their arrival. Not thread-safe."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[int, Spectrum]] = deque()
@@ -92,7 +92,7 @@ class Watch:
 
     @property
     def revision(self) -> int:
-        """Changes with a jump to another moment: content made before is invalid."""
+        """A number that changes with a jump to another time: content made before is invalid."""
         return 0
 
     @property
@@ -106,7 +106,7 @@ class Watch:
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:
-        """Keep everything unchanged while in the block; be brief in it."""
+        """Lock the state while in the block; keep the block short."""
         with self._changed:
             yield self.overview
 
@@ -141,7 +141,7 @@ class Watch:
         return self.clock.monotonic_s() - self._last_message_s
 
     def on_change(self, callback: Callable[[], None]) -> None:
-        """Call `callback` after each change, in the thread that brings it; it must not wait."""
+        """Call `callback` after each change, in the thread that makes the change; `callback` must not block."""
         self._callbacks.append(callback)
 
     def wait_for(self, condition: Callable[[Overview], bool], within_s: float) -> bool:
@@ -161,7 +161,7 @@ class Watch:
 
 
 class Bell:
-    """Wakes tasks of the page's loop from any thread. Several rings wake each task once."""
+    """A thread-safe event that wakes tasks of the page's loop. Several rings wake each task once."""
 
     def __init__(self) -> None:
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -186,7 +186,7 @@ class Bell:
         self._event = asyncio.Event()
 
     async def wait(self, timeout_s: float) -> bool:
-        """Wait until it rings; return False when the time is up."""
+        """Wait until the bell rings; return False when the time is up."""
         try:
             await asyncio.wait_for(self._event.wait(), timeout_s)
         except TimeoutError:
@@ -195,7 +195,7 @@ class Bell:
 
 
 class Audience:
-    """The open pages, so that all show the end before the server stops. From any thread."""
+    """A thread-safe register of open pages: the server stops once all show the end."""
 
     def __init__(self) -> None:
         self._pages: set[int] = set()

@@ -13,7 +13,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 
 class FilmExporter:
-    """Writes films with one suffix. See `afspm.record.export`."""
+    """An exporter of films with one suffix. See `afspm.record.export`."""
 
     def __init__(self, suffix: str) -> None:
         self._suffix = suffix

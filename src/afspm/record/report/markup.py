@@ -13,7 +13,7 @@ _DAY_NS = 86_400 * NS_PER_S
 
 
 class PageTimes:
-    """Formats times of a run: in UTC, and in this computer's zone where that differs.
+    """A formatter of times of a run: in UTC, and in this computer's zone where that differs.
 
     Args:
         start_ns, end_ns: of the run.

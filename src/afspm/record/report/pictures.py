@@ -131,7 +131,7 @@ def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> No
 
 
 def is_ours(folder: Path, own: str, components: str) -> bool:
-    """Return whether the report draws a figure; remove the report's figure if a component has drawn it since."""
+    """Return whether the report draws this figure; remove the report's own figure if a component has drawn it since."""
     if (folder / components).exists():
         (folder / own).unlink(missing_ok=True)
         return False

@@ -60,7 +60,7 @@ def sample_map(shown: Sequence[TopographyPicture], spectra_m: Sequence[XY], fram
 
 
 class _View:
-    """Maps positions in m to percent of the width and height of the map."""
+    """The conversion of positions in m to percent of the width and height of the map."""
 
     def __init__(self, places_m: NDArray[np.float64]) -> None:
         low, high = places_m.min(axis=0), places_m.max(axis=0)

@@ -20,7 +20,7 @@ _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
 class ArbitrationEvent(Enum):
-    """An event that control depends on: the kinds of requests, and two that come with time."""
+    """An event that control depends on: a kind of request, or one of two events that come with time."""
 
     REQUEST_CONTROL = "asks for control"
     RELEASE_CONTROL = "gives control back"
@@ -51,7 +51,7 @@ class ControlChange(Enum):
 
 
 class Cause(Enum):
-    """Why control was taken from its holder."""
+    """The reason why control was taken from its holder."""
 
     RELEASED = "released"
     PROBLEM = "problem"
@@ -134,10 +134,10 @@ class RoleTable:
 
 @dataclass(frozen=True)
 class Rules:
-    """The part of the experiment file that the table needs.
+    """The part of the experiment file that the arbitration table needs.
 
     Attributes:
-        problems: the problems that this experiment knows.
+        problems: the problems declared for this experiment.
         adjustable: parameters that a person may set while a component is in control.
         end_on: problems that end the experiment.
     """

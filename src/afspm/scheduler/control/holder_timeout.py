@@ -92,5 +92,5 @@ class HolderTimeout:
         return self.started_s + self.restart_grace_s if lost_s is None else lost_s + self.grace_s
 
     def loss_logged(self, now_s: float) -> HolderTimeout:
-        """Log no other loss within the grace period: a connection may come and go."""
+        """Suppress logs of further losses within the grace period: a connection may come and go."""
         return replace(self, next_loss_log_s=now_s + self.grace_s)

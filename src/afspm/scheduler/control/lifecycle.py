@@ -24,7 +24,7 @@ _OTHERS = ("scheduler", "translator")
 
 @dataclass(frozen=True)
 class StartupBarrier:
-    """Delays the first control state, and requests that may change it, until missed packets are published.
+    """A delay of the first control state, and of requests that may change it, until missed packets are published.
 
     Without it, a packet that the translator repeats would get a time after the change, and pass for a new one.
 
@@ -46,14 +46,14 @@ class StartupBarrier:
         return replace(self, until_s=now_s + self.patience_s, is_restart=is_restart)
 
     def put_off(self, until_s: float) -> StartupBarrier:
-        """Stay closed until then at least: more packets are to come."""
+        """Keep the barrier closed at least until `until_s`: more packets are expected."""
         return self if self.until_s is None else replace(self, until_s=max(self.until_s, until_s))
 
     def opened(self, now_s: float) -> StartupBarrier:
         return self if self.until_s is None else replace(self, until_s=None, opened_s=now_s)
 
     def keep(self, event: RequestIn) -> StartupBarrier | None:
-        """Keep a request that comes too early; None: it may be decided now."""
+        """Keep a request that arrives before the barrier opens; return None if the barrier is open."""
         if self.until_s is None or not self.is_restart or len(self.kept) >= _MOST_KEPT:
             return None
         return replace(self, kept=(*self.kept, event))

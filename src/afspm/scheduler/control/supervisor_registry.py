@@ -99,14 +99,14 @@ class SupervisorRegistry:
         return None if goes_on else since_s
 
     def orders_for(self, supervisor: str) -> tuple[SupervisorRegistry, tuple[str, ...]]:
-        """Return the processes that a supervisor has to restart, and remove the order: it is given now."""
+        """Return the processes that a supervisor has to restart, and remove the order, which is delivered now."""
         known = self.supervisors.get(supervisor)
         if known is None or not known.orders:
             return self, ()
         return replace(self, supervisors={**self.supervisors, supervisor: replace(known, orders=())}), known.orders
 
     def order(self, process: str, now_s: float) -> tuple[SupervisorRegistry, str]:
-        """Order the restart of a process. Return also the reason why that is impossible, or ""."""
+        """Order the restart of a process. Also return the reason if that is impossible, else ""."""
         having = {name: one for name, one in self.supervisors.items() if process in one.processes}
         if not having:
             known = sorted({process for one in self.supervisors.values() for process in one.processes})

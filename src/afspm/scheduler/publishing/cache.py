@@ -39,7 +39,7 @@ class PacketCache:
 
     Args:
         envelopes: how packets are named and how many of each name are kept.
-        max_bytes: of all together. Beyond it, older packets go first while their envelope has a newer one.
+        max_bytes: total size. Beyond it, the oldest packets are dropped whose envelope has a newer packet.
     """
 
     def __init__(self, envelopes: Envelopes | None = None, max_bytes: int = 512 * 2**20) -> None:
@@ -97,7 +97,7 @@ class PacketCache:
         return out, kept
 
     def pass_over(self, packet: Packet) -> bool:
-        """Remember a packet of the translator that is not published; False: it is a duplicate."""
+        """Register a packet of the translator that is not published; return False if it is a duplicate."""
         if packet.time_ns is None:
             return True
         is_new = packet.time_ns not in self._sources and self._first_times.pop(packet.time_ns, None) != _NEVER_NS
@@ -124,7 +124,7 @@ class PacketCache:
         return out, self._keep(out, None, self._envelopes.history(message))
 
     def restore(self, packets: Iterable[LoggedPacket]) -> None:
-        """Take packets of before a restart, oldest first."""
+        """Restore packets published before a restart, oldest first."""
         newest_ns = next(reversed(self._kept), 0)
         for packet, source_ns, history in packets:
             if packet.time_ns is None or packet.time_ns <= newest_ns:
@@ -141,7 +141,7 @@ class PacketCache:
         return any(self._kept[time_ns].packet.payload == payload for time_ns in newest)
 
     def not_before(self, time_ns: int) -> None:
-        """Publish every further packet with a time after this."""
+        """Give every further packet a time after `time_ns`."""
         self._last_ns = max(self._last_ns, time_ns)
 
     def replay(self, prefixes: Iterable[str], since_ns: int) -> tuple[Packet, ...]:

@@ -50,7 +50,7 @@ _CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
 class AnsweredRequest(NamedTuple):
-    """A request with its answer, not in words yet.
+    """A request with its answer, before it is put into words.
 
     Attributes:
         took_s: real time from the request to its answer.

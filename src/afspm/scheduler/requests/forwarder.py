@@ -20,7 +20,7 @@ from afspm.scheduler.events import Forward, RequestIn
 
 @dataclass(frozen=True, slots=True)
 class ReadForTurn:
-    """Read the value of `name` before the request `number` is decided."""
+    """The purpose of reading `name` before the request `number` is decided."""
 
     number: int
     name: str
@@ -28,21 +28,21 @@ class ReadForTurn:
 
 @dataclass(frozen=True, slots=True)
 class MoveForTurn:
-    """Move the microscope before the action `number`."""
+    """The purpose of moving the microscope before the action `number`."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
 class ReadAhead:
-    """Read the value of `name` when a translator connects."""
+    """The purpose of reading `name` when a translator connects."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class AskForFrame:
-    """Send a request of the coordinate frame; only the frame reads `purpose`."""
+    """The purpose of a coordinate frame's request; only the frame reads `purpose`."""
 
     purpose: object
 

@@ -77,7 +77,7 @@ class Turn:
         return replace(self, awaited=(self.awaited or frozenset()) - {name})
 
     def moving(self, move: PrePositioner) -> Turn:
-        """Wait for a move, then read the values again."""
+        """Register a move to wait for, after which the values are read again."""
         return Turn(self.number, move=move)
 
     def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:

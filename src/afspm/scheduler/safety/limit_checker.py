@@ -54,7 +54,7 @@ _PLACES = ((frozenset(REGION_CHANGES), frozenset({names.START_SCAN})), (frozense
 
 
 class _Breach(Exception):
-    """A limit is broken. Does not leave this module."""
+    """The error that a limit is broken. It does not leave this module."""
 
     def __init__(self, code: ControlResponse, reason: str) -> None:
         super().__init__(reason)
@@ -71,7 +71,7 @@ class _Use(NamedTuple):
 
 @dataclass(frozen=True)
 class LimitChecker:
-    """Checks requests against the limits, and stores the values that steps and rates are measured from."""
+    """The check of requests against the limits, with the values that steps and rates are measured from."""
 
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
     state: LimitState = field(default_factory=LimitState)
@@ -216,7 +216,7 @@ class LimitChecker:
         return checker
 
     def published(self, subject: object, now_ns: int) -> LimitChecker:
-        """Store places, and the times at which values with a limited rate change, from a published message."""
+        """Store positions and changes of values with a limited rate from a published message."""
         usage = self.state.usage
         for name, value in numbers(self._valid_values(subject)):
             if name in self.limits.rated:

@@ -42,7 +42,7 @@ class LastUse:
 
 @dataclass(frozen=True)
 class Usage:
-    """Values and uses, by name. Kept over a restart: a scheduler that was killed must not allow a use any sooner.
+    """Values and latest uses of parameters and actions, by name. Kept over a restart, so that no interval is shortened.
 
     Attributes:
         sent: uses of unknown outcome, which count.

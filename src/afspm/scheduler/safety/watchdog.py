@@ -20,7 +20,7 @@ _SOON_S = 1.0
 
 
 class TipDuty(Enum):
-    """The duty of the scheduler towards a tip that its holder left in danger. Its values stand in saved states."""
+    """The duty of the scheduler towards a tip that its holder left in danger. Its values are part of saved states."""
 
     NONE = "none"
     OWED = "owed"
@@ -174,7 +174,7 @@ class Watchdog:
         return dog if dog.owes_retract else dog._after(TipEvent.RETRACTED_LATE)
 
     def begun(self, now_s: float) -> Watchdog:
-        """Wait after a restart: missed packets come first, and the translator may not be connected yet."""
+        """Start the wait after a restart: missed packets come first, and the translator may not be connected yet."""
         return replace(self, due_s=now_s + self.settings.again_s) if self.owes_retract else self
 
     @property
@@ -200,11 +200,11 @@ class Watchdog:
 
     @property
     def question(self) -> str:
-        """The action whose support by the translator is checked when it connects."""
+        """The action whose support is checked when a translator connects."""
         return self.settings.retract or names.STOP_SCAN
 
     def without_retract(self) -> Watchdog:
-        """Note that the microscope has no action to retract."""
+        """Register that the microscope has no action to retract."""
         return replace(self, can_retract=False)
 
     def people_called(self) -> Watchdog:
@@ -285,7 +285,7 @@ class Watchdog:
         return self._after(TipEvent.SEEN_TO)
 
     def hurry(self, now_s: float) -> Watchdog:
-        """Shorten all waits to a moment: the experiment ends."""
+        """End all waits now: the experiment ends."""
         due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
         return replace(self, in_haste=True, due_s=due_s)
 

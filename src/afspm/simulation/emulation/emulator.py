@@ -49,7 +49,7 @@ FAREWELL_S = 0.5
 
 
 class Crashed(AfspmError):
-    """Raised to end the emulated controller without any further answer, like a crash."""
+    """The error that ends the emulated controller without any further answer, like a crash."""
 
     code = "emulator-crashed"
 
@@ -188,13 +188,13 @@ class Emulator(ABC):
         """Stop listening. Also called if `open` failed."""
 
     def abandon(self) -> None:
-        """Drop the present activity, after `tick` or `serve` has raised. Extend it where more than the rig is busy."""
+        """Drop the present activity, after `tick` or `serve` has raised. Override if more than the rig is active."""
         self.rig.abandon(self.clock.now_s())
 
     # -- services for subclasses
 
     def show_button(self, name: str, why: str, pressed: Callable[[], object]) -> None:
-        """Show a button until it is pressed or removed; there is one at a time.
+        """Show a button until it is pressed or removed. Only one button is shown at a time.
 
         A person, or a test, presses it by deleting the file `delete-to-NAME.txt` in `folder`: so any program on any
         computer with access to the folder can press it, alone as well as in an experiment.
@@ -269,10 +269,10 @@ class Emulator(ABC):
 
     @contextmanager
     def running(self, folder: Path, clock: Clock | None = None) -> Iterator[str]:
-        """Run in a thread while in the block, for tests and scripts; yields the address.
+        """Run the controller in a thread while in the block, for tests and scripts; yields the address.
 
         Raises:
-            any exception of `run` before it listened, or up to the end of the block, except an emulated crash.
+            any exception of `run` up to the end of the block, before listening too, except an emulated crash.
         """
         opened: list[str] = []
         failed: list[BaseException] = []

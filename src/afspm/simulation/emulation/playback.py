@@ -21,7 +21,7 @@ _SHOWN: Final = 200
 
 
 class Deviation(Exception):
-    """The client differs from the recording; the text gives the place, and both questions."""
+    """The error that the client differs from the recording; its text gives the place and both questions."""
 
 
 @dataclass(frozen=True)

@@ -93,7 +93,7 @@ class MakerProgram(ABC):
 
     @property
     def engages(self) -> bool:
-        """True while the approach is due but not started."""
+        """True while an approach is due but has not started."""
         return self._engages
 
     @property

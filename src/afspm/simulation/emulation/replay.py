@@ -42,7 +42,7 @@ class ReplayClient:
 
 
 class TraceReplay(Emulator):
-    """Plays a trace back: gives the recorded answers, and reports the first different question.
+    """An emulated controller that gives a trace's recorded answers, and reports the first different question.
 
     Args:
         trace: the file (`afspm trace`).

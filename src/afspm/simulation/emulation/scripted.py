@@ -58,13 +58,13 @@ class ScriptWire(Protocol):
         """Send a reply to a client, unless it is gone."""
 
     def send_half(self, client: Client, reply: bytes) -> None:
-        """Send half a reply, in the way of the wire."""
+        """Send half a reply, truncated as this transport would truncate it."""
 
     def close(self) -> None: ...
 
 
 class ScriptFailed(AfspmError):
-    """A script can't be run; the interpreter's message becomes the reply."""
+    """The error that a script can't be run; the interpreter's message becomes the reply."""
 
     code = "script-failed"
 
@@ -90,7 +90,7 @@ class Waiting:
 
 
 class ScriptedEmulator(Emulator):
-    """A controller that answers scripts. Write the abstract methods; all are called from one thread.
+    """A controller that answers scripts. Subclasses write the abstract methods; all are called from one thread.
 
     Attributes:
         program: the maker's program behind the interpreter, created by `make_program`.

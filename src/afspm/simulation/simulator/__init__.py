@@ -225,7 +225,7 @@ class Simulator(Driver):
         self._reached(refuses=False).instrument.change_tip(condition, self.clock.now_s())
 
     def run_drawing(self, work: Callable[[], None]) -> None:
-        """Draw a scan beside everything else."""
+        """Compute a scan in a background thread."""
         in_background(work)
 
     def connect(self) -> None:
@@ -315,7 +315,7 @@ class Simulator(Driver):
         return found if self._fault_action else {name: a for name, a in found.items() if name != _FAULT}
 
     def run_process(self, context: ProcessContext) -> int:
-        """Run the translator, with faults that are not the controller's."""
+        """Run the translator, with injected faults of the translator itself."""
         from afspm.simulation.simulator.faulty import FaultyTranslator
         from afspm.translator.translator import run_translator
 

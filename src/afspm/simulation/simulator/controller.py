@@ -348,7 +348,7 @@ class SavedFiles:
         return None if late is None else float(late[1])
 
     def complete(self) -> None:
-        """Complete the late file."""
+        """Write the rest of the late file."""
         path = Path(self._kept.pop("late")[0])
         try:
             _hidden(path).replace(path)

@@ -1,4 +1,4 @@
-"""A translator with faults that are not the controller's: late and missing answers, hangs, crashes."""
+"""A translator with injected faults of its own: late and missing answers, hangs, crashes."""
 
 from __future__ import annotations
 

@@ -57,26 +57,26 @@ class ChildPhase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class StartChild:
-    """Start the process."""
+    """The effect that starts the process."""
 
 
 @dataclass(frozen=True, slots=True)
 class KillChild:
-    """Kill the process; its exit follows as an event."""
+    """The effect that kills the process; its exit follows as an event."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class GiveUpChild:
-    """Restart the process no more, and log it. The scheduler stops waiting for it, too."""
+    """The effect that ends restarts of the process, with a log line. The scheduler stops waiting for it, too."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class ChildLog:
-    """Log a line; `level` is a name of `logging`."""
+    """The effect that logs a line; `level` is a name of `logging`."""
 
     level: str
     text: str
@@ -129,7 +129,7 @@ class ChildWatch:
         return self.tick(now_s)
 
     def waits(self, now_s: float) -> None:
-        """Restart the time allowed for its start: the process exists, but must still wait."""
+        """Restart the time allowed for its start: the process exists, but still waits for the scheduler."""
         if self._liveness is not None:
             self._liveness.waits(now_s)
 

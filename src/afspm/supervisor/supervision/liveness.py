@@ -69,7 +69,7 @@ class Liveness:
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
         """Process a heartbeat, with the age of the current step and the limit for one step.
 
-        A heartbeat after `closing` cancels it: then the process was not closing, or another one announced it.
+        A heartbeat after `closing` cancels the announcement: the process is not closing, or another one announced it.
         """
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = ProcessHealth.ALIVE

@@ -21,7 +21,7 @@ _WITHOUT_PROCESS = {
 
 
 class ProcessStatus:
-    """Since when each process has been in its condition."""
+    """The condition of each process, with the time since when it lasts."""
 
     def __init__(self, liveness: LivenessPolicy) -> None:
         self._liveness = liveness

@@ -74,7 +74,7 @@ class RunEnd:
 
     Attributes:
         ask_s, kill_s: when to ask and to kill, in real monotonic time.
-        latest_s: until when busy processes are waited for before they are asked.
+        latest_s: deadline for busy processes; then they are asked to end.
         last: the last step taken.
         in_haste: whether a person wants the run to end now.
         busy_s: when a process was last seen busy after it was asked.
@@ -111,7 +111,7 @@ class RunEnd:
         return replace(self, kill_s=now_s, last=EndStep.ASK, in_haste=True)
 
     def deadline_s(self) -> float | None:
-        """Return when `step` has the next thing to do; None: never again."""
+        """Return when `step` is next due; None: never again."""
         match self.last:
             case None:
                 return self.ask_s
@@ -148,7 +148,7 @@ class RunEnd:
 def unfinished(
     ending: RunEnd, children: Mapping[str, SupervisedChild], now_s: float, liveness: LivenessPolicy
 ) -> list[str]:
-    """Return the processes that have something to finish; for a translator also after it was asked: the tip."""
+    """Return the processes still at work; after the request to end, only those closing and busy translators."""
     is_asked, has_ended = ending.last is not None, ending.why.is_announced
     # a scheduler on another computer counts as alive
     can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)

@@ -62,7 +62,7 @@ class ChildLife:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """Return when its next heartbeat, or its end, is so late that the operating system is asked about it."""
+        """Return when a missing heartbeat or exit is so late that the operating system is asked about the process."""
         if self.beat is None:
             return None
         return self.beat_s + (liveness.closing_s if self.beat.closing else liveness.silence_s) / 2.0
@@ -72,7 +72,7 @@ class ChildLife:
         return due_s is not None and now_s >= due_s
 
     def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether it works on a step, by its last heartbeat or as seen, within the limit it declared."""
+        """Return whether the process works on a step, by heartbeat or sample, within the limit that it declared."""
         if self.beat is None or self.beat.closing:
             return False
         longest_s, age_s = self.beat.longest_step_s or liveness.longest_step_s, self.beat.step_age_s or 0.0
@@ -83,7 +83,7 @@ class ChildLife:
 
     @property
     def is_ending(self) -> bool:
-        """Whether it still works on its end: on a busy computer one second of work may take ten.
+        """Whether the process still works on closing: on a busy computer one second of work may take ten.
 
         A process in an endless loop uses up its allowance of processor time quickly if the computer is idle.
         """
@@ -121,9 +121,9 @@ class SupervisedChild:
         return self.given_up or self.watch.over
 
     def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
-        """Return whether it may have something left to do.
+        """Return whether the process may have work left.
 
-        True if it starts, has not sent a heartbeat for a moment, is frozen and can be restarted, or was restarted and
+        True if the process is starting, briefly silent, frozen and can be restarted, or was restarted and
         has yet to receive the packets that it missed, if it still can.
         """
         life = self.life

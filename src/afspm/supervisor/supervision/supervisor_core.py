@@ -51,7 +51,7 @@ SCHEDULER_ANSWERS_WITHIN_S = 15.0
 
 
 class SupervisorCore:
-    """Decides which processes to start, kill and ask to end, and what to log.
+    """The decisions which processes to start, kill and ask to end, and which lines to log.
 
     Args:
         awaits_scheduler: whether components begin only after the scheduler has answered.
@@ -126,7 +126,7 @@ class SupervisorCore:
         return effects
 
     def may_start(self, name: str) -> bool:
-        """Return whether a process may still be started: the run may have ended since."""
+        """Return whether a process may still be started: false once the run is ending."""
         return self.ending is None or self.children[name].rescued
 
     def deadline_s(self) -> float | None:

@@ -13,12 +13,12 @@ from afspm.supervisor.supervision.child import HeartbeatReport
 
 @dataclass(frozen=True, slots=True)
 class RunBegan:
-    """The run begins: all processes start."""
+    """The event that the run begins: all processes start."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProcessStarted:
-    """The operating system has created the process."""
+    """The event that the operating system has created the process."""
 
     name: str
     pid: int
@@ -26,7 +26,7 @@ class ProcessStarted:
 
 @dataclass(frozen=True, slots=True)
 class StartFailed:
-    """The operating system could not create the process."""
+    """The event that the operating system could not create the process."""
 
     name: str
     why: str
@@ -34,7 +34,7 @@ class StartFailed:
 
 @dataclass(frozen=True, slots=True)
 class Beaten:
-    """A heartbeat arrived."""
+    """The event that a heartbeat arrived."""
 
     name: str
     report: HeartbeatReport
@@ -42,7 +42,7 @@ class Beaten:
 
 @dataclass(frozen=True, slots=True)
 class ActivitySeen:
-    """The operating system was asked whether a process without heartbeats works; None: unknown.
+    """The operating system's answer whether a process without heartbeats works; None: unknown.
 
     Attributes:
         processor_s: processor time used since the process started; None: unknown.
@@ -55,7 +55,7 @@ class ActivitySeen:
 
 @dataclass(frozen=True, slots=True)
 class Exited:
-    """A child has exited; a negative code is the number of the signal that ended it, as in `subprocess`."""
+    """The exit of a child; a negative code is the number of the signal that ended it, as in `subprocess`."""
 
     name: str
     pid: int
@@ -66,7 +66,7 @@ class Exited:
 
 @dataclass(frozen=True, slots=True)
 class EndSignal:
-    """A person, or the system, ends the run."""
+    """The signal of a person, or of the system, to end the run."""
 
     number: int
 
@@ -77,33 +77,33 @@ class EndSignal:
 
 @dataclass(frozen=True, slots=True)
 class RestartOrdered:
-    """A person orders a restart of a process."""
+    """The order of a person to restart a process."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
 class SchedulerAnswered:
-    """The scheduler of this run has answered: components may send it requests."""
+    """The event that the scheduler of this run has answered: components may send it requests."""
 
 
 @dataclass(frozen=True, slots=True)
 class UseReported:
-    """The scheduler answered whether the microscope is in use; `why` is empty if it is not."""
+    """The scheduler's answer whether the microscope is in use; `why` is empty if it is not."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class EndRefused:
-    """The scheduler refused to end the experiment."""
+    """The scheduler's refusal to end the experiment."""
 
     why: str
 
 
 @dataclass(frozen=True, slots=True)
 class TimePassed:
-    """The deadline came, or any other event."""
+    """The event that time has passed, up to a deadline or another event: deadlines are checked."""
 
 
 SupervisorEvent = (
@@ -137,7 +137,7 @@ class ProcessAction(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessCommand:
-    """Carry out an action on a process."""
+    """The effect that carries out an action on a process."""
 
     action: ProcessAction
     name: str
@@ -145,22 +145,22 @@ class ProcessCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseComponents:
-    """Let components that wait for the scheduler begin."""
+    """The effect that lets components begin which wait for the scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
 class AskUse:
-    """Ask the scheduler whether the microscope is in use; `UseReported` follows if the scheduler knows."""
+    """The effect that asks the scheduler if the microscope is in use; `UseReported` follows if the scheduler knows."""
 
 
 @dataclass(frozen=True, slots=True)
 class EndExperiment:
-    """Ask the scheduler to end the experiment; `EndRefused` follows if it refuses."""
+    """The effect that asks the scheduler to end the experiment; `EndRefused` follows if it refuses."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriteLog:
-    """Log a line under the name of a process; `level` is a name of `logging`."""
+    """The effect that logs a line under the name of a process; `level` is a name of `logging`."""
 
     name: str
     level: str

@@ -29,7 +29,7 @@ class ReceivedBeat:
 
 
 class BeatRecorder:
-    """Receives heartbeats at its own address, in its own thread, until it is closed.
+    """A receiver of heartbeats at its own address, in its own thread, until it is closed.
 
     Args:
         on_beat: called in that thread after each beat.

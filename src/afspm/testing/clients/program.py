@@ -25,7 +25,7 @@ _LAST_WORDS = 3
 
 
 class Pump(Protocol):
-    """Serves the judge's own sockets during a wait for the client."""
+    """The service of the judge's own sockets during a wait for the client."""
 
     def __call__(self, done: Callable[[], bool], within_s: float) -> bool:
         """Wait until `done()`; return False on a timeout."""

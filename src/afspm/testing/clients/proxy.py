@@ -20,7 +20,7 @@ _LONG, _COMMAND = 0x02, 0x04
 
 @dataclass
 class FrameCounter:
-    """Counts the frames in a stream of ZMTP, except commands."""
+    """The number of frames in a stream of ZMTP, except commands."""
 
     messages: int = 0
     _skip: int = _GREETING
@@ -44,7 +44,7 @@ class FrameCounter:
 
 
 class CuttingProxy:
-    """Forwards data between client and scheduler.
+    """A proxy between client and scheduler that cuts connections.
 
     Args:
         target: the scheduler's address, "tcp://host:port".

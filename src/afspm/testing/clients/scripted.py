@@ -46,20 +46,20 @@ def success(request: ScriptedRequest) -> Sequence[Sequence[bytes]]:
 
 
 class ScriptedScheduler:
-    """The sockets of a scheduler.
+    """A scheduler for tests: real sockets, scripted answers.
 
     Args:
         control, publish: addresses to bind.
-        keys: its own; None: without encryption.
+        keys: the scheduler's keys; None: without encryption.
 
     Attributes:
         requests: received requests, in order.
-        greetings: received requests 101.
+        greetings: received greetings (request number 101).
         connections: the number of connections to `control`, including those refused for their keys.
         prefixes, markers: received subscriptions.
         cached: packets, as frames, for clients that request them by a marker.
         reply: returns the answer to a request.
-        greeting: returns the answer to request 101.
+        greeting: returns the answer to a greeting.
     """
 
     def __init__(self, clock: Clock, control: str, publish: str, keys: Keys | None) -> None:

@@ -100,7 +100,7 @@ def _in_session(
 
 
 class _Walk:
-    """Runs the steps in order."""
+    """The run of all steps in order."""
 
     def __init__(self, guide: Guide, progress: CommissioningProgress, write: Callable[[], None]) -> None:
         self._guide = guide

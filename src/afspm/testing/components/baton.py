@@ -13,7 +13,7 @@ _LONGEST_STEP_S = 60.0
 
 
 class LifeEnded(BaseException):
-    """Raised in code that waits when its process is killed, each time it waits."""
+    """The exception raised at each wait in the code of a killed process."""
 
 
 class Baton:
@@ -64,7 +64,7 @@ class Baton:
             raise LifeEnded
 
     def die(self) -> None:
-        """End this process here and now."""
+        """End this process at once, from its own code."""
         self._killed = True
         raise LifeEnded
 

@@ -354,7 +354,7 @@ class Bench:
     # --- for the processes ---
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None:
-        """See `StepObserver`."""
+        """Observe a step of the scheduler; see `StepObserver`."""
 
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None:
         """Keep each packet that the scheduler publishes."""
@@ -394,7 +394,7 @@ def _no_port(heard: tuple[str, ...] | None = None) -> Port:
 
 
 class _BenchTranslator(TranslatorProcess):
-    """A translator that refuses on demand. What it has to refuse outlives a kill."""
+    """A translator that refuses on demand. Pending refusals survive a kill."""
 
     def __init__(self, *args: Any, **settings: Any) -> None:
         super().__init__(*args, **settings)
@@ -411,7 +411,7 @@ class _BenchTranslator(TranslatorProcess):
 
 
 class _Person(Process):
-    """Sends requests, once each, and waits for the connection if there is none."""
+    """A person whose requests are sent once each, after a wait for the connection if there is none."""
 
     def __init__(self, time: SimulatedTime, weather: Weather, scheduler: SchedulerHost) -> None:
         super().__init__(time, "person")
@@ -435,10 +435,10 @@ class _Person(Process):
                 self._line.ask(request)
 
     def line_down(self, line: ControlLine) -> None:
-        """The line is made again by itself."""
+        """Do nothing: the line reconnects by itself."""
 
     def answered(self, line: ControlLine, number: int, response: Response) -> None:
-        """The state that the scheduler publishes shows the effect."""
+        """Do nothing: the state that the scheduler publishes shows the effect."""
 
 
 def _seconds(time: Time) -> float:

@@ -75,7 +75,7 @@ class BlockingProcess(Process):
             baton.kill()
 
     def arrived(self) -> None:
-        """Note a message that its code may wait for."""
+        """Register a message that the process's code may wait for."""
         if self._waits:
             self._go_on()
 
@@ -107,7 +107,7 @@ class BlockingProcess(Process):
         self._baton.wait()
 
     def may_die(self) -> None:
-        """Kill the process by chance at this moment."""
+        """Kill the process now, with probability `dies_in_call`."""
         if self.dies_in_call and self.timeline.chance(self.dies_in_call):
             assert self._baton is not None
             self._baton.die()
@@ -279,7 +279,7 @@ class ComponentProcess(BlockingProcess):
 
 
 class MemoryPort:
-    """See `afspm.transport.port.Port`."""
+    """The in-memory form of `afspm.transport.port.Port`."""
 
     def __init__(self, host: ComponentProcess) -> None:
         self._host = host
@@ -304,7 +304,7 @@ class MemoryPort:
         return -1
 
     def close(self) -> None:
-        """There is nothing to close: connections belong to the process."""
+        """Do nothing: connections belong to the process."""
 
 
 class TranslatorProcess(BlockingProcess):
@@ -396,7 +396,7 @@ class TranslatorProcess(BlockingProcess):
 
 
 class MemoryServerPort:
-    """See `afspm.transport.port.ServerPort`."""
+    """The in-memory form of `afspm.transport.port.ServerPort`."""
 
     def __init__(self, host: TranslatorProcess) -> None:
         self._host = host
@@ -412,7 +412,7 @@ class MemoryServerPort:
         self._host.reply(frames)
 
     def is_connected(self, connection: bytes) -> bool:
-        """Return True: its scheduler has no epoch, so the result is not used."""
+        """Return True: the simulated scheduler has no epoch, so the result is not used."""
         return True
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
@@ -422,4 +422,4 @@ class MemoryServerPort:
         self._host.wake(incoming)
 
     def close(self) -> None:
-        """There is nothing to close: connections belong to the process."""
+        """Do nothing: connections belong to the process."""

@@ -67,7 +67,7 @@ class Pipe:
 
 
 class LineServer(Host, Protocol):
-    """Answers requests: scheduler or translator."""
+    """The answering end of a line: scheduler or translator."""
 
     def peer_connected(self, line: ControlLine) -> None: ...
     def peer_disconnected(self, line: ControlLine) -> None: ...
@@ -75,7 +75,7 @@ class LineServer(Host, Protocol):
 
 
 class LineClient(Host, Protocol):
-    """Sends requests."""
+    """The requesting end of a line."""
 
     def line_up(self, line: ControlLine) -> None: ...
     def line_down(self, line: ControlLine) -> None: ...
@@ -89,7 +89,7 @@ class ControlLine:
         name: the name that the client uses.
 
     Args:
-        doubling: whether requests may arrive twice, as those of an impatient client do.
+        doubling: whether requests may arrive twice, as from a client that repeats them early.
     """
 
     def __init__(
@@ -169,14 +169,14 @@ class ControlLine:
 
 
 class PacketSource(Host, Protocol):
-    """Publishes packets, and keeps them for late joiners."""
+    """A publisher of packets, with a cache for late joiners."""
 
     def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]: ...
     def left(self, feed: Feed) -> None: ...
 
 
 class FeedListener(Host, Protocol):
-    """Subscribes to packets."""
+    """A subscriber to packets."""
 
     def since_ns(self, feed: Feed) -> int: ...
     def received(self, feed: Feed, packet: Packet) -> None: ...
@@ -226,7 +226,7 @@ class Feed:
             self._timeline.after(self._weather.reconnect_s * (0.5 + self._timeline.random.random()), self._try)
 
     def fall_silent(self, for_s: float) -> None:
-        """See `ControlLine`."""
+        """Lose all messages; see `ControlLine.fall_silent`."""
         _fall_silent(self._timeline, (self._there, self._back))
         self._timeline.after(for_s, self.cut)
 

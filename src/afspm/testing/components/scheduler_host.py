@@ -88,7 +88,7 @@ class Disk:
 
 
 class StepObserver(Protocol):
-    """Checks the scheduler."""
+    """An observer that checks each step of the scheduler."""
 
     def stepped(self, host: SchedulerHost, event: Input | None, effects: Sequence[Effect]) -> None: ...
     def carried_out(self, host: SchedulerHost, effect: Effect) -> None: ...
@@ -107,7 +107,7 @@ class SchedulerHost(Process):
         make_core: makes the core of each life, if it is not a plain one.
 
     Attributes:
-        worker: takes the jobs of the coordinate frame in this life; None: the observer does.
+        worker: executes jobs of the coordinate frame in this life; None: the observer receives them.
     """
 
     def __init__(

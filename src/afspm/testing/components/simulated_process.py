@@ -19,7 +19,7 @@ _SAME_S = 1e-6
 
 
 class Alarm:
-    """Calls a process at a time that may change again and again; setting the same time costs nothing."""
+    """A call of a process at a time that may be changed often; setting the same time again costs nothing."""
 
     def __init__(self, process: Process, ring: Callable[[], None]) -> None:
         self._process = process
@@ -46,7 +46,7 @@ class Process:
     """A process over all its lives. Subclasses set up the memory of one life in `begin`.
 
     Attributes:
-        alive: there is a life.
+        alive: the process is running or frozen.
         banned: it can't be started.
         frozen: it does nothing, and messages wait.
         sockets: the connections that others have made to it, noticed or not.

@@ -16,7 +16,7 @@ _STUCK = 10_000
 
 
 class GoesInCircles(Exception):
-    """Events follow each other without time passing."""
+    """The error that events follow each other without time passing."""
 
 
 class Timer:

@@ -171,7 +171,7 @@ class CheckClient:
         """Wait until the microscope is there, and take control.
 
         Raises:
-            Lost: that was impossible.
+            Lost: there is no microscope, or control was not granted.
         """
         try:
             self.wait(lambda: self._link.connected and self._link.is_caught_up(), STARTED_S, _ANSWERS)

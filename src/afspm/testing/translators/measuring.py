@@ -157,7 +157,7 @@ class Taken:
 
 
 class CheckMeasurements:
-    """Takes measurements for checks. A failed measurement is not repeated: checks that need it are skipped.
+    """Measurements for checks. A failed measurement is not repeated: checks that need it are skipped.
 
     Attributes:
         excused: checks that this controller can't pass, with the reason.
@@ -294,7 +294,7 @@ class CheckMeasurements:
     # --- both ---
 
     def act(self, action: str) -> None:
-        """Run an action. Raises Skipped if it is unsupported, which some microscopes only report now."""
+        """Run an action. Raises Skipped if it is unsupported, which some microscopes report only on use."""
         response = self.client.ask(ControlRequest.ACTION, action)
         if response.code == ControlResponse.ACTION_NOT_SUPPORTED and self.support.actions.get(action) is None:
             self.support.actions[action] = False

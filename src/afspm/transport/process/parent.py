@@ -50,7 +50,7 @@ def read_launch_line(pipe: int) -> bytes:
 
 
 class StopRequested(BaseException):
-    """The parent is gone or stops the process.
+    """The exception that the parent has ended, or stops the process.
 
     Like KeyboardInterrupt it is no `Exception`: a script's `except Exception` must not keep a process alive.
     """

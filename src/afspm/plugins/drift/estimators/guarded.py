@@ -57,7 +57,7 @@ def log_failure(failure: PairFailure) -> None:
 
 
 class Guarded:
-    """Runs an estimator so that no caller needs to check its result.
+    """A guard that runs an estimator, so that no caller needs to check its result.
 
     An exception, a result of the wrong type or shape, and impossible accepted values are failures: see
     `Registration.failure`. A displacement without overlap, and a mirrored or much stretched sample, are refused. The

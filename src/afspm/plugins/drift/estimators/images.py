@@ -19,7 +19,7 @@ MOST_SATURATED = 0.6  # of the pixels at exactly the lowest or the highest value
 
 
 class Unusable(Exception):
-    """A scan that can't be registered with any other; the text is the reason."""
+    """The error that a scan can't be registered with any other; its text is the reason."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -46,7 +46,7 @@ which grows with doubt, would give the images too little weight there."""
 
 
 class LeastSquares:
-    """Registers two scans as I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise with d = u + A q + creep of the lines.
+    """Registration of two scans: I2(q + d/2) e^(-g/2) = I1(q - d/2) e^(g/2) + noise, d = u + A q + creep of the lines.
 
     1. `prepare`: flatten rows, clip outliers, refuse scans without information. `grid`: a common pixel.
     2. `search` and `score`: candidates by normalised cross-correlation, and the likeliest of them.
@@ -54,7 +54,7 @@ class LeastSquares:
        according to their `noise`.
     4. `covariance`: the uncertainty from noise, enlarged by doubt; `nuisances`: the average over possible shear,
        rotation, calibration and creep.
-    5. `acceptance`: refuse what may be no match.
+    5. `acceptance`: refuse likely false matches.
 
     Args:
         wrong_at_most: the largest accepted probability that a match is wrong by more than a pixel; doubled where a

@@ -186,7 +186,7 @@ class Scored:
 
 
 class Scorer:
-    """Scores shifts of two images: L = sum over channels of -n/2 ln(1 - rho²), and the prior; n independent values."""
+    """The score of a shift: L = sum over channels of -n/2 ln(1 - rho²), plus the prior; n independent values."""
 
     def __init__(self, scene: Scene, expected: ExpectedShift | None):
         self._scene = scene

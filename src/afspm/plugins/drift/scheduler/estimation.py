@@ -79,7 +79,7 @@ class Estimation:
         return answer
 
     def compensated(self, time_s: float, velocity_m_s: tuple[float, float]) -> None:
-        """Note that the controller moves the tip with this velocity from `time_s` on.
+        """Register that the controller moves the tip with this velocity from `time_s` on.
 
         Raises:
             ConfigError: the tracker can't take this into account.

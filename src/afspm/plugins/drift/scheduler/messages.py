@@ -69,14 +69,14 @@ class Registered:
 
 @dataclass(frozen=True)
 class Forecasted:
-    """The worker runs, or has a new forecast without a scan."""
+    """The report that the worker runs, or has a new forecast without a scan."""
 
     forecast: Plain | None
 
 
 @dataclass(frozen=True)
 class NotRegistered:
-    """The worker could not process a scan at all."""
+    """The report that the worker could not process a scan."""
 
     key: str
     reason: str
@@ -84,7 +84,7 @@ class NotRegistered:
 
 @dataclass(frozen=True)
 class WorkerGone:
-    """The worker has ended."""
+    """The report that the worker has ended."""
 
     reason: str
 
@@ -112,12 +112,12 @@ class ScanJob:
 
 @dataclass(frozen=True)
 class StartWorker:
-    """Start the worker; a running worker is killed, and its job forgotten."""
+    """The job that starts the worker; a running worker is killed, and its job is dropped."""
 
 
 @dataclass(frozen=True)
 class Compensated:
-    """The controller moves the tip with this velocity from this time on."""
+    """The information that the controller moves the tip with this velocity from this time on."""
 
     time_s: float
     velocity_m_s: tuple[float, float]

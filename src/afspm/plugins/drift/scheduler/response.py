@@ -160,7 +160,7 @@ def restore_compensation(draft: DriftDraft) -> None:
 
 
 def hand_over(draft: DriftDraft) -> None:
-    """Give the controller the newest rate, if it is significant and no person is in control."""
+    """Send the newest drift rate to the controller, if it is significant and no person is in control."""
     predicted = draft.forecast.predicted(draft.now_ns * 1e-9)
     if draft.control.mode is ControlMode.MANUAL or predicted is None or not draft.corrects:
         return

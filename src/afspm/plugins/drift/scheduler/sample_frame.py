@@ -62,7 +62,7 @@ from afspm.scheduler.events import (
 
 @dataclass(frozen=True)
 class SampleFrame:
-    """See `scheduler.coordinate_frame.CoordinateFrame`; made by `SampleFrame.initial`."""
+    """The sample's `scheduler.coordinate_frame.CoordinateFrame`; made by `SampleFrame.initial`."""
 
     env: DriftEnvironment
     state: DriftState
@@ -209,7 +209,7 @@ def _follow_control(draft: DriftDraft, change: ControlChanged) -> None:
 
 @dataclass(frozen=True)
 class _DirectionAsked:
-    """Marks a request for the scan direction; its answer is processed like any value of a parameter."""
+    """The mark of a request for the scan direction; its answer is processed like any value of a parameter."""
 
 
 def _ask_direction(draft: DriftDraft) -> None:

@@ -155,7 +155,7 @@ def _middle_s(draft: DriftDraft, scan: Scan, event: PacketIn) -> float:
 
 
 def note_state(draft: DriftDraft, payload: bytes | memoryview, time_ns: int | None) -> None:
-    """Follow the start of scans."""
+    """Track the start of scans from a published state."""
     status = draft.env.codec.decode_packet("ScopeStateMsg", payload)
     if isinstance(status, ScopeStatus) and time_ns is not None:
         draft.timing = draft.timing.with_state(status, time_ns * 1e-9, draft.places.upwards)

@@ -30,7 +30,7 @@ class ScanStart:
 
 @dataclass(frozen=True)
 class ScanStartTracker:
-    """Follows the state of the microscope to find the start of scans.
+    """A tracker of the microscope's states that finds the start of scans.
 
     SCANNING is published again after a pause, and to a restarted scheduler: then the scan began earlier.
     """
@@ -39,7 +39,7 @@ class ScanStartTracker:
     is_scanning: bool = False
 
     def with_state(self, status: ScopeStatus, time_s: float, upwards: bool | None) -> ScanStartTracker:
-        """Process a state; `upwards`: the direction in force. A lost microscope goes on with its scan."""
+        """Process a state; `upwards`: the direction in force. A disconnected microscope continues its scan."""
         if status.state is ScopeState.UNDEFINED:
             return self
         is_scanning, begun = status.state is ScopeState.SCANNING, self.begun
@@ -50,7 +50,7 @@ class ScanStartTracker:
         return ScanStartTracker(begun, is_scanning)
 
     def scan_came(self) -> ScanStartTracker:
-        """Close the scan: the next SCANNING begins another, even without a state between them."""
+        """Mark the scan as finished: the next SCANNING starts another scan, even without a state in between."""
         return replace(self, is_scanning=False)
 
     def of_scan(self, end_s: float) -> ScanStart | None:

@@ -16,7 +16,7 @@ _STRICT = {"extra": "forbid"}
 
 @dataclass(frozen=True)
 class RescanRule:
-    """When the Rescanner is asked for a rescan.
+    """The rule for requests to the Rescanner.
 
     Attributes:
         rule: "tolerance": the sample is further off than `tolerance`, with two standard deviations added; "paper": scan

@@ -94,7 +94,7 @@ class HeldScan:
 
 @dataclass(frozen=True)
 class ScanGate:
-    """Keeps back a scan until its position is known, and every later packet of the microscope.
+    """A gate that holds a scan, and every later packet of the microscope, until the scan's position is known.
 
     So all channels of a scan get the same, best known mapping, and the order of packets is kept.
 
@@ -179,7 +179,7 @@ class RespondToFailure:
 
 @dataclass(frozen=True)
 class CallPerson:
-    """No more scans will be registered."""
+    """The deferred response that calls a person, since no more scans will be registered."""
 
 
 FollowUp = RespondToScan | RespondToFailure | CallPerson

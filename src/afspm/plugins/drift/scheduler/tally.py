@@ -1,4 +1,4 @@
-"""Counts registered scans, altogether and lately."""
+"""Counts of registered scans, in total and among the latest scans."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LATELY = 10
 
 @dataclass(frozen=True)
 class RegistrationTally:
-    """Counts the outcomes of registration. Scans of a new place don't count for the share of unregistered scans."""
+    """The number of registration outcomes. Scans of a new place don't count for the share of unregistered scans."""
 
     counts: Mapping[RegistrationOutcome, int] = field(default_factory=dict)
     lately: tuple[bool, ...] = ()

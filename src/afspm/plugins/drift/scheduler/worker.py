@@ -50,7 +50,7 @@ class Complaint:
 
 
 class Reports(Protocol):
-    """Takes the reports of a worker."""
+    """The receiver of a worker's reports."""
 
     def send(self, obj: object, /) -> None: ...
 
@@ -92,7 +92,7 @@ class DriftWorkerInProcess:
             yield self._reports.popleft()
 
     def close(self) -> None:
-        """There is nothing to close: the state is on disk."""
+        """Do nothing: the state is on disk."""
 
 
 def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:

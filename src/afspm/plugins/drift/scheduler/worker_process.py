@@ -27,7 +27,7 @@ _CONTEXT = multiprocessing.get_context("spawn")
 
 
 class DriftWorkerProcess:
-    """See `scheduler.shell.FrameWorker`.
+    """The `scheduler.shell.FrameWorker` in a child process.
 
     Args:
         file: where the worker keeps its state; None: nowhere.

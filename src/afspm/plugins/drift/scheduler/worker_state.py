@@ -18,7 +18,7 @@ _ARRAY = "array"
 
 
 class WorkerStateFile:
-    """Holds numbers, texts, lists, dicts and numpy arrays.
+    """A file of numbers, texts, lists, dicts and numpy arrays.
 
     Args:
         path: None: nothing is kept.

@@ -156,7 +156,7 @@ class BankTracker:
         state.filters = state.filters.with_velocity(time_s, velocity, noise, rarest=self._settings.rarest)
 
     def compensated(self, time_s: float, velocity_m_s: ArrayLike) -> None:
-        """Note that the controller moves tip coordinates with a velocity (2,) from a time on.
+        """Register that the controller moves tip coordinates with a velocity (2,) from `time_s` on.
 
         Raises:
             InvalidValue: before the middle of the newest scan: its position has been published already.
@@ -347,7 +347,7 @@ class BankTracker:
         return snapshot(self._state, "bank", VERSION)
 
     def restore(self, state: PlainMapping) -> None:
-        """See `Tracker`. Raises InvalidValue for the state of another tracker, or of one with other filters."""
+        """Restore the result of `state`. Raises InvalidValue: the state is of another tracker, or of other filters."""
         found = restored(BankState, state, "bank", VERSION)
         if (filters := found.filters) is not None:
             if (self._settings.transform == "similarity") != (found.similarity is not None):

@@ -147,7 +147,7 @@ class Filters:
         return replace(self, covariance=covariance)
 
     def with_scan(self, noise_m2: Array, duration_s: float) -> Filters:
-        """Add a scan of now, with a location error (2, 2) and the sample's wandering during the scan."""
+        """Add the newest scan, with a location error (2, 2) and the sample's wandering during the scan."""
         mean = np.concatenate([self.mean, self.mean[:, :4]], axis=1)
         rows = np.concatenate([self.covariance, self.covariance[:, :4, :]], axis=1)
         covariance = np.concatenate([rows, rows[:, :, :4]], axis=2)

@@ -271,5 +271,5 @@ class PaperTracker:
         return snapshot(self._state, "paper", VERSION)
 
     def restore(self, state: PlainMapping) -> None:
-        """See `Tracker`. Raises InvalidValue for the state of another tracker."""
+        """Restore the result of `state`. Raises InvalidValue for the state of another tracker."""
         self._state = restored(PaperState, state, "paper", VERSION)

@@ -108,7 +108,7 @@ class ReferenceScans:
         return _alike(self.kept[number].scan, scan) >= _LIKE
 
     def judged(self, tried: Table[int, bool], step: int) -> None:
-        """Count for each reference whether it could be registered with the newest scan."""
+        """Update the refusals and the last use of each reference tried with the newest scan."""
         for number, succeeded in tried.items():
             kept = self.kept[number]
             if succeeded:

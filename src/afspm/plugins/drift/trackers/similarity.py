@@ -87,14 +87,14 @@ class Similarity:
         return replace(self, error=error, covariance=(covariance + covariance.T) / 2, doubted=False)
 
     def straight_about(self, position_m: Array) -> Similarity:
-        """Remove the expected error about a place (2,), where displacements stay the same."""
+        """Correct `straight` by the expected rotation and scale error, about a place (2,) that stays fixed."""
         error = self.error.copy()
         undone = _turned_about(position_m, -error[0])
         error[0] = 0.0
         return replace(self, straight=undone @ self.straight, pivot_m=position_m, error=error)
 
     def with_scan(self) -> Similarity:
-        """Add a scan of now, straightened as it was registered."""
+        """Add the newest scan, straightened as it was registered."""
         now = [*range(len(self.error)), 0]
         return replace(self, error=self.error[now], covariance=self.covariance[np.ix_(now, now)])
 

@@ -60,11 +60,11 @@ def _fits(signature: inspect.Signature, arguments: tuple[object, ...]) -> bool:
 
 
 class NoAnswer(Exception):
-    """GXSM never answers this call, nor any later one until it is restarted."""
+    """A call that blocks GXSM: neither this call nor a later one is answered until GXSM is restarted."""
 
 
 class WrongArguments(SystemError):
-    """The arguments can't be converted to C types.
+    """The error that arguments can't be converted to C types.
 
     Attributes:
         value: result that Gxsm4 returns instead through its shared memory.

@@ -16,7 +16,7 @@ _LISTENS: Final = re.compile(r"listening at (\S+):(\d+)")
 
 
 class ConsoleClosed(BaseException):
-    """GXSM was closed while a script ran."""
+    """The error of a script that runs while GXSM is closed."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ class _Write:
 
 
 class GxsmFileWriter:
-    """Writes files to one folder.
+    """A writer of files to one folder.
 
     Attributes:
         folder: folder of scans and spectra; a person may choose another one at the panel.

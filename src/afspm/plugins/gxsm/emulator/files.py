@@ -24,8 +24,8 @@ class GxsmChannel:
     """A channel that GXSM records.
 
     Attributes:
-        source: the instrument's name of it.
-        label: GXSM's name of it.
+        source: name of the channel in the simulated instrument.
+        label: name of the channel in GXSM.
         direction: "Xp" forward, "Xm" backward.
         unit: unit in the file ("AA" for lengths), and unit on the panel.
         scale: factor from the instrument's values to this unit.

@@ -93,7 +93,7 @@ class GxsmScan:
         next_follows: True if another scan is due to start.
         follows: True if that scan starts without a pause.
         number, own: number in its file names; the file names, once saved.
-        before: file names reported at first; None: its own at once.
+        before: file names reported at first, those of the previous scan; None: its own from the start.
         y_before: line reported until its first line is complete.
         memory: rows of the previous scan, by channel.
     """

@@ -25,7 +25,7 @@ _MAY_BE_INFINITE: Final = ("BiasSpectr.TimingSet", "ZSpectr.TimingSet")
 
 
 class FunctionRefused(Exception):
-    """The controller refuses a function, with a reason."""
+    """The refusal of a function by the controller, with a reason."""
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ class ZController:
         self._follows_s = 0.0
 
     def go_wrong(self, now_s: float) -> None:
-        """Withdraw the tip by the safe tip, if a fault demands it."""
+        """Withdraw the tip by the safe tip, if a fault is configured to do so."""
         faults, rig = self._core.faults, self._core.rig
         if faults.strikes("safe-tip", now_s):
             rig.withdraw(now_s)

@@ -72,7 +72,7 @@ class CommandTree:
             self._roots[level] = self._prelude.environment(self._table({**shared, **self._session(workflow, level)}))
 
     def start(self, script: str, level: int | None) -> tuple[object, str | None]:
-        """Return a script ready to run, or the reply that it can't be. Raises ScriptFailed."""
+        """Return a script ready to run, or the reply that reports why it can't run. Raises ScriptFailed."""
         with self._bounded():
             started = self._prelude.start(script, self._roots[level])
         return started if isinstance(started, tuple) else ((self._prelude, started), None)

@@ -102,7 +102,7 @@ class ParkEmulator(ScriptedEmulator):
         return _reply(request, result="NaN", value="NaN")
 
     def tick(self, now_s: float) -> float | None:
-        """Advance also the scripts that have been answered already."""
+        """Also advance the scripts that have been answered already."""
         for script in [one for one, is_answered in self._scripts.items() if is_answered]:
             try:
                 ended = script.step() is not None

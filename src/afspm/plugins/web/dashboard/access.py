@@ -33,14 +33,14 @@ class Visitor:
 
 
 class Access:
-    """Decides which viewers may look, and which may steer; see `Passwords`.
+    """The rules for which viewers may look, and which may steer; see `Passwords`.
 
     Args:
         host: the address to listen at.
         password_hash: of the common password; the password itself may be in the environment instead
             (AFSPM_DASHBOARD_PASSWORD).
         people: the hash of each person's password.
-        now_s: the time in real seconds, for sessions and for the rate of tries.
+        now_s: the time in real seconds, for sessions and for the rate limit of password attempts.
         sessions: of viewers who have signed in.
 
     Raises:
@@ -84,7 +84,7 @@ class Access:
         return Visitor() if self.lets_look else None
 
     def is_signed_in(self, visitor: Visitor) -> bool:
-        """Return whether the session of a visitor goes on: it ends when the person signs out anywhere."""
+        """Return whether a visitor's session is still valid; signing out anywhere ends it."""
         return not visitor.cookie or self._sessions.find(visitor.cookie) is not None
 
     def person_of(self, visitor: Visitor) -> str:
@@ -110,5 +110,5 @@ class Access:
         return self._sessions.begin(person, self._passwords.proof_of(person))
 
     def leave(self, cookie: str | None, *, everywhere: bool = False) -> None:
-        """End a session, or all of its person."""
+        """End a session, or all sessions of its person."""
         self._sessions.end(cookie or "", everywhere=everywhere)

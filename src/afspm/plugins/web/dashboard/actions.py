@@ -29,7 +29,7 @@ class ActionResult:
 
     Attributes:
         text: for the person, with the reason of a refusal.
-        each: of an action on several parameters, the result for each by its name.
+        each: result by parameter name, if the action set or read several parameters.
     """
 
     text: str
@@ -48,7 +48,7 @@ def not_signed_in() -> Future[ActionResult]:
 
 
 class Actions:
-    """Actions in the name of one person, for one thread. A refusal is returned in the result, not raised."""
+    """The actions of one person, for use in one thread. Refusals are returned in the result, not raised."""
 
     def __init__(self, commands: PersonCommands, watch: Watch) -> None:
         self._commands = commands
@@ -80,7 +80,7 @@ class Actions:
         return _result(self._commands.restart(process), f"{process} is being restarted")
 
     def note(self, text: str, scan_ns: int | None = None, time_ns: int | None = None) -> ActionResult:
-        """Write a note on a scan, on a moment, or on now."""
+        """Write a note on a scan or on a time; default: the present."""
         return _result(self._commands.note(text, scan_ns, time_ns), "Noted")
 
     # --- the microscope, in MANUAL ---
@@ -99,13 +99,13 @@ class Actions:
         return _result(self._commands.stop(), f"The {what} is stopped")
 
     def read(self, parameters: Iterable[str]) -> ActionResult:
-        """Return the values of parameters in force, with their units; a refused one is not ok."""
+        """Return the values of parameters in force, with their units; refused ones are not `ok`."""
         return ActionResult("", each={name: self._read(name) for name in parameters})
 
     def set(self, wanted: Mapping[str, str], shown: Mapping[str, str]) -> ActionResult:
-        """Set parameters to quantities as a person writes them: "0.5 V", "2 um/s", "12". Each is a request of its own.
+        """Set parameters, one request each, to quantities written by a person: "0.5 V", "2 um/s", "12".
 
-        If one of them is ambiguous, nothing is sent.
+        Nothing is sent if a quantity is ambiguous.
 
         Args:
             shown: the values that the person saw, with their units.
@@ -119,7 +119,7 @@ class Actions:
         return ActionResult(" ".join(refused or [one.text for one in each.values()]), ok=not refused, each=each)
 
     def scan(self, region: Region | None = None, shape: tuple[int, int] | None = None) -> ActionResult:
-        """Begin a scan; `region` and `shape` None: those in force. Returns when the scan has begun."""
+        """Begin a scan, and return once it has begun. None as `region` or `shape`: the one in force."""
         if (refused := self._commands.prepare_scan(region, shape)) is not None:
             return _result(refused, "")
         where = "" if region is None else f" at {typeset_position(region.center_m)}"
@@ -170,7 +170,7 @@ def _in_force(parameter: str, response: Response) -> str:
 
 
 def unclear(parameter: str, text: str, shown: str) -> str:
-    """Return why a text is no clear value of a parameter; empty if it is one. A number needs the parameter's unit.
+    """Return why a text is ambiguous as a parameter's value; empty if it is clear. A number needs the parameter's unit.
 
     >>> unclear("scan-speed", "8", "4 µm/s")
     'scan-speed: write the unit as well, for example "8 µm/s".'
@@ -205,7 +205,7 @@ Action = Callable[[Actions], ActionResult]
 
 
 class Steering:
-    """Carries out the requests of persons, each under the person's name and in order.
+    """An executor of persons' requests, each under the person's name and in order.
 
     Args:
         access: knows which viewers have signed in.
@@ -223,7 +223,7 @@ class Steering:
         return self._submit(person, action) if person else not_signed_in()
 
     def read(self, action: Action) -> Future[ActionResult]:
-        """Carry out an action that only reads, in the name of the page itself."""
+        """Carry out an action that only reads, under the page's own name."""
         return self._submit(_PAGE, action)
 
     def close(self) -> None:

@@ -51,8 +51,8 @@ class Content:
     """The page at one moment.
 
     Attributes:
-        trouble: why it should not be trusted; empty: it may be.
-        unheard: for each process without reports while others report: for how long, ns.
+        trouble: why the page may be out of date; empty: it is current.
+        unheard: time without a report in ns, by process, while other processes report.
     """
 
     status: str = ""
@@ -71,7 +71,7 @@ class Content:
 
 
 class Contents:
-    """Makes the content; from the page's thread.
+    """The maker of the content, for use in the page's thread.
 
     Args:
         limits: the allowed region of scans, in tip coordinates; None if it is not known.
@@ -92,7 +92,7 @@ class Contents:
         self._revision = 0
 
     def get(self) -> Content:
-        """Return the content of now, or of a moment ago."""
+        """Return the present content, or a slightly older cached one."""
         with self._lock:
             now_s, revision = self._watch.clock.monotonic_s(), self._watch.revision
             if revision != self._revision:
@@ -176,7 +176,7 @@ def _now_ns(watch: Watch, overview: Overview) -> int:
 
 
 def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
-    """Return for how long, in ns, each process has sent no report while others have: its computer is gone."""
+    """Return ns since the last report of each process silent while others report: its computer is unreachable."""
     if watch.ended:
         return {}
     speed = 1.0 / watch.clock.real_s(1.0)
@@ -185,7 +185,7 @@ def unheard(watch: Watch, overview: Overview) -> dict[str, int]:
 
 
 def processes_of(watch: Watch, overview: Overview) -> Iterator[ProcessState]:
-    """Yield the processes; after the run all have ended, regardless of their last report."""
+    """Yield the processes; after the run, all are shown as ended, regardless of their last report."""
     for state in overview.processes.values():
         if not watch.is_over or state.condition in OVER:
             yield state

@@ -22,7 +22,7 @@ END_SHOWN_WITHIN_S = 1.5  # time for the pages to show the end
 
 
 class Dashboard(WebComponent):
-    """Serves the page of an experiment. Persons steer through the scheduler, each under the person's name.
+    """The page of an experiment. Persons steer through the scheduler, each under their own name.
 
     Other processes have the processor first.
 

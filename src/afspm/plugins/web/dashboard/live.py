@@ -50,7 +50,7 @@ Asked = Annotated[PictureRequest, Depends()]
 
 
 class Live:
-    """Answers the requests of the browser's scripts.
+    """The handler of requests from the browser's scripts.
 
     Args:
         archive: of scans that are no longer in memory.
@@ -68,7 +68,7 @@ class Live:
         self._closing = False
 
     def close(self) -> None:
-        """Answer all requests that wait for a picture, and let no other wait. From any thread."""
+        """Answer all requests that wait for a picture, and let no later request wait. Thread-safe."""
         self._closing = True
         self._bell.ring()
 

@@ -1,6 +1,6 @@
 """The page of a recorded night: a running experiment's page at one moment, with a slider through the night.
 
-Also the requests of its scripts (its scans, the difference of two, its report), and its one action, a note.
+The module also answers its scripts (scans, difference of two scans, report), and has its one action, a note.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _asset(name: str) -> str:
 
 
 class NightRequests:
-    """Answers the requests of the night page's scripts."""
+    """The handler of requests from the night page's scripts."""
 
     def __init__(self, night: Night, archive: Archive) -> None:
         self._night = night
@@ -176,7 +176,7 @@ class NightActions(Actions):
 
 
 class NightSteering(Steering):
-    """Writes notes, one after the other."""
+    """A writer of notes, one after the other."""
 
     def __init__(self, night: Night, access: Access, name: str) -> None:
         self._night = night

@@ -145,7 +145,7 @@ def _level_html(level: str) -> str:
 
 
 class HealthPanel:
-    """A row for each process, which stays while its words change: a button must not move under the finger."""
+    """A row for each process. Rows keep their place when their text changes, so that no button moves before a click."""
 
     def __init__(self, session: SteeringSession) -> None:
         self._session = session
@@ -211,7 +211,7 @@ def process_words(state: ProcessState, unheard_ns: int | None = None) -> tuple[s
 
 
 class NotesPanel:
-    """Lists the notes, and lets a viewer who has signed in write one."""
+    """The list of notes, with a field to write a note for viewers who have signed in."""
 
     def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
         self._watch = watch

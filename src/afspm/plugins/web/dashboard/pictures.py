@@ -79,7 +79,7 @@ class RenderedFrame:
 
 
 class PictureCache:
-    """Draws, from any thread; keeps the newest few pictures. A frame is identified by its number."""
+    """A thread-safe cache of the newest few pictures. A frame is identified by its number."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -99,7 +99,7 @@ def _draw(frame: ChannelFrame, look: Look, beside: ChannelFrame | None) -> Rende
 
 
 class Thumbnails:
-    """Draws, from any thread, and keeps the newest few hundred; a finished scan never changes.
+    """A thread-safe cache of the newest few hundred small pictures; a finished scan never changes.
 
     Args:
         frame: returns a finished channel by time and name; None if its values are not kept.

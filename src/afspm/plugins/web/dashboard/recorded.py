@@ -1,6 +1,6 @@
 """`python -m afspm.plugins.web.dashboard.recorded`: serves the page of a recorded night until Ctrl-C.
 
-A process of its own, since a process has one NiceGUI, and `afspm run` does not load it before the end. Its settings are
+The page needs a separate process: a process can hold one NiceGUI only, and `afspm run` loads it last. Settings are
 a line on standard input; it ends when standard input is closed.
 """
 

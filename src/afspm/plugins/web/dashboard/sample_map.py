@@ -113,7 +113,7 @@ def _keys(content: MapContent, spectra: Sequence[SpectrumSummary], *, whole: boo
 
 
 def places_of(scans: Sequence[ScanSummary]) -> tuple[list[tuple[ScanSummary, int]], int]:
-    """Return ([(newest scan, how many) for each place], number of older places left out); the newest last."""
+    """Return [(newest scan, number of scans) per place], newest place last, and the number of older places left out."""
     found: dict[tuple[int, ...], tuple[ScanSummary, int]] = {}
     seen: dict[tuple[int, ...], int] = {}
     for scan in scans:

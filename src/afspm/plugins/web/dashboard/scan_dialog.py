@@ -52,7 +52,7 @@ class ScanChoice:
 
 
 class ScanDialog:
-    """Asks for the size and pixels of a scan about a place."""
+    """A dialog for the size and pixels of a scan centred on a place."""
 
     def __init__(self, choice: ScanChoice) -> None:
         self._choice = choice

@@ -29,7 +29,7 @@ class Session:
     Attributes:
         person: empty for a viewer who only looks.
         proof: derived from the password at its beginning.
-        generation: of the person's sessions: signing out everywhere begins the next.
+        generation: counts how often the person signed out everywhere.
         since_s: its beginning, real time.
     """
 
@@ -48,7 +48,7 @@ class _Kept:
 
 
 class Sessions:
-    """Signs cookies and checks them. From any thread.
+    """A thread-safe signer and verifier of session cookies.
 
     Args:
         file: keeps the key and ended sessions over a restart, readable by its owner alone; None: sessions end with this
@@ -81,7 +81,7 @@ class Sessions:
             return None if is_over or self._now_s() - session.since_s >= REMEMBERED_S else session
 
     def end(self, cookie: str, *, everywhere: bool = False) -> None:
-        """End the session of a cookie, or all of its person."""
+        """End the session of a cookie, or all sessions of its person."""
         session = self.find(cookie)
         if session is None:
             return

@@ -18,7 +18,7 @@ _CLOSE = [{"label": "Close", "color": "white"}]
 
 
 class SteeringSession:
-    """Carries out a viewer's actions, and shows the result, with the reason of a refusal."""
+    """The actions of one viewer, and the display of each result, with the reason of a refusal."""
 
     def __init__(self, watch: Watch, steering: Steering, visitor: Visitor) -> None:
         self.watch = watch

@@ -63,7 +63,7 @@ class EventBatch:
 
 
 class EventHistory:
-    """The newest events, bounded. From any thread.
+    """The newest events, bounded in number. Thread-safe.
 
     Args:
         complete_since_ns: events before this time may be incomplete.
@@ -129,7 +129,7 @@ class EventHistory:
 def fill(history: EventHistory, run_dir: Path, state_dir: Path | None, now_ns: int) -> None:
     """Add the run's events on disk: the journal, then later ones from the packet log.
 
-    If neither is on this computer, only the replay of the scheduler's cache is known of the past.
+    If neither is on this computer, past events come from the replay of the scheduler's cache only.
     """
     oldest_ns = None
     for message, thing, time_ns in _recorded(run_dir, state_dir):

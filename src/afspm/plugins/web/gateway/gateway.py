@@ -19,7 +19,7 @@ MOST_REQUESTS = 200
 
 
 class Gateway(WebComponent):
-    """Serves a JSON API over HTTP: state, parameters, scans, control, measurements, events.
+    """A JSON API over HTTP: state, parameters, scans, control, measurements, events.
 
     A client with a name acts as `<gateway>:<name>`, with the roles and limits of that name. Control has a lease, which
     the scheduler keeps: a client that vanishes loses control as a process that dies does. Other processes have the

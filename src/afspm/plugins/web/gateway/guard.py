@@ -80,7 +80,7 @@ def answer(refused: RefusedRequest) -> JSONResponse:
 
 
 class _Body:
-    """Limits the size of a request's body, also without a declared length."""
+    """The body of a request, limited in size also without a declared length."""
 
     def __init__(self, receive: Receive) -> None:
         self._receive = receive

@@ -70,7 +70,7 @@ class Measurement:
 
 @dataclass
 class _Following:
-    """A measurement that has begun, or may have."""
+    """The progress of a measurement that was requested from the scheduler."""
 
     measurement: Measurement
     target: Target
@@ -89,7 +89,7 @@ class _Following:
 
 
 class Measurements:
-    """The measurements of all clients. From any thread.
+    """The measurements of all clients. Thread-safe.
 
     Args:
         file: keeps them over a restart; None: they end with this process.

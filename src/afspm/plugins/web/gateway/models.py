@@ -263,7 +263,7 @@ class NoteAsked(_Asked):
 
 
 class DoneModel(_Answer):
-    """The request was carried out."""
+    """The answer to a request that was carried out."""
 
     done: Literal[True] = True
 

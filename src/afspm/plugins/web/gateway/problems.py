@@ -103,7 +103,7 @@ _BY_RESPONSE = {
 
 
 class RefusalModel(BaseModel):
-    """A refusal. Programs go by `code`; `reason` and `advice` are for people."""
+    """A refusal. Programs branch on `code`; `reason` and `advice` are for people."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -127,7 +127,7 @@ class RefusalModel(BaseModel):
 
 
 class RefusedRequest(Exception):
-    """A request is answered by a refusal."""
+    """The error that ends a request with a refusal."""
 
     def __init__(self, code: RefusalCode, reason: str, *, may_have_been_done: bool = False) -> None:
         super().__init__(reason)

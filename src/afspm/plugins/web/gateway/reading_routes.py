@@ -97,7 +97,7 @@ class ParameterCache:
 
 
 class ReadingRoutes:
-    """Answers from published messages; only parameters and actions are read from the microscope."""
+    """Routes answered from published messages; only parameters and actions are read from the microscope."""
 
     def __init__(self, services: GatewayServices) -> None:
         self._services = services

@@ -46,7 +46,7 @@ class GatewayServices:
     waiting: Counter[str] = field(default_factory=Counter)
 
     def person_of(self, asked: Request) -> str:
-        """Return the name in a request; empty: it only looks."""
+        """Return the name in a request; empty: the client may only read."""
         person: str = getattr(asked.state, PERSON, "")
         return person
 

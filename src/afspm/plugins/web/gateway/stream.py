@@ -46,7 +46,7 @@ def _event(id_: str, kind: str, text: str) -> str:
 
 
 class StreamCount:
-    """Counts open streams, because each takes memory and time."""
+    """The number of open streams, bounded because each takes memory and time."""
 
     def __init__(self) -> None:
         self._open = 0
