@@ -65,7 +65,7 @@ class Verdict:
     """Opinion on one scan, with a reason for people.
 
     Attributes:
-        flaws: of a bad tip, as far as the scan shows them, those that hide others first; a subset of `FLAWS`.
+        flaws: of a bad tip, as far as the scan shows them, the ones hiding others first; a subset of `FLAWS`.
     """
 
     opinion: Opinion

@@ -14,7 +14,7 @@ from afspm.model import Region
 
 LEDGER_EVENT = "ledger"
 PRESSED_FROM_M = 0.2e-9
-"""Mean indentation of a scan by errors of the feedback from which the scan counts: five times that of a usual scan."""
+"""Mean indentation of a scan by errors of the feedback from which the scan counts: five times the usual one."""
 
 
 @dataclass(frozen=True)

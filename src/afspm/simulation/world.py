@@ -282,7 +282,7 @@ class World:
     def saturated(self, current_a: Array, kind: str = "") -> float:
         """Return the share of the values at which the preamplifier is saturated, in a scan or in a kind of spectrum."""
         s = self.settings
-        # the noise of a scan's current is added behind the amplifier, that of a spectrum's before it
+        # the preamplifier's noise is added behind the clipping in a scan, and before it in a spectrum
         limit_a = s.iv.preamplifier_a if kind else s.signals.preamplifier_a - 4.0 * s.noise.current_a
         return float((np.abs(current_a) >= limit_a).mean())
 
