@@ -69,7 +69,7 @@ def main() -> None:
     axes[2].axvline(CHANGED_ROW, color="0.6", linewidth=0.8)
     axes[2].text(CHANGED_ROW + 3, 1.2, "true change", color="0.4")
     axes[2].set(xlabel="row", ylabel="evidence / threshold", xlim=(0, ROWS), ylim=(0, 1.3), title="evidence by row")
-    axes[2].legend(loc="upper left", bbox_to_anchor=(0.0, 0.9), frameon=False)
+    axes[2].legend(loc="center right", bbox_to_anchor=(1.0, 0.42), frameon=False)
     figure.suptitle("SIMULATED", x=0.01, ha="left", fontsize=8, color="0.4")
     figure.savefig(PICTURE, dpi=110)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
@@ -57,7 +56,7 @@ def flags(lab: Lab) -> int:
 def test_changed_tip_is_flagged_while_the_scan_is_running() -> None:
     lab = Lab("line_watch")
     whole_night(lab)
-    assert run(LineWatch(), lab) == ExitCode.ENDED
+    assert run(LineWatch(action="stop"), lab) == ExitCode.ENDED
     assert flags(lab) == 1
     last = verdicts(lab)[-1]
     assert last.stops
@@ -69,8 +68,7 @@ def test_changed_tip_is_flagged_while_the_scan_is_running() -> None:
 def test_look_publishes_the_row_and_flags_nothing() -> None:
     lab = Lab("line_watch")
     whole_night(lab)
-    action: Literal["look"] = "look"
-    run(LineWatch(action=action), lab)
+    run(LineWatch(), lab)
     assert flags(lab) == 0
     assert verdicts(lab)
     assert not any(one.stops for one in verdicts(lab))
@@ -86,12 +84,12 @@ def test_scan_during_which_the_setpoint_was_changed_is_not_judged() -> None:
     lab.at(at_s + 10.0, lambda: lab.publish(Feedback(True, 1.0, 1.0, 0.5)))
     publish_lines(lab, night()[-1], last, range(CHANGED_ROW - 2, ROWS), at_s + 20.0)
     lab.at(900.0, lab.kill)
-    run(LineWatch(), lab)
+    run(LineWatch(action="stop"), lab)
     assert verdicts(lab) == []
 
 
 def test_scan_that_the_classifier_calls_bad_is_no_measure() -> None:
-    lab, watch = Lab("line_watch"), LineWatch()
+    lab, watch = Lab("line_watch"), LineWatch(action="stop")
     for number, picture in enumerate(night()[:LEARNT]):
         tell(lab, number, picture)
         scan = Scan(HOME, "Height", "m", picture["Height"], began_ns(number) + round(ROWS * LINE_S * 1e9))
@@ -110,7 +108,7 @@ def test_lines_of_a_repair_are_not_judged() -> None:
     lab.at(100.0 + (LEARNT + 0.9) * PERIOD_S, lambda: lab.flag(TIP))
     tell(lab, LEARNT + 1, night()[-1], complete=False)
     lab.at(900.0, lab.kill)
-    run(LineWatch(), lab)
+    run(LineWatch(action="stop"), lab)
     assert verdicts(lab) == []
 
 
@@ -119,10 +117,10 @@ def test_restarted_watch_learns_no_scan_twice(tmp_path: Path) -> None:
     for number, picture in enumerate(night()[: LEARNT + 1]):
         tell(first, number, picture)
     first.at(900.0, first.kill)
-    watch = LineWatch()
+    watch = LineWatch(action="stop")
     run(watch, first, tmp_path)
     learnt = list(watch.memory["learnt_ns"])
-    second, again = Lab("line_watch"), LineWatch()
+    second, again = Lab("line_watch"), LineWatch(action="stop")
     for number, picture in enumerate(night()[:LEARNT]):
         publish_scan(second, picture, number, 10.0)
     tell(second, LEARNT + 1, night()[-1], complete=False)
@@ -140,6 +138,6 @@ def test_alarm_that_comes_after_the_scan_flags_nothing() -> None:
     lab.at(at_s - 1.0, partial(lab.publish, ScopeStatus(ScopeState.FREE)))
     publish_lines(lab, night()[-1], LEARNT + 1, range(ROWS), at_s)
     lab.at(900.0, lab.kill)
-    run(LineWatch(), lab)
+    run(LineWatch(action="stop"), lab)
     assert verdicts(lab)
     assert flags(lab) == 0

@@ -163,7 +163,7 @@ class SimulatedController:
 
     def set(self, values: dict[str, Value], now_s: float) -> None:
         """Change values, by their generic names, in the table's units; move to a new frame or position."""
-        self._instrument.account(now_s)  # with the feedback as it was
+        self.instrument.account(now_s)  # with the feedback as it was
         before = self._si()
         self._kept["values"].update(values)
         after = self._si()
