@@ -60,8 +60,9 @@ def main() -> None:
     axes[1].text(0.98, (alarm.row + 4) / ROWS, f"tip changed, row {alarm.since_row}", ha="right", va="bottom")
     axes[1].text(0.5, 0.75, "saved", ha="center", color="0.4")
     for number, curve in curves.items():
-        label = "scan with the change" if number == GOOD else "good scan"
-        axes[2].plot(np.arange(len(curve)), curve, label=label, color="tab:red" if number == GOOD else "tab:blue")
+        axes[2].plot(np.arange(len(curve)), curve, color="tab:red" if number == GOOD else "tab:blue")
+    axes[2].text(CHANGED_ROW + 6, 0.8, "scan with the change", color="tab:red")
+    axes[2].text(ROWS, 0.4, "good scan", ha="right", color="tab:blue")
     axes[2].axhline(1.0, color="k", linewidth=0.8)
     axes[2].axhline(LOOK, color="k", linewidth=0.8, linestyle=":")
     axes[2].text(ROWS, 1.02, "stop", ha="right", va="bottom")
@@ -69,7 +70,6 @@ def main() -> None:
     axes[2].axvline(CHANGED_ROW, color="0.6", linewidth=0.8)
     axes[2].text(CHANGED_ROW + 3, 1.2, "true change", color="0.4")
     axes[2].set(xlabel="row", ylabel="evidence / threshold", xlim=(0, ROWS), ylim=(0, 1.3), title="evidence by row")
-    axes[2].legend(loc="center right", bbox_to_anchor=(1.0, 0.42), frameon=False)
     figure.suptitle("SIMULATED", x=0.01, ha="left", fontsize=8, color="0.4")
     figure.savefig(PICTURE, dpi=110)
 
