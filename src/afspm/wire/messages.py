@@ -32,6 +32,7 @@ from afspm.wire.generated import (
     drift_pb2,
     feedback_pb2,
     geometry_pb2,
+    grants_pb2,
     journal_pb2,
     lines_pb2,
     scan_pb2,
@@ -212,6 +213,22 @@ NOTE: Final = MessageDeclaration(
 MEASUREMENT_SETTINGS: Final = MessageDeclaration(
     type=journal_pb2.MeasurementSettings, kind=MessageKind.EVENT, source=Role.SCHEDULER
 )
+APPROVALS: Final = MessageDeclaration(
+    type=grants_pb2.Approvals,
+    kind=MessageKind.EVENT,
+    source=Role.SCHEDULER,
+    always=False,
+    event="approvals",
+)
+PROPOSAL: Final = MessageDeclaration(
+    type=grants_pb2.Proposal,
+    kind=MessageKind.EVENT,
+    source=Role.SCHEDULER,
+    always=False,
+    history=100,
+    event="proposal",
+    in_past=True,
+)
 DRIFT_MAPPING: Final = MessageDeclaration(
     type=DriftMapping,
     kind=MessageKind.RESULT,
@@ -240,7 +257,7 @@ FEEDBACK_ANALYSIS: Final = MessageDeclaration(
 )
 
 _MODULES = (
-    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2,
+    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, grants_pb2,
     journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
 # collected by their class, so that no declaration above can be forgotten
