@@ -12,6 +12,7 @@ from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import WireError
 from afspm.model import (
+    Approvals,
     ControlEvent,
     ControlMode,
     ControlRequest,
@@ -29,6 +30,7 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
+    Proposal,
     RescanKind,
     Scan,
     ScanLines,
@@ -64,6 +66,7 @@ __all__ = [
 ]
 
 MOST_LINES = 2_000
+MOST_PROPOSALS = 200
 MOST_ENTRIES = 5_000
 OLD_S = 6.0  # real time; a supervisor reports its processes every 2 s
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
@@ -127,6 +130,8 @@ class Overview:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control: the newest; None before the first.
         processes, progress_reports: the newest of each, by name.
+        proposals: of agents, by id, newest last, bounded.
+        approvals: of persons, in force.
         log, notes, entries, refusals: newest last, bounded.
     """
 
@@ -138,6 +143,8 @@ class Overview:
         self.readings = Readings()
         self.processes: dict[str, ProcessState] = {}
         self.progress_reports: dict[str, Progress] = {}
+        self.proposals: dict[str, Proposal] = {}
+        self.approvals = Approvals()
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -288,6 +295,15 @@ class Overview:
 
     def _on_spectrum(self, spectrum: Spectrum, time_ns: int) -> None:
         self._measured.add_spectrum(spectrum, time_ns, self._holder)
+
+    def _on_proposal(self, proposal: Proposal, time_ns: int) -> None:
+        self.proposals.pop(proposal.id, None)
+        self.proposals[proposal.id] = proposal
+        while len(self.proposals) > MOST_PROPOSALS:
+            del self.proposals[next(iter(self.proposals))]
+
+    def _on_approvals(self, approvals: Approvals, time_ns: int) -> None:
+        self.approvals = approvals
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control

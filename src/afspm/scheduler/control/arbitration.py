@@ -116,7 +116,7 @@ class RoleTable:
         operate: command the microscope in MANUAL mode, and set an `adjustable` parameter. Without the key: the
             dashboard, and other components through which a person commands the microscope.
         restart: restart a process.
-        approve: approve plans of agents, give grants, revoke both, and clear `stopped-by-agent`. An agent never has this
+        approve: approve plans of agents, give grants, revoke both, and clear `stopped-by-agent`. No agent has this
             role. Without the key: the dashboard and other components through which a person commands the microscope,
             and `afspm approve` on this computer.
     """
