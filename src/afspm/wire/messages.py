@@ -217,14 +217,12 @@ APPROVALS: Final = MessageDeclaration(
     type=grants_pb2.Approvals,
     kind=MessageKind.EVENT,
     source=Role.SCHEDULER,
-    always=False,
     event="approvals",
 )
 PROPOSAL: Final = MessageDeclaration(
     type=grants_pb2.Proposal,
     kind=MessageKind.EVENT,
     source=Role.SCHEDULER,
-    always=False,
     history=100,
     event="proposal",
     in_past=True,

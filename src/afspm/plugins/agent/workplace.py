@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import secrets
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
@@ -186,7 +185,8 @@ class Workplace:
         who = self.requests.name_of(person)
         if any(one.who == who and one.state == "running" for one in self.runs.values()):
             raise RefusedRequest(RefusalCode.NOT_FREE, "a run of yours goes on; wait for its end, or stop")
-        run = Run(secrets.token_hex(4), who, proposal, len(plan.steps))
+        number = max((int(one) for one in self.runs), default=0) + 1
+        run = Run(str(number), who, proposal, len(plan.steps))
         self.runs[run.id] = run
         self._save()
         self._tasks[run.id] = asyncio.ensure_future(self._carry_out(person, run, plan))

@@ -60,6 +60,10 @@ def offset_m(draft: StateDraft) -> XY | None:
 
 def refused(draft: StateDraft, job: ForwardedRequest) -> str:
     """Return the reason why a command lacks an approval or breaks the limits of its role; "" if it may be sent."""
+    until_s = draft.lease.asked_until_s()
+    # a frozen scheduler finds the request and the end of the lease at the same time
+    if draft.env.settings.rules.is_agent(job.client) and until_s is not None and draft.now_s > until_s:
+        return f"the lease of {job.client} has ended"
     position = draft.limits.state.position
     return draft.grants.refused(job.client, job.request, draft.now_ns, offset_m(draft), position)
 
