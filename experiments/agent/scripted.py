@@ -91,7 +91,7 @@ class ScriptedModel(Component):
 
 
 class ScriptedPerson(Component):
-    """Approves every plan that has a preflight, and gives a grant for one curve. A real person would look at it first."""
+    """Approves every plan that has a preflight, and gives a grant for one curve. A real person would look first."""
 
     listens = ("Proposal",)
 

@@ -305,7 +305,24 @@ class AgentTools:
 
 def _schema(model: type[arguments.Arguments]) -> dict[str, Any]:
     schema = model.model_json_schema()
-    return {name: value for name, value in schema.items() if name not in ("title", "description")}
+    schema.pop("description", None)
+    short: dict[str, Any] = _without_titles(schema)
+    return short
+
+
+def _without_titles(schema: Any) -> Any:
+    # pydantic gives each field a title, its own name again; a model reads the list of tools in every conversation
+    if isinstance(schema, list):
+        return [_without_titles(one) for one in schema]
+    if not isinstance(schema, dict):
+        return schema
+    return {
+        name: {key: _without_titles(one) for key, one in value.items()}
+        if name == "properties"
+        else _without_titles(value)
+        for name, value in schema.items()
+        if name != "title"
+    }
 
 
 def _answer(content: Content) -> types.CallToolResult:
