@@ -35,6 +35,7 @@ from afspm.model import (
     names,
 )
 from afspm.plugins.agent.approval import fresh, of_plan
+from afspm.plugins.agent.plan import plan_of
 from tests.simulation.agent_rig import ADA, AGENT, STOP, UM, AgentRig, AgentViolation, facts
 
 _TEXTS = (
@@ -140,7 +141,7 @@ class Attack:
         return fresh(wanted, facts(self.rig))
 
     def _approve(self) -> None:
-        proposal = self.random.choice(list(self.rig.place.proposals.values()))
+        proposal = self.random.choice(list(self.rig.place.proposals.values())[-3:])
         if proposal.preflight:
             self._person(GRANT_REQUEST, of_plan(proposal, self.rig.place.frame)[0])
 
@@ -164,7 +165,7 @@ class Attack:
         elif name == "propose":
             given = {"plan": {"title": "t", "steps": [self._step() for _ in range(self.random.randint(1, 4))]}}
         elif name in ("preflight", "run"):
-            known = list(self.rig.place.proposals)
+            known = list(self.rig.place.proposals)[-3:]
             given = {"proposal": self.random.choice(known) if known and self.random.random() < 0.9 else "0" * 16}
         elif name == "measure":
             given = {"step": self._step()}
@@ -212,6 +213,10 @@ class Attack:
         chance = self.random
         if self.rig.core.control.holder != AGENT and chance.random() < 0.5:
             return int(ControlRequest.REQUEST_CTRL), 0
+        if self.rig.place.proposals and chance.random() < 0.3:  # a step of a plan: again, early, or of another plan
+            newest = list(self.rig.place.proposals.values())[-3:]
+            step = chance.choice(plan_of(chance.choice(newest).plan).requests(self.rig.place.frame))
+            return step.kind, step.subject
         match chance.randint(0, 15):
             case 0 | 1 | 2:
                 return int(ControlRequest.REQUEST_CTRL), chance.choice((0, 0, 0, 0, 1, 2, STOP))

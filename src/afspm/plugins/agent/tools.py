@@ -44,9 +44,9 @@ BLOCKS = 16
 _log = logging.getLogger("afspm.plugins.agent")
 Content = dict[str, object] | tuple[dict[str, object], bytes]
 Tool = Callable[[str, Any], Awaitable[Content]]
-_READS = types.ToolAnnotations(read_only_hint=True, open_world_hint=False)
-_PROPOSES = types.ToolAnnotations(read_only_hint=False, destructive_hint=False, open_world_hint=False)
-_ACTS = types.ToolAnnotations(read_only_hint=False, destructive_hint=True, open_world_hint=False)
+_READS = types.ToolAnnotations(read_only_hint=True)
+_PROPOSES = types.ToolAnnotations(destructive_hint=False)
+_ACTS = types.ToolAnnotations(destructive_hint=True)
 
 
 class AgentTools:
