@@ -215,8 +215,8 @@ class Attack:
             return int(ControlRequest.REQUEST_CTRL), 0
         if self.rig.place.proposals and chance.random() < 0.3:  # a step of a plan: again, early, or of another plan
             newest = list(self.rig.place.proposals.values())[-3:]
-            step = chance.choice(plan_of(chance.choice(newest).plan).requests(self.rig.place.frame))
-            return step.kind, step.subject
+            planned = chance.choice(plan_of(chance.choice(newest).plan).requests(self.rig.place.frame))
+            return planned.kind, planned.subject
         match chance.randint(0, 15):
             case 0 | 1 | 2:
                 return int(ControlRequest.REQUEST_CTRL), chance.choice((0, 0, 0, 0, 1, 2, STOP))

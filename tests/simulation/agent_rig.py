@@ -320,7 +320,7 @@ class AgentRig:
         self.saved: SavedState | None = None
         self.kills_done = 0
         self.watchman = Watchman(self)
-        self.watch = _PatientWatch(self.clock, ProblemNames({STOPPED_BY_AGENT: STOP}))  # type: ignore[arg-type]
+        self.watch = _PatientWatch(self.clock, ProblemNames({STOPPED_BY_AGENT: STOP}))
         run_dir = Path(__file__).parents[2] / "experiments" / "agent"  # read only, for its limits
         measurements = Measurements(None, self.watch, self.clock.monotonic_s)
         self.place = Workplace(
@@ -343,7 +343,7 @@ class AgentRig:
     def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
         future: Future[T] = Future()
         try:
-            future.set_result(action(PersonCommands(self.link(self.name_of(person)), self.watch)))  # type: ignore[arg-type]
+            future.set_result(action(PersonCommands(self.link(self.name_of(person)), self.watch)))
         except BaseException as error:  # as a thread's future: the caller gets it
             future.set_exception(error)
         return future

@@ -70,7 +70,7 @@ def test_server_that_reads_a_text_is_caught(monkeypatch: pytest.MonkeyPatch) -> 
 
     monkeypatch.setattr(AgentTools, "_scans", obedient)
     streams = [
-        attacked(seed, 250, texts=lambda text, one=one: one).rig.effects  # type: ignore[misc]
+        attacked(seed, 250, texts=lambda text, one=one: one).rig.effects
         for one in (HARMLESS, INJECTED)
         for seed in range(4)
     ]

@@ -9,7 +9,7 @@ import pytest
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue
-from afspm.model import Frame, Proposal, ScanParameters
+from afspm.model import Frame, Proposal, Region, ScanParameters
 from afspm.plugins.agent.approval import of_plan, of_table
 from afspm.plugins.agent.plan import plan_of, read_plan, read_step
 
@@ -92,6 +92,7 @@ def test_requests_are_the_bytes_that_are_sent() -> None:
     sent = wire.decode_request([bytes([requests[1].kind]), requests[1].step.payload])
     assert isinstance(sent.subject, ScanParameters)
     assert sent.subject.shape == (64, 32)
+    assert isinstance(sent.subject.region, Region)
     assert sent.subject.region.center_m == pytest.approx((10e-9, 0.0))
 
 

@@ -100,7 +100,8 @@ def test_client_without_a_name_only_looks(started: Started) -> None:
         assert (await agent.call("capabilities"))["actions"]
         assert "roles" in (await agent.call("limits"))["limits"]
         await agent.call("journal")
-        for tool, given in {"propose": {"plan": PLAN}, "stop": {"reason": "x"}, "measure": {"step": SCAN}}.items():
+        calls: dict[str, Any] = {"propose": {"plan": PLAN}, "stop": {"reason": "x"}, "measure": {"step": SCAN}}
+        for tool, given in calls.items():
             assert (await agent.refused(tool, **given))["code"] == "name-needed"
 
     run.act(look, name="")

@@ -110,7 +110,7 @@ class AgentLab:
         effects += self.lab.answer_reads(
             scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
             scan_top_left_x=str(left), scan_top_left_y=str(low), scan_angle="0",
-            **{names.PROBE_POS_X.replace("-", "_"): "0", names.PROBE_POS_Y.replace("-", "_"): "0"},
+            probe_pos_x="0", probe_pos_y="0",
         )  # fmt: skip
         new = [one for one in self.lab.forwarded[before:] if (one.request.kind, one.request.subject) == (kind, subject)]
         if new and answers is not None:
