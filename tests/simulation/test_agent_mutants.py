@@ -21,7 +21,7 @@ from afspm.scheduler.state import SchedulerState
 from tests.simulation.agent_attacks import Attack
 from tests.simulation.agent_rig import AgentViolation
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 Patch = pytest.MonkeyPatch
 ATTACKS, CALLS = 60, 250
 
@@ -180,7 +180,7 @@ MUTANTS: list[Callable[[Patch], None]] = [
 ]
 
 
-@pytest.mark.parametrize("mutant", rotated(MUTANTS, 4), ids=lambda one: one.__name__)
+@pytest.mark.parametrize("mutant", rotated(MUTANTS, 10), ids=lambda one: one.__name__)
 def test_broken_guard_is_found(mutant: Callable[[Patch], None], monkeypatch: Patch) -> None:
     mutant(monkeypatch)
     assert any(map(_is_found, range(ATTACKS)))

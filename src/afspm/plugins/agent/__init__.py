@@ -10,5 +10,5 @@ Theory of operation
                   right before it is sent (`scheduler.safety.grants`). No text from outside is read as anything but text
 
 `plan` is pure: a plan, its canonical form, its id, and the exact requests that a person approves. `twin` is the
-simulated run of a plan, in a process of its own. `commands` holds `afspm approve`, by which a person decides.
+simulated run of a plan, in a process of its own. `commands` holds `afspm approve`, the decision of a person.
 """

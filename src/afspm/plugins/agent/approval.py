@@ -14,7 +14,7 @@ from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
 
 PLAN_LASTS_S = 3600.0
 DRIFT_PART = 0.1
-"""Part of the smallest scan by which the sample may drift between preflight and scan."""
+"""Part of the smallest scan as the largest drift of the sample between preflight and scan."""
 DRIFT_M = 10e-9
 """The same for plans without a scan."""
 _FIELDS = ("agent", "for", "region", "parameters", "counts")

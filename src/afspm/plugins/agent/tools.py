@@ -59,7 +59,7 @@ class AgentTools:
     TOOLS: ClassVar[dict[str, tuple[type[arguments.Arguments], types.ToolAnnotations, str]]] = {
         "status": (arguments.Nothing, _READS, "Microscope, control, problems, approvals in force, your runs."),
         "capabilities": (arguments.Nothing, _READS, "Parameters with their values, and actions of the microscope."),
-        "limits": (arguments.Nothing, _READS, "The limits of the experiment, and what is left of your grant."),
+        "limits": (arguments.Nothing, _READS, "The limits of the experiment, and the rest of your grant."),
         "journal": (arguments.Journal, _READS, "What happened: requests, refusals, changes of control."),
         "scans": (arguments.Newest, _READS, "The newest scans, without values."),
         "scan_numbers": (arguments.OfScan, _READS, "Statistics of each channel, and averages of 16 x 16 blocks."),

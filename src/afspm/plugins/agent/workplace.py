@@ -119,7 +119,7 @@ class Workplace:
             self.runs[run.id] = run
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
-    # --- what is published: from the component's thread ---
+    # --- published messages: from the component's thread ---
 
     def take(self, thing: object, time_ns: int) -> None:
         """Process a published message."""
