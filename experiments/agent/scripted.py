@@ -31,6 +31,7 @@ class ScriptedModel(Component):
 
     def run(self):
         asyncio.run(self.measure())
+        self.scope.end_experiment()
 
     async def measure(self):
         async with (
