@@ -68,7 +68,7 @@ $(COLLECTED): $(TEST) $(shell find tests -name '*.py')
 
 ## decisions broken on purpose, each of which the simulated nights have to find; prints how many they found
 mutants: $(TEST)
-	@AFSPM_CASES=all $(PYTEST) -n 2 tests/simulation/test_mutants.py tests/simulation/test_what_if.py
+	@AFSPM_CASES=all $(PYTEST) -n 2 $(addprefix tests/simulation/,test_mutants.py test_what_if.py test_agent_mutants.py)
 
 ## every sample in experiments/, shortened, to its end
 test-samples: $(TEST)

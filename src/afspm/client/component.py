@@ -79,6 +79,8 @@ class Component:
     """In MANUAL mode a person uses the microscope through this component, unless the experiment file names another."""
     has_people: ClassVar[bool] = False
     """The component acts for people, whose passwords are in its setting `people`."""
+    needs_approval: ClassVar[bool] = False
+    """The component acts for agents: its commands need the approval of a person."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Packages needed beside a plain install of afspm, in the notation of `pip install`: `("scikit-learn>=1.4",)`."""
     needs_actions: tuple[str, ...] = ()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -10,6 +11,7 @@ from typing import Literal
 
 from afspm import wire
 from afspm.basics.errors import ExperimentEnded, InvalidValue, NoResponse, RequestError
+from afspm.basics.plain_data import Plain
 from afspm.client.command_retry import CommandRetry, refused
 from afspm.client.control_hold import ControlHold
 from afspm.client.events import Events, PublishedEvent
@@ -22,6 +24,8 @@ from afspm.client.parameter_text import Value, to_parameter, value_in
 from afspm.client.sweeping import ParameterSweep, SweepPoint
 from afspm.client.targets import ScanTarget, SpectrumTarget, xy_of
 from afspm.model import (
+    CLOCK_REQUEST,
+    GRANT_REQUEST,
     RELAY_REQUEST,
     RESTART_REQUEST,
     ControlMode,
@@ -29,6 +33,7 @@ from afspm.model import (
     ControlResponse,
     Feedback,
     Frame,
+    Grant,
     HasTime,
     InstrumentOrders,
     InstrumentReadings,
@@ -398,6 +403,19 @@ class Scope(ExperimentView):
     def restart(self, process: str) -> None:
         """Restart a process of the experiment, even one that was given up."""
         self._ask_scheduler(RESTART_REQUEST, process)
+
+    def approval_facts(self) -> Plain:
+        """Return the facts that an approval is valid for: run, limits, offset of the coordinates, and time."""
+        with self._call():
+            response = self._link.request(CLOCK_REQUEST)
+        if not response.ok:
+            raise refused(CLOCK_REQUEST, response, self._link.name)
+        facts: Plain = json.loads(response.payload)
+        return {name: facts.get(name) for name in ("run", "limits", "offset_m", "now_ns")}
+
+    def approve(self, grant: Grant) -> None:
+        """Approve a plan of an agent, give it a grant, or revoke its approvals; needs the role `approve`."""
+        self._ask_scheduler(GRANT_REQUEST, grant)
 
     def end_experiment(self) -> None:
         """End the experiment for all processes; the next call raises ExperimentEnded."""

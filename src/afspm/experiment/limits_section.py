@@ -16,6 +16,12 @@ only = ["tip_corrector"]
 [limits.actions.x-crash]
 only = ["tip_corrector"]
 every = "10 min"
+
+[limits.roles.agent]
+actions = ["start-scan", "start-spec"]
+region = { x = ["-2 um", "2 um"], y = ["-2 um", "2 um"] }
+parameters = { tip-bias-voltage = ["-1 V", "1 V"] }
+per_hour = { start-scan = 30 }
 """
 
 from __future__ import annotations
@@ -29,15 +35,15 @@ from typing import Final
 import pydantic
 
 from afspm.basics.errors import AfspmError
-from afspm.basics.plain_data import Count
+from afspm.basics.plain_data import Count, WholeNumber
 from afspm.basics.units import Angle, Length, parse_quantity, require_unit, si, si_unit
 from afspm.experiment.document import Document
 from afspm.experiment.findings import nearest
 from afspm.experiment.sections import Section, parse
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.validation_messages import name_of, report
-from afspm.model import Parameter, Region, instrument_of, names
-from afspm.scheduler.safety.limits import ExperimentLimits, Limit
+from afspm.model import Parameter, Region, component_of, instrument_of, names
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 
 Quantity = str | float
 _QUANTITIES: Final = ("min", "max", "step", "rate")
@@ -63,7 +69,16 @@ class LimitsSection(Section):
     most_pixels: Count = ExperimentLimits.most_pixels
 
 
-_OWN: Final = (*LimitsSection.model_fields, "actions")
+class RoleSection(Section):
+    """A table of [limits.roles]: further limits of a component, or of a person or agent that acts through it."""
+
+    region: RegionSection | None = None
+    actions: tuple[str, ...] | None = None
+    parameters: dict[str, tuple[Quantity, Quantity]] | None = None
+    per_hour: dict[str, WholeNumber] | None = None
+
+
+_OWN: Final = (*LimitsSection.model_fields, "actions", "roles")
 
 
 @dataclass(frozen=True)
@@ -106,6 +121,7 @@ class LimitsReader:
             region_source=str(self.document.place("limits", "region")),
             most_pixels=whole.most_pixels,
             sets={name: one for name, one in self.sets.items() if one},
+            roles=self._roles(table.get("roles", {})),
         )
         self._check_sizes(limits)
         return limits
@@ -161,6 +177,50 @@ class LimitsReader:
         given = self._table(table, path, _OF_ACTION)
         return None if given is None else self._limit(given, path, None)
 
+    def _roles(self, table: object) -> dict[str, RoleLimits]:
+        if not isinstance(table, Mapping):
+            self.document.error("[limits] roles is not a table", "limits", "roles")
+            return {}
+        return {name: self._role(name, one) for name, one in table.items()}
+
+    def _role(self, name: str, table: object) -> RoleLimits:
+        path = ("limits", "roles", name)
+        if component_of(name) not in self.components:
+            what, near = f"[limits.roles] there is no component {component_of(name)!r}", component_of(name)
+            self.document.error(what, *path, hint=nearest(near, self.components))
+        plain = dict(table) if isinstance(table, Mapping) else {}
+        given = parse(RoleSection, ".".join(path), plain, self.document)
+        ranges = {one: self._range(one, pair, path) for one, pair in (given.parameters or {}).items()}
+        for action in (*(given.actions or ()), *(given.per_hour or ())):
+            if action not in self._known_actions and (self.actions is not None or not action.startswith("x-")):
+                what = f"[{'.'.join(path)}] there is no action {action!r}"
+                self.document.error(what, *path, hint=nearest(action, self._known_actions))
+        source = str(self.document.place(*path))
+        return RoleLimits(
+            ExperimentLimits(
+                parameters={one: limit for one, limit in ranges.items() if limit is not None},
+                region=None if given.region is None else self._region(given.region, path),
+                region_source=source,
+            ),
+            given.parameters is not None,
+            given.actions,
+            given.per_hour or {},
+            source,
+        )
+
+    def _range(self, name: str, pair: tuple[Quantity, Quantity], path: tuple[str, ...]) -> Limit | None:
+        place = (*path, "parameters", name)
+        if name not in self.parameters:
+            what = f"[{'.'.join(path)}] there is no parameter {name!r}"
+            self.document.error(what, *place, hint=nearest(name, self.parameters))
+            return None
+        given = dict(zip(("min", "max"), pair, strict=True))
+        unit = self.parameters.get(name) or _unit_given(given, si_unit) or ""
+        low, high = (self._in(value, key, unit, place) for key, value in given.items())
+        if low is not None and high is not None and low > high:
+            self.document.error(f"{name_of(place)}: the first value is above the second", *place)
+        return Limit(low, high, unit=unit, source=str(self.document.place(*place)))
+
     def _table(self, table: object, path: tuple[str, ...], known: Collection[str]) -> Table | None:
         if not isinstance(table, Mapping):
             self.document.error(f"{name_of(path)} is a table of keys and values, not {table!r}", *path)
@@ -199,18 +259,18 @@ class LimitsReader:
             return None
         return number
 
-    def _region(self, box: RegionSection) -> Region | None:
-        path = ("limits", "region")
+    def _region(self, box: RegionSection, owner: tuple[str, ...] = ("limits",)) -> Region | None:
+        path = (*owner, "region")
         match box.x, box.y, box.center, box.size:
             case (left, right), (low, high), None, None:
                 center, size = ((left + right) / 2, (low + high) / 2), (right - left, high - low)
             case None, None, (_, _) as center, (_, _) as size:
                 pass
             case _:
-                self.document.error("[limits] region needs either x and y, or center and size", *path)
+                self.document.error(f"{name_of(path)} needs either x and y, or center and size", *path)
                 return None
         if min(size) <= 0:
-            self.document.error("[limits] region is empty", *path, hint="from the smaller to the larger value")
+            self.document.error(f"{name_of(path)} is empty", *path, hint="from the smaller to the larger value")
             return None
         return Region(center, size, box.angle)
 

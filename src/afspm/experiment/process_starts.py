@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 
 DASHBOARD = "dashboard"
+TERMINAL = "terminal"
+"""The name of commands such as `afspm approve`."""
 """Name under which `afspm dashboard` joins a run."""
 DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
 """Environment variable that only dashboards get."""
@@ -286,6 +288,11 @@ def _for_scheduler(resolved: ResolvedExperiment) -> Settings:
         operators = resolved.declaring("operates")
         operate = operators if DASHBOARD in resolved.processes else [*operators, DASHBOARD]
         control = replace(control, roles=replace(control.roles, operate=tuple(operate)))
+    if control.agents is None:
+        control = replace(control, agents=tuple(resolved.declaring("needs_approval")))
+    if control.roles.approve is None:
+        approve = (*(control.roles.operate or ()), TERMINAL)
+        control = replace(control, roles=replace(control.roles, approve=approve))
     sections = {
         "control": to_plain(control),
         "limits": to_plain(resolved.limits),

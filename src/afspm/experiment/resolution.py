@@ -27,7 +27,7 @@ from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedPro
 from afspm.experiment.sections import parse, read_sections
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.wiring_classes import BoundSocket
-from afspm.model import PacketHeader, Parameter, ProblemNames, Role
+from afspm.model import HIGHEST_PROBLEM, STOPPED_BY_AGENT, PacketHeader, Parameter, ProblemNames, Role
 from afspm.scheduler.publishing.envelopes import CacheSettings, Envelopes
 
 _STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
@@ -127,6 +127,8 @@ def _resolve_sections(resolved: ResolvedExperiment) -> None:
         sets={} if has is None else has.sets,
         certain=has is not None,
     )
+    if resolved.declaring("needs_approval") or resolved.sections.control.agents:
+        resolved.named_problems.setdefault(STOPPED_BY_AGENT, HIGHEST_PROBLEM)
     resolved.limits = reader.read(parts.sections.get("limits", {}))
     resolved.conditions = conditions_section.ConditionsReader(
         document, resolved.instruments, reader.actions, resolved.problems

@@ -35,6 +35,7 @@ from afspm.model.events import (
     is_process_name,
 )
 from afspm.model.geometry import Frame, Region, RegionChange
+from afspm.model.grants import Approval, Approvals, Grant, GrantedCount, GrantedRange, GrantedStep, Proposal
 from afspm.model.instruments import (
     InstrumentOrder,
     InstrumentOrders,
@@ -44,10 +45,11 @@ from afspm.model.instruments import (
     instrument_of,
 )
 from afspm.model.packet import LoggedPacket, Packet, PacketHeader
-from afspm.model.problems import Problem, ProblemNames
+from afspm.model.problems import HIGHEST_PROBLEM, STOPPED_BY_AGENT, Problem, ProblemNames
 from afspm.model.registration_outcome import RegistrationOutcome, registration_summary
 from afspm.model.requests import (
     CLOCK_REQUEST,
+    GRANT_REQUEST,
     HAS_ENDED,
     LEASE_REQUEST,
     LONGEST_LEASE_S,
@@ -78,13 +80,18 @@ from afspm.model.state import (
 
 __all__ = [
     "CLOCK_REQUEST",
+    "GRANT_REQUEST",
     "HAS_ENDED",
+    "HIGHEST_PROBLEM",
     "LEASE_REQUEST",
     "LONGEST_LEASE_S",
     "OTHER_RUN_RESPONSE",
     "RELAY_REQUEST",
     "RESTART_REQUEST",
+    "STOPPED_BY_AGENT",
     "WAIT_FOR_CONTROL",
+    "Approval",
+    "Approvals",
     "ControlEvent",
     "ControlMode",
     "ControlRequest",
@@ -92,6 +99,10 @@ __all__ = [
     "ControlState",
     "Feedback",
     "Frame",
+    "Grant",
+    "GrantedCount",
+    "GrantedRange",
+    "GrantedStep",
     "HasTime",
     "InstrumentOrder",
     "InstrumentOrders",
@@ -116,6 +127,7 @@ __all__ = [
     "ProcessState",
     "ProcessStates",
     "Progress",
+    "Proposal",
     "Region",
     "RegionChange",
     "RegistrationOutcome",

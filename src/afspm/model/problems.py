@@ -9,6 +9,8 @@ from enum import IntEnum
 from afspm.basics.errors import InvalidValue
 
 HIGHEST_PROBLEM = 255  # one byte on the wire
+STOPPED_BY_AGENT = "stopped-by-agent"
+"""The problem that the tool `stop` of an agent flags; an experiment with an agent has it, with the highest number."""
 
 
 class Problem(IntEnum):

@@ -39,11 +39,20 @@ LEASE_REQUEST = 104
 """Request of the holder to lose control after a time without another command or lease request, also while a scan is
 running; the subject is this time in real seconds. An extension of afspm."""
 LONGEST_LEASE_S = 86_400.0
+GRANT_REQUEST = 105
+"""Request of a person to approve a plan of an agent, to give it a grant, or to revoke its approvals; the subject is a
+Grant. An extension of afspm."""
 
 OTHER_RUN_RESPONSE = 100
 """Response to a component that named another run than the scheduler's; an extension of afspm."""
 
-_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "RELAY", RESTART_REQUEST: "RESTART", LEASE_REQUEST: "LEASE"}
+_OURS = {
+    CLOCK_REQUEST: "CLOCK",
+    RELAY_REQUEST: "RELAY",
+    RESTART_REQUEST: "RESTART",
+    LEASE_REQUEST: "LEASE",
+    GRANT_REQUEST: "GRANT",
+}
 
 
 def request_name(kind: int) -> str:

@@ -13,6 +13,7 @@ from afspm import wire
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import WireError
 from afspm.model import (
+    Approvals,
     ControlEvent,
     ControlMode,
     ControlRequest,
@@ -31,6 +32,7 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
+    Proposal,
     RescanKind,
     Scan,
     ScanLines,
@@ -67,6 +69,7 @@ __all__ = [
 ]
 
 MOST_LINES = 2_000
+MOST_PROPOSALS = 200
 MOST_ENTRIES = 5_000
 OLD_S = 6.0  # real time; a supervisor reports its processes every 2 s
 OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
@@ -130,6 +133,8 @@ class Overview:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control: the newest; None before the first.
         processes, progress_reports: the newest of each, by name.
+        proposals: of agents, by id, newest last, bounded.
+        approvals: of persons, in force.
         log, notes, entries, refusals: newest last, bounded.
     """
 
@@ -142,6 +147,8 @@ class Overview:
         self.processes: dict[str, ProcessState] = {}
         self.instruments: dict[str, ReadingCurve] = {}
         self.progress_reports: dict[str, Progress] = {}
+        self.proposals: dict[str, Proposal] = {}
+        self.approvals = Approvals()
         self.log: deque[LogLine] = deque(maxlen=MOST_LINES)
         self.notes: deque[Note] = deque(maxlen=most_entries)
         self.entries: deque[JournalEntry] = deque(maxlen=most_entries)
@@ -293,6 +300,15 @@ class Overview:
             curve = self.instruments.setdefault(one.name, ReadingCurve())
             curve.unit = one.unit or curve.unit
             curve.add(time_ns, one.value if one.value is not None and one.is_number else math.nan)
+
+    def _on_proposal(self, proposal: Proposal, time_ns: int) -> None:
+        self.proposals.pop(proposal.id, None)
+        self.proposals[proposal.id] = proposal
+        while len(self.proposals) > MOST_PROPOSALS:
+            del self.proposals[next(iter(self.proposals))]
+
+    def _on_approvals(self, approvals: Approvals, time_ns: int) -> None:
+        self.approvals = approvals
 
     def _on_control(self, control: ControlState, time_ns: int) -> None:
         self.control = control

@@ -10,6 +10,7 @@ from afspm.model.idempotency_cache import SentAction
 from afspm.model.microscope_status import TipRisk
 from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.publishing.event_log import SentStart
+from afspm.scheduler.safety.grants import GrantBook
 from afspm.scheduler.safety.limit_state import LimitState
 from afspm.scheduler.safety.watchdog import RetractState
 
@@ -58,6 +59,7 @@ class SavedState:
     frame: object = None
     instrument_units: Mapping[str, str] = field(default_factory=dict)
     instrument_orders: int = 0
+    grants: GrantBook = field(default_factory=GrantBook)
 
     def without_holder(self) -> SavedState:
         """Return the state with no holder: an older state does not know the present one."""

@@ -58,7 +58,7 @@ from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.publishing import packet_intake
 from afspm.scheduler.publishing.cache import TIME_STEP_NS, PacketCache
 from afspm.scheduler.publishing.event_log import SCHEDULER, SentStart, start_entry, unreadable_entry
-from afspm.scheduler.requests import answers, instrument_requests, request_pipeline
+from afspm.scheduler.requests import answers, approvals, instrument_requests, request_pipeline
 from afspm.scheduler.requests.forwarder import AskForFrame
 from afspm.scheduler.safety import safety_commands
 from afspm.scheduler.saved_state import SavedState
@@ -81,6 +81,7 @@ def step(
     request_pipeline.send_next(draft)
     if draft.control is not state.control:
         _dispatch(draft, ControlChanged(state.control, draft.control))
+    approvals.publish_changes(draft)
     _end_when_safe(draft)
     return draft.finish()
 

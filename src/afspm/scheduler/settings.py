@@ -56,6 +56,7 @@ class ControlSettings:
         solved_by_hand: problems that a person solves: a component may flag them though no component solves them.
         end_on: problems that end the experiment as soon as they are flagged, such as `["tip-shape-changed"]` where no
             component repairs the tip.
+        agents: components whose commands need the approval of a person; without the key: those of the class `Agent`.
         roles: see below.
     """
 
@@ -72,6 +73,7 @@ class ControlSettings:
     idle: Literal["end", "stay"] = "end"
     solved_by_hand: tuple[str, ...] = ("device-malfunction",)
     end_on: tuple[str, ...] = ()
+    agents: tuple[str, ...] | None = None
     roles: RoleTable = field(default_factory=RoleTable)
 
     __pydantic_config__: ClassVar[object] = SECTION
@@ -85,7 +87,14 @@ class ControlSettings:
         roles, end = self.roles, self.roles.end_experiment
         if end is not None:  # a supervisor ends the experiment when no component that can act is left
             roles = replace(roles, end_experiment=(*end, SUPERVISOR))
-        return Rules(roles, problems, frozenset(self.adjustable), frozenset(map(problems.number, self.end_on)))
+        return Rules(
+            roles,
+            problems,
+            frozenset(self.adjustable),
+            frozenset(map(problems.number, self.end_on)),
+            frozenset(self.agents or ()),
+            frozenset(problems[name] for name in self.solved_by_hand if name in problems),
+        )
 
     def watchdog(self) -> WatchdogSettings:
         default = WatchdogSettings()

@@ -21,6 +21,7 @@ from afspm.scheduler.publishing.cache import PacketCache
 from afspm.scheduler.publishing.event_log import EventLog
 from afspm.scheduler.requests.forwarder import Forwarder
 from afspm.scheduler.requests.pending_requests import PendingRequests
+from afspm.scheduler.safety.grants import GrantChecker
 from afspm.scheduler.safety.limit_checker import LimitChecker
 from afspm.scheduler.safety.watchdog import Watchdog
 from afspm.scheduler.saved_state import SavedState
@@ -71,6 +72,7 @@ class SchedulerState:
     by_hand: HandSettings
     logged: frozenset[str]
     frame: CoordinateFrame
+    grants: GrantChecker
 
     @classmethod
     def initial(cls, settings: SchedulerSettings, frame: CoordinateFrame = TIP_FRAME) -> SchedulerState:
@@ -92,6 +94,7 @@ class SchedulerState:
             by_hand=HandSettings(),
             logged=frozenset(),
             frame=frame,
+            grants=GrantChecker(settings.rules, settings.limits, settings.run.name),
         )
 
     def saved_parts(self) -> tuple[object, ...]:
@@ -99,6 +102,7 @@ class SchedulerState:
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
         return (
             *saved,
+            self.grants.book,
             self.limits.state.usage,
             self.idempotency.sent_actions,
             self.event_log.starts,
@@ -151,6 +155,7 @@ class StateParts:
     by_hand: HandSettings
     logged: frozenset[str]
     frame: CoordinateFrame
+    grants: GrantChecker
 
 
 _PARTS = tuple(one.name for one in fields(SchedulerState))
@@ -163,6 +168,7 @@ class StateDraft(StateParts):
         now_s: real and monotonic, for timeouts.
         now_ns: of the experiment, for everything that has a meaning in it.
         raised: inputs raised by this step; the frame processes them within it.
+        before: the state before this step.
     """
 
     def __init__(self, state: SchedulerState, env: Environment, now_s: float, now_ns: int) -> None:
@@ -172,7 +178,7 @@ class StateDraft(StateParts):
         self.now_ns = now_ns
         self.effects: list[Effect] = []
         self.raised: list[FrameAnswered] = []
-        self._before = state
+        self.before = state
         self._is_to_be_saved = False
 
     def save(self) -> None:
@@ -191,8 +197,8 @@ class StateDraft(StateParts):
         """Return the new state and the effects: saving comes first, requests to the translator come last."""
         self.send_forwards()
         parts = self.__dict__
-        state = replace(self._before, **{name: parts[name] for name in _PARTS})
-        if self._is_to_be_saved or state.saved_parts() != self._before.saved_parts():
+        state = replace(self.before, **{name: parts[name] for name in _PARTS})
+        if self._is_to_be_saved or state.saved_parts() != self.before.saved_parts():
             self.effects.insert(0, SaveState(saved_state(state, self.env)))
         return state, self.effects
 
@@ -216,6 +222,7 @@ def saved_state(state: SchedulerState, env: Environment) -> SavedState:
         frame=state.frame.saved(),
         instrument_units=state.instruments.units,
         instrument_orders=state.instruments.number,
+        grants=state.grants.book,
     )
 
 
@@ -242,4 +249,5 @@ def restored_state(
         watchdog=state.watchdog.restored(saved.tip),
         microscope=replace(state.microscope, risk=saved.tip_risk),
         instruments=replace(state.instruments, units=saved.instrument_units, number=saved.instrument_orders),
+        grants=replace(state.grants, book=saved.grants),
     )

@@ -13,6 +13,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm.basics.errors import AfspmError, InvalidValue, WireError
 from afspm.model import (
     CLOCK_REQUEST,
+    GRANT_REQUEST,
     LEASE_REQUEST,
     LONGEST_LEASE_S,
     RELAY_REQUEST,
@@ -29,7 +30,7 @@ from afspm.model import (
 from afspm.wire import unit_conversion
 from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
-from afspm.wire.mapping import FEEDBACK, PARAMETER, RELAYED, known, time_ns, timestamp
+from afspm.wire.mapping import FEEDBACK, GRANT, PARAMETER, RELAYED, known, time_ns, timestamp
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer
 
@@ -252,5 +253,6 @@ _SUBJECTS: dict[int, Callable[[bytes], object]] = {
     RELAY_REQUEST: RELAYED.decode,
     RESTART_REQUEST: _action,
     LEASE_REQUEST: _seconds,
+    GRANT_REQUEST: GRANT.decode,
     ControlRequest.ACTION_SUPPORT: _action,
 }

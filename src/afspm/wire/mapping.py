@@ -16,7 +16,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from afspm import model
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import InvalidValue
-from afspm.wire.generated import control_pb2, feedback_pb2, instruments_pb2, journal_pb2
+from afspm.wire.generated import control_pb2, feedback_pb2, grants_pb2, instruments_pb2, journal_pb2
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer
 
@@ -259,7 +259,32 @@ RELAYED = MessageMapping(
 INSTRUMENT_ORDERS = MessageMapping(
     model.InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER)
 )
+_COUNT = MessageMapping(model.GrantedCount, grants_pb2.GrantedCount, "action", "count")
+GRANT = MessageMapping(
+    model.Grant,
+    grants_pb2.Grant,
+    *("plan", "run", "limits"),
+    agent=FieldMapping("agent", from_wire=_needed("an agent")),
+    steps=_each("steps", MessageMapping(model.GrantedStep, grants_pb2.GrantedStep, "request", "payload")),
+    region_m=FieldMapping("region", from_wire=tuple),
+    ranges=_each("ranges", MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")),
+    counts=_each("counts", _COUNT),
+    lasts_s="lasts",
+    since_ns=_time("since"),
+    offset_m=FieldMapping("offset", from_wire=tuple),
+    drift_m="drift",
+)
+_APPROVAL = MessageMapping(
+    model.Approval,
+    grants_pb2.Approval,
+    *("agent", "plan", "by", "steps_left"),
+    until_ns=_time("until"),
+    left=_each("left", _COUNT),
+)
 MAPPINGS: tuple[MessageMapping[Any], ...] = (
+    GRANT,
+    MessageMapping(model.Approvals, grants_pb2.Approvals, approvals=_each("approvals", _APPROVAL)),
+    MessageMapping(model.Proposal, grants_pb2.Proposal, "who", "id", "plan", "preflight", time_ns=_time()),
     FEEDBACK,
     SCOPE_STATUS,
     CONTROL_STATE,

@@ -32,6 +32,7 @@ from afspm.wire.generated import (
     drift_pb2,
     feedback_pb2,
     geometry_pb2,
+    grants_pb2,
     instruments_pb2,
     journal_pb2,
     lines_pb2,
@@ -222,6 +223,20 @@ INSTRUMENT_READINGS: Final = MessageDeclaration(
     event="readings",
     in_past=True,
 )
+APPROVALS: Final = MessageDeclaration(
+    type=grants_pb2.Approvals,
+    kind=MessageKind.EVENT,
+    source=Role.SCHEDULER,
+    event="approvals",
+)
+PROPOSAL: Final = MessageDeclaration(
+    type=grants_pb2.Proposal,
+    kind=MessageKind.EVENT,
+    source=Role.SCHEDULER,
+    history=100,
+    event="proposal",
+    in_past=True,
+)
 DRIFT_MAPPING: Final = MessageDeclaration(
     type=DriftMapping,
     kind=MessageKind.RESULT,
@@ -253,7 +268,7 @@ TIP_VERDICT: Final = MessageDeclaration(
 )
 
 _MODULES = (
-    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, instruments_pb2,
+    analysis_pb2, control_pb2, drift_pb2, feedback_pb2, geometry_pb2, grants_pb2, instruments_pb2,
     journal_pb2, lines_pb2, scan_pb2, spectroscopy_pb2,
 )  # fmt: skip
 # collected by their class, so that no declaration above can be forgotten

@@ -22,6 +22,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "keep_scanning": ('[series]\nduration = "15 min"\npixels = [16, 16]\n', 1, 0),
     "scan_list": ('[list]\nevery = "5 min"\npixels = [16, 8]\n', 6, 0),
     "sweep": ("[sweep]\npixels = [16, 16]\n[sweep.parameters]\nscan-speed = [8e-6]\n", 9, 0),
+    "agent": ("", 1, 1),
     "region_grid": ("[grid]\ncounts = [2, 2]\npixels = [16, 16]\n", 4, 0),
     "adaptive_map": ("[map.until]\nspectra = 12\n", 0, 12),
     "spectroscopy_grid": ("[curves]\ncounts = [2, 2]\n", 0, 4),

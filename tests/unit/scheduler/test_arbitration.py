@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afspm.model import ControlMode, ControlResponse, ProblemNames
+from afspm.model import STOPPED_BY_AGENT, ControlMode, ControlResponse, ProblemNames
 from afspm.model.snapshot import from_plain, to_plain
 from afspm.scheduler.control.arbitration import (
     OTHERWISE,
@@ -69,7 +69,8 @@ def test_each_event_has_a_last_row_that_always_applies() -> None:
 def test_every_row_can_apply() -> None:
     roles = RoleTable(end_experiment=("boss",), set_mode=("boss",), clear_problems=("boss",), operate=("boss",))
     met = set()
-    for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP}))):
+    stopping = Rules(problems=ProblemNames({STOPPED_BY_AGENT: 99}), agents=frozenset({"a"}))
+    for rules in (RULES, Rules(roles), Rules(end_on=frozenset({TIP})), stopping):
         for control in _states():
             for event in ArbitrationEvent:
                 for who in ("a", "b", "boss"):
@@ -310,7 +311,7 @@ def test_the_diagram_is_drawn_from_the_table() -> None:
 
 def _states() -> list[ArbitrationState]:
     states = [ArbitrationState(ended=True)]
-    for flagged in ({}, {1: "a"}, {1: "a", 2: "b"}):
+    for flagged in ({}, {1: "a"}, {1: "a", 2: "b"}, {99: "a"}):
         problems = MappingProxyType(flagged)
         states += [ArbitrationState(m, None, 0, problems) for m in (ControlMode.MANUAL, ControlMode.AUTOMATED)]
         states += [ArbitrationState(ControlMode.AUTOMATED, "a", solving, problems) for solving in (flagged or {0: ""})]

@@ -139,6 +139,10 @@ class PersonCommands:
         with self._watch.reading() as overview:
             return overview.status is not None and overview.status.state is ScopeState.SPEC
 
+    def request(self, kind: int, subject: object = None) -> Response:
+        """Send a request that has no method here."""
+        return self._ask(kind, subject)
+
     # --- within ---
 
     def _ask(self, kind: int, subject: object = None, request_id: str = "") -> Response:

@@ -14,7 +14,15 @@ from typing import ClassVar
 
 from afspm.basics.frozen import replace
 from afspm.basics.plain_data import SECTION
-from afspm.model import ControlMode, ControlResponse, ControlState, Problem, ProblemNames, component_of
+from afspm.model import (
+    STOPPED_BY_AGENT,
+    ControlMode,
+    ControlResponse,
+    ControlState,
+    Problem,
+    ProblemNames,
+    component_of,
+)
 
 _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
@@ -33,6 +41,7 @@ class ArbitrationEvent(Enum):
     READ = "asks the microscope for a value"
     DEAD = "is dead"
     IDLE = "has let its lease run out"
+    REVOKED = "has lost its approval"
 
 
 class ControlChange(Enum):
@@ -59,6 +68,8 @@ class Cause(Enum):
     MANUAL = "manual"
     DEAD = "dead"
     IDLE = "idle"
+    REVOKED = "revoked"
+    STOPPED = "stopped"
     ENDED = "ended"
 
     @property
@@ -74,6 +85,8 @@ _CAUSE_TEXTS = {
     Cause.MANUAL: "the mode changed to MANUAL",
     Cause.DEAD: "its process died",
     Cause.IDLE: "it did nothing for longer than its lease",
+    Cause.REVOKED: "its approval ended",
+    Cause.STOPPED: "an agent called stop",
     Cause.ENDED: "the experiment ended",
 }
 
@@ -121,6 +134,9 @@ class RoleTable:
         operate: command the microscope in MANUAL mode, and set an `adjustable` parameter. Without the key: the
             dashboard, and other components through which a person commands the microscope.
         restart: restart a process.
+        approve: approve plans of agents, give grants, revoke both, and clear `stopped-by-agent`. No agent has this
+            role. Without the key: the dashboard and other components through which a person commands the microscope,
+            and `afspm approve` on this computer.
     """
 
     end_experiment: tuple[str, ...] | None = None
@@ -128,6 +144,7 @@ class RoleTable:
     clear_problems: tuple[str, ...] | None = None
     operate: tuple[str, ...] | None = None
     restart: tuple[str, ...] | None = None
+    approve: tuple[str, ...] | None = None
 
     __pydantic_config__: ClassVar[object] = SECTION
 
@@ -140,12 +157,29 @@ class Rules:
         problems: the problems declared for this experiment.
         adjustable: parameters that a person may set while a component is in control.
         end_on: problems that end the experiment.
+        agents: components whose commands need the approval of a person.
+        by_hand: problems that a person solves.
     """
 
     roles: RoleTable = RoleTable()
     problems: ProblemNames = field(default_factory=ProblemNames)
     adjustable: frozenset[str] = frozenset()
     end_on: frozenset[int] = frozenset()
+    agents: frozenset[str] = frozenset()
+    by_hand: frozenset[int] = frozenset()
+
+    @property
+    def stop(self) -> int:
+        """The number of the problem `stopped-by-agent`; 0 where the experiment has no agent."""
+        return self.problems.get(STOPPED_BY_AGENT, 0)
+
+    def is_agent(self, who: str) -> bool:
+        """Return whether `who` acts only with the approval of a person."""
+        return component_of(who) in self.agents
+
+    def may_approve(self, who: str) -> bool:
+        """Return whether `who` may approve plans and grants."""
+        return not self.is_agent(who) and may(self.roles.approve or (), who)
 
 
 @dataclass(frozen=True)
@@ -242,6 +276,15 @@ NO_SUCH_MODE = Condition(
     "neither manual nor automated", lambda c, a, r: a.number not in (ControlMode.MANUAL, ControlMode.AUTOMATED)
 )
 SAME_MODE = Condition("that is the mode", lambda c, a, r: a.number == c.mode)
+IS_STOPPED = Condition("stopped-by-agent is flagged", lambda c, a, r: bool(r.stop) and r.stop in c.problems)
+STOPS = Condition(
+    "it is stopped-by-agent and the mode is automated",
+    lambda c, a, r: bool(r.stop) and a.number == r.stop and c.mode is ControlMode.AUTOMATED,
+)
+STOP_NEEDS_A_PERSON = Condition(
+    "it is stopped-by-agent, and the asker does not have the role `approve`",
+    lambda c, a, r: bool(r.stop) and a.number == r.stop and not r.may_approve(a.who),
+)
 TO_MANUAL = Condition("to manual", lambda c, a, r: a.number == ControlMode.MANUAL)
 
 _R, _D = ControlResponse, ControlChange
@@ -262,6 +305,11 @@ def _without_answer(when: Condition, do: tuple[ControlChange, ...], why: str, ca
 TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ArbitrationEvent.REQUEST_CONTROL: (
         _refuse(IS_MANUAL, _R.WRONG_CONTROL_MODE, "the mode is MANUAL: a person is in control"),
+        _refuse(
+            IS_STOPPED,
+            _R.WRONG_EXP_PROBLEM,
+            "an agent has stopped the experiment; a person looks at it, and clears stopped-by-agent",
+        ),
         _refuse(SOLVES_UNFLAGGED, _R.WRONG_EXP_PROBLEM, "{problem} is not flagged; flagged: {problems}"),
         _refuse(
             SOLVES_OTHER_THAN_MALFUNCTION,
@@ -285,6 +333,7 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
         _accept(IS_FLAGGED, (), "it is flagged already: two components may notice the same"),
         _accept(ENDS_EXPERIMENT, (_D.FLAG, _D.END), "the experiment ends instead of waiting for a solver"),
+        _accept(STOPS, (_D.FLAG, _D.TAKE), "until a person has cleared it, no component is in control", Cause.STOPPED),
         _accept(
             HOLDER_SOLVES_NOTHING,
             (_D.FLAG, _D.TAKE),
@@ -302,6 +351,11 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ArbitrationEvent.CLEAR: (
         _refuse(UNKNOWN_PROBLEM, _R.WRONG_EXP_PROBLEM, "this experiment knows no problem with the number {number}"),
         _accept(NOT_FLAGGED, (), "nothing to clear: classifier and corrector may both clear"),
+        _refuse(
+            STOP_NEEDS_A_PERSON,
+            _R.FAILURE,
+            "{problem} is cleared by a person with the role approve ([control.roles]), not by {who}",
+        ),
         _refuse(
             MAY_NOT_CLEAR,
             _R.FAILURE,
@@ -356,6 +410,10 @@ TABLE: dict[ArbitrationEvent, tuple[Transition, ...]] = {
     ),
     ArbitrationEvent.IDLE: (
         _without_answer(ASKER_HOLDS, (_D.TAKE,), "an idle component must not block the others", Cause.IDLE),
+        _without_answer(OTHERWISE, (), "it was not in control"),
+    ),
+    ArbitrationEvent.REVOKED: (
+        _without_answer(ASKER_HOLDS, (_D.TAKE,), "an agent without an approval does not keep control", Cause.REVOKED),
         _without_answer(OTHERWISE, (), "it was not in control"),
     ),
 }

@@ -25,6 +25,7 @@ from afspm.scheduler.publishing.event_log import control_entries
 from afspm.scheduler.publishing.own_packets import publish_control
 from afspm.scheduler.requests import answers
 from afspm.scheduler.safety import safety_commands
+from afspm.scheduler.safety.grants import AGENT_LEASE_S
 from afspm.scheduler.state import StateDraft
 
 TRANSLATOR = "translator"
@@ -105,10 +106,14 @@ def answer_unless_ending(
 def _carry_out(draft: StateDraft, change: _Change) -> None:
     # all of it precedes the answer to the request that caused the change
     before, after = change.before, change.after
-    problems = draft.env.settings.rules.problems
+    rules = draft.env.settings.rules
+    problems = rules.problems
+    draft.grants = draft.grants.control_changed(before, after, rules.by_hand, draft.now_ns)
     entries = control_entries(draft.now_ns, before, after, change.ask, change.row, problems)
     draft.event_log = draft.event_log.add(draft.now_s, *entries)
     draft.lease = draft.lease.held_by(after.holder, draft.now_ns)
+    if after.holder is not None and after.holder != before.holder and rules.is_agent(after.holder):
+        draft.lease = draft.lease.asked(AGENT_LEASE_S, draft.now_s)  # also for a client that requests no lease
     _log_change(draft, change, _alert_watchdog(draft, change))
     if after.ended:
         answers.call_back(draft, None, Cause.ENDED)
@@ -128,7 +133,7 @@ def _alert_watchdog(draft: StateDraft, change: _Change) -> list[str]:
         # a cleared malfunction means that the tip is well: it may be at the surface, where it can be in danger again
         draft.watchdog = draft.watchdog.seen_to()
         draft.microscope = draft.microscope.with_tip(away=False)
-    if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED)):
+    if cause is None or (former is None and cause not in (Cause.MANUAL, Cause.ENDED, Cause.STOPPED)):
         return []
     flight = draft.forwarder.flight
     feedback = None if flight is None else feedback_of(flight.request)

@@ -7,14 +7,24 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from afspm.basics.formatting import PREFIXABLE, area_text, lengths_text, position_text, quantity, unit_text
+from afspm.basics.formatting import (
+    PREFIXABLE,
+    area_text,
+    duration_text,
+    lengths_text,
+    position_text,
+    quantity,
+    unit_text,
+)
 from afspm.basics.frozen import replace
 from afspm.model import (
+    GRANT_REQUEST,
     LEASE_REQUEST,
     RESTART_REQUEST,
     ControlMode,
     ControlRequest,
     Feedback,
+    Grant,
     Parameter,
     PositionChange,
     ProbePosition,
@@ -71,7 +81,7 @@ def _ended_control(holder: str, cause: Cause) -> str:
     match cause:
         case Cause.RELEASED:
             return f"{holder} gave control back"
-        case Cause.DEAD | Cause.IDLE:
+        case Cause.DEAD | Cause.IDLE | Cause.REVOKED:
             return f"{holder} lost control: {cause.text}"
         case _:
             return f"{holder} lost control"
@@ -183,6 +193,15 @@ def _mode(subject: Any, problems: ProblemNames) -> str:
     return f"sets the mode {name}"
 
 
+def _grant(grant: Grant) -> str:
+    if grant.revokes:
+        return f"revokes all approvals of {grant.agent}"
+    if grant.plan:
+        return f"approves the plan {grant.plan} of {grant.agent}"
+    counts = ", ".join(f"{one.count} × {one.action}" for one in grant.counts)
+    return f"grants {grant.agent} {counts or 'no action'} for {duration_text(grant.lasts_s)}"
+
+
 _WORDS: dict[int, Callable[[Any, ProblemNames], str]] = {
     int(ControlRequest.ACTION): lambda subject, problems: str(subject),
     int(ControlRequest.PARAM): _parameter,
@@ -196,6 +215,7 @@ _WORDS: dict[int, Callable[[Any, ProblemNames], str]] = {
     int(ControlRequest.SET_CONTROL_MODE): _mode,
     int(ControlRequest.END_EXPERIMENT): lambda subject, problems: "ends the experiment",
     int(ControlRequest.ACTION_SUPPORT): lambda subject, problems: f"asks whether there is {subject}",
+    GRANT_REQUEST: lambda subject, problems: _grant(subject),
     LEASE_REQUEST: lambda subject, problems: f"keeps control for {subject:g} s",
     RESTART_REQUEST: lambda subject, problems: f"restart {subject}",
 }

@@ -16,6 +16,7 @@ from afspm.model import (
     ProcessState,
     ProcessStates,
     Progress,
+    Proposal,
     RelayedMessage,
     component_of,
     is_process_name,
@@ -163,6 +164,9 @@ def announcement(event: RequestIn, codec: Codec) -> Announcement:
         mine = thing.name in (event.name, component_of(event.name))
         return _named(told.message, thing.name) if mine else Announcement("", f"{event.name} is not {thing.name}")
     if isinstance(thing, Note) and told.message == "Note":
+        mine = thing.who == event.name
+        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if isinstance(thing, Proposal) and told.message == "Proposal":
         mine = thing.who == event.name
         return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
     if isinstance(thing, MeasurementSettings) and told.message == "MeasurementSettings":

@@ -64,7 +64,8 @@ def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status:
 
 
 def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Return what a request has used of its limits."""
+    """Return what a request has used of its limits and of its approval."""
+    draft.grants = draft.grants.not_done(job.client, job.request)
     mapped = job.mapped
     draft.limits = draft.limits.not_done(job.client, job.outgoing, None if mapped is None else mapped.names)
 

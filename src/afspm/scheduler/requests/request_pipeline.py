@@ -27,6 +27,7 @@ import json
 from afspm.basics.frozen import replace
 from afspm.model import (
     CLOCK_REQUEST,
+    GRANT_REQUEST,
     HAS_ENDED,
     LEASE_REQUEST,
     OTHER_RUN_RESPONSE,
@@ -52,7 +53,7 @@ from afspm.scheduler.coordinate_frame import MappedRequest
 from afspm.scheduler.events import FrameAnswered, Reply, RequestIn
 from afspm.scheduler.publishing import own_packets as publishing
 from afspm.scheduler.publishing.event_log import SCHEDULER
-from afspm.scheduler.requests import answers, instrument_requests
+from afspm.scheduler.requests import answers, approvals, instrument_requests
 from afspm.scheduler.requests.forwarder import (
     AskForFrame,
     ForwardedRequest,
@@ -166,6 +167,9 @@ def _unknown(request: Request, why: str) -> Response:
 def authorise(draft: StateDraft, event: RequestIn) -> bool:
     """Return whether to forward a request to the translator; if not, it was answered."""
     kind, subject = event.request.kind, event.request.subject
+    if why := draft.grants.refused_at_arrival(event.name, event.request, draft.now_ns):
+        answers.answer(draft, event, ControlResponse.FAILURE, why)
+        return False
     if (report := instrument_requests.report_in(draft, event)) is not None and not draft.control.ended:
         instrument_requests.take_report(draft, event, report, _not_allowed_now)
     elif kind == RELAY_REQUEST:  # also after the end: final process states belong in the record
@@ -182,6 +186,8 @@ def authorise(draft: StateDraft, event: RequestIn) -> bool:
         _answer_clock_request(draft, event)
     elif kind == LEASE_REQUEST:
         _renew_lease(draft, event)
+    elif kind == GRANT_REQUEST:
+        approvals.decide(draft, event)
     elif kind <= 0:
         why = f"there is no request with the number {kind}"
         answers.answer(draft, event, ControlResponse.CMD_NOT_SUPPORTED, why)
@@ -214,7 +220,13 @@ def _renew_lease(draft: StateDraft, event: RequestIn) -> None:
 
 def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
     run = draft.env.settings.run
-    common = {"run": run.name, "simulated": run.simulated, "now_ns": draft.now_ns, "in_use": _reason_to_stay(draft)}
+    common = {
+        "run": run.name,
+        "simulated": run.simulated,
+        "now_ns": draft.now_ns,
+        "in_use": _reason_to_stay(draft),
+        **approvals.facts(draft),
+    }
     told = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
     response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
@@ -295,6 +307,9 @@ def _decide(draft: StateDraft, job: ForwardedRequest) -> None:
     mapped = _mapped(draft, job)
     if isinstance(mapped, Response) or not _is_within_limits(draft, job, mapped):
         return
+    if why := approvals.refused(draft, job):
+        _refuse(draft, job, Response(int(ControlResponse.PARAM_ERROR), b"", why, job.request.id))
+        return
     if job.request.kind == _ACTION:
         if turn.move is None and _starts_move(draft, job, turn):
             return
@@ -315,6 +330,7 @@ def _send(draft: StateDraft, job: ForwardedRequest, mapped: MappedRequest | None
     draft.event_log = draft.event_log.sending(name, request, sent_ns)
     if job.command:
         draft.limits = draft.limits.sending(name, job.outgoing, draft.now_ns, _names_meant(job))
+        approvals.sending(draft, job)
         draft.pending = replace(draft.pending, turn=None)
         _restart_lease(draft, name)
     draft.forwarder = draft.forwarder.sent(job, draft.now_s)
@@ -399,6 +415,7 @@ def _is_within_limits(draft: StateDraft, job: ForwardedRequest, mapped: MappedRe
 
 def _starts_reads(draft: StateDraft, job: ForwardedRequest, turn: Turn) -> bool:
     needed = draft.limits.depends_on(job.request, is_mapped=draft.frame.maps(draft.now_ns))
+    needed = list(dict.fromkeys((*needed, *draft.grants.depends_on(job.client, job.request))))
     if not needed:
         return False
     draft.pending = replace(draft.pending, turn=turn.reading(frozenset(needed)))
@@ -568,6 +585,7 @@ def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response)
         draft.microscope = draft.microscope.with_feedback(feedback)
     if job.command:
         _restart_lease(draft, job.client)
+        approvals.done(draft, job)
         if draft.control.mode is ControlMode.MANUAL:
             draft.by_hand = draft.by_hand.requested(request)
     return response

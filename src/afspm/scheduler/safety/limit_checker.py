@@ -117,7 +117,7 @@ class LimitChecker:
         Args:
             is_mapped: a mapped place is sent as a whole, even if the client set only a part of it.
         """
-        given = self._names_set_by(request)
+        given = self.names_set_by(request)
         needed = [name for name in given if name in self.limits.bounded]
         if self.limits.region is not None or is_mapped:
             action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
@@ -149,7 +149,7 @@ class LimitChecker:
 
     def unknown(self, request: Request) -> LimitChecker:
         """Forget the values that a request of unknown outcome may have changed."""
-        given = self._names_set_by(request)
+        given = self.names_set_by(request)
         usage = self.state.usage
         for name in given:
             usage = usage.forget(name)
@@ -167,7 +167,7 @@ class LimitChecker:
         usage = self.state.usage
         for name in self._counted_uses(request, used):
             usage = usage.use_sent(name, LastUse(now_ns, who, request.id))
-        for name in self.limits.rated.intersection(self._names_set_by(request)) if self.limits.rated else ():
+        for name in self.limits.rated.intersection(self.names_set_by(request)) if self.limits.rated else ():
             usage = usage.changing(name)
         return self._with_usage(usage)
 
@@ -180,7 +180,7 @@ class LimitChecker:
         usage = self.state.usage
         for name in self._counted_uses(request, used):
             usage = usage.use_undone(name, who, request.id)
-        for name in self._names_set_by(request):
+        for name in self.names_set_by(request):
             usage = usage.unchanged(name)
         return self._with_usage(usage)
 
@@ -247,13 +247,13 @@ class LimitChecker:
         counted = self.limits.counted
         if not counted:
             return []
-        uses = [name for name in self._names_set_by(request) if used is None or name in used]
+        uses = [name for name in self.names_set_by(request) if used is None or name in used]
         if request.kind == ControlRequest.ACTION:
             uses.append(str(request.subject))
         return [name for name in uses if name in counted]
 
-    def _names_set_by(self, request: Request) -> list[str]:
-        # malformed values have no name: `check` refuses such a request
+    def names_set_by(self, request: Request) -> list[str]:
+        """Return the parameters that a request sets. Malformed values have no name: `check` refuses such a request."""
         values = [value for subject in self._set_by(request) for value in self._valid_values(subject)]
         return list(dict.fromkeys(value.name for value in values))
 

@@ -56,6 +56,25 @@ class Limit:
 
 
 @dataclass(frozen=True)
+class RoleLimits:
+    """Further limits of one component, of persons and agents that act through it, or of one of these.
+
+    Attributes:
+        limits: ranges, and the region, which is in the coordinates of components.
+        parameters_only: whether all other parameters are refused.
+        actions: all others are refused; None: no action is.
+        per_hour: the largest number of uses within an hour of experiment time, by action.
+        source: where it was set.
+    """
+
+    limits: ExperimentLimits
+    parameters_only: bool = False
+    actions: tuple[str, ...] | None = None
+    per_hour: Mapping[str, int] = field(default_factory=dict)
+    source: str = "[limits.roles]"
+
+
+@dataclass(frozen=True)
 class ExperimentLimits:
     """All limits of an experiment.
 
@@ -67,6 +86,7 @@ class ExperimentLimits:
         region_source: where the region was set.
         most_pixels: of a scan.
         sets: by name of an action, the parameters that the microscope sets at once as that action.
+        roles: further limits by name of a component, or of a person or agent: "agent", "agent:claude".
     """
 
     parameters: Mapping[str, Limit] = field(default_factory=dict)
@@ -75,6 +95,7 @@ class ExperimentLimits:
     region_source: str = "[limits] region"
     most_pixels: int = 8192 * 8192
     sets: Mapping[str, tuple[Parameter, ...]] = field(default_factory=dict)
+    roles: Mapping[str, RoleLimits] = field(default_factory=dict)
 
     @cached_property
     def bounded(self) -> frozenset[str]:

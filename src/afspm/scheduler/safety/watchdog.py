@@ -15,7 +15,7 @@ from afspm.model import ControlResponse, ScopeState, names
 from afspm.model.microscope_status import FEEDBACK_OFF, STARTS, STOPS, MicroscopeStatus
 from afspm.scheduler.control.arbitration import Cause
 
-_DEFAULT_STOPS = frozenset({Cause.PROBLEM, Cause.MANUAL, Cause.DEAD, Cause.IDLE})
+_DEFAULT_STOPS = frozenset(set(Cause) - {Cause.RELEASED, Cause.SOLVED, Cause.ENDED})
 _SOON_S = 1.0
 
 

@@ -13,7 +13,7 @@ from afspm.basics.errors import AfspmError, UnitError
 from afspm.basics.formatting import counted, quantity, typeset_position
 from afspm.basics.units import parse_quantity
 from afspm.client.parameter_text import from_parameter
-from afspm.model import ControlMode, ControlResponse, Region, Response, names
+from afspm.model import GRANT_REQUEST, ControlMode, ControlResponse, Grant, Region, Response, names
 from afspm.model.geometry import XY
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.person_commands import PersonCommands
@@ -75,6 +75,11 @@ class Actions:
             if not (result := self.clear(problem)).ok:
                 return result
         return ActionResult(f"Cleared {counted(len(problems), 'problem')}")
+
+    def approve(self, grant: Grant) -> ActionResult:
+        """Approve a plan of an agent, or revoke its approvals."""
+        done = "are revoked" if grant.revokes else f"include {grant.plan}"
+        return _result(self._commands.request(GRANT_REQUEST, grant), f"The approvals of {grant.agent} {done}")
 
     def restart(self, process: str) -> ActionResult:
         return _result(self._commands.restart(process), f"{process} is being restarted")

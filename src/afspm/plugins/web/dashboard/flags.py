@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from afspm.model import ControlMode, ControlState, Problem
+from afspm.model import STOPPED_BY_AGENT, ControlMode, ControlState, Problem
 from afspm.record.overview import ROUTINE, Overview
 
 _ADVICE = {
@@ -34,14 +34,16 @@ def flags(overview: Overview) -> Iterator[Flag]:
     for number in control.problems if control else ():
         now = overview.timelines.problems[number].now if number in overview.timelines.problems else None
         name, by, since_ns = overview.problems.name(number), now.by if now else "", now.start_ns if now else None
-        advice = f"{ROUTINE}." if overview.is_routine(now) else advice_for(number, control) if control else ""
+        advice = f"{ROUTINE}." if overview.is_routine(now) else advice_for(number, control, name) if control else ""
         yield Flag(number, name, by, since_ns, advice)
 
 
-def advice_for(problem: int, control: ControlState) -> str:
+def advice_for(problem: int, control: ControlState, name: str = "") -> str:
     """Return the advice for a person about a flagged problem."""
     if control.holder:  # while problems are flagged, only a component that solves one gets control
         return f"{control.holder} is in control to solve it: wait, or take over."
+    if name == STOPPED_BY_AGENT:
+        return "An agent has stopped the experiment: look at the microscope, then clear the problem."
     known = _ADVICE.get(Problem(problem), _OTHER) if problem in Problem._value2member_map_ else _OTHER
     if control.mode is ControlMode.MANUAL:
         return known[0].upper() + known[1:]

@@ -15,6 +15,7 @@ from nicegui import ui
 from afspm.model.line_levelling import Levelling
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.dashboard.actions import Steering
+from afspm.plugins.web.dashboard.approvals import ApprovalBar
 from afspm.plugins.web.dashboard.conditions import Conditions
 from afspm.plugins.web.dashboard.content import Content, Contents
 from afspm.plugins.web.dashboard.panels import ChartPanel, HealthPanel, LogPanel, NotesPanel, SpectraPanel
@@ -100,6 +101,7 @@ class Page:
                 button.props('flat round dense aria-label="Light or dark"')
                 self._sign_in_or_out()
         self._problems = ProblemBar(self._session)
+        self._approvals = ApprovalBar(self._session)
         ui.html('<div id="trouble" role="alert" hidden></div>', sanitize=False)
 
     def _sign_in_or_out(self) -> None:
@@ -124,6 +126,7 @@ class Page:
         self._status.set_content(content.status)
         self._mode.show()
         self._problems.show()
+        self._approvals.show()
         await self._sections.show(content)
         state = self._state(content)
         try:

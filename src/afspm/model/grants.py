@@ -1,0 +1,154 @@
+"""Approvals of persons for agents: one plan, or a grant within which an agent measures by itself."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from afspm.basics.errors import InvalidValue
+from afspm.model.geometry import XY, Region
+
+MOST_STEPS = 1000
+MOST_COUNT = 10_000
+LONGEST_GRANT_S = 7 * 86_400.0
+LONGEST_PROPOSAL = 60_000
+"""Characters of a plan or of a preflight."""
+
+
+@dataclass(frozen=True, slots=True)
+class GrantedStep:
+    """One request of an approved plan, exactly as it will be sent.
+
+    Attributes:
+        request: the number of a ControlRequest.
+    """
+
+    request: int
+    payload: bytes = b""
+
+
+@dataclass(frozen=True, slots=True)
+class GrantedRange:
+    """A parameter that may be set, and its lowest and highest value, in SI."""
+
+    parameter: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class GrantedCount:
+    """An action, and how often it may be used."""
+
+    action: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """A person's approval of one plan, or a grant, for one agent.
+
+    Attributes:
+        agent: "component:name".
+        plan: the id of the approved plan; empty: a grant.
+        steps: all requests of the plan, in order.
+        region_m: of a grant: x and y of the centre, width, height; empty: no place may be set.
+        ranges, counts: of a grant: the parameters and actions allowed; all others are refused.
+        lasts_s: experiment time; 0: all approvals of the agent end.
+        run: the run that it is valid for.
+        limits: digest of the limits that the plan was checked against.
+        since_ns: the time of that check. A flagged problem, or MANUAL, since then makes the approval stale.
+        offset_m: the microscope's coordinates of the components' origin at that check.
+        drift_m: largest change of the offset; empty offset: not checked.
+
+    Raises:
+        InvalidValue: a number out of range.
+    """
+
+    agent: str
+    plan: str = ""
+    steps: tuple[GrantedStep, ...] = ()
+    region_m: tuple[float, ...] = ()
+    ranges: tuple[GrantedRange, ...] = ()
+    counts: tuple[GrantedCount, ...] = ()
+    lasts_s: float = 0.0
+    run: str = ""
+    limits: str = ""
+    since_ns: int = 0
+    offset_m: tuple[float, ...] = ()
+    drift_m: float = 0.0
+
+    def __post_init__(self) -> None:
+        numbers = (*self.region_m, *self.offset_m, self.lasts_s, self.drift_m)
+        if not all(map(math.isfinite, numbers)) or not 0.0 <= self.lasts_s <= LONGEST_GRANT_S or self.drift_m < 0.0:
+            raise InvalidValue(f"a grant with the numbers {numbers}", hint=f"finite; at most {LONGEST_GRANT_S:g} s")
+        if len(self.region_m) not in (0, 4) or len(self.offset_m) not in (0, 2) or min(self.region_m[2:] or (1,)) <= 0:
+            raise InvalidValue(f"a grant for the region {self.region_m}", hint="x, y, width and height in m")
+        if len(self.steps) > MOST_STEPS:
+            raise InvalidValue(f"a plan of {len(self.steps)} requests", hint=f"at most {MOST_STEPS}")
+        if bool(self.plan) != bool(self.steps):
+            raise InvalidValue("an approved plan has an id and steps, a grant has neither")
+        for one in self.ranges:
+            if not (math.isfinite(one.low) and math.isfinite(one.high) and one.low <= one.high):
+                raise InvalidValue(f"a grant for {one.parameter} from {one.low} to {one.high}")
+        for each in self.counts:
+            if not 0 <= each.count <= MOST_COUNT:
+                raise InvalidValue(f"a grant for {each.count} times {each.action}", hint=f"at most {MOST_COUNT}")
+
+    @property
+    def region(self) -> Region | None:
+        if not self.region_m:
+            return None
+        x, y, width, height = self.region_m
+        return Region((x, y), (width, height))
+
+    @property
+    def origin_m(self) -> XY | None:
+        return (self.offset_m[0], self.offset_m[1]) if self.offset_m else None
+
+    @property
+    def revokes(self) -> bool:
+        return self.lasts_s == 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Approval:
+    """An approval in force.
+
+    Attributes:
+        plan: empty: a grant.
+        by: the person who approved.
+        left: of a grant: the actions still allowed.
+    """
+
+    agent: str
+    plan: str
+    by: str
+    until_ns: int
+    steps_left: int = 0
+    left: tuple[GrantedCount, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Approvals:
+    """All approvals in force."""
+
+    approvals: tuple[Approval, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A plan that an agent proposes, frozen.
+
+    Attributes:
+        who: "component:name".
+        id: the hash of the plan.
+        plan: JSON in its canonical form.
+        preflight: JSON; empty: there was none.
+    """
+
+    time_ns: int
+    who: str
+    id: str
+    plan: str
+    preflight: str = ""

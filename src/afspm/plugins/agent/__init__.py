@@ -1,0 +1,14 @@
+"""An agent takes part in an experiment by the Model Context Protocol, within what a person has approved.
+
+Theory of operation
+-------------------
+
+    comes in      calls of thirteen tools (`tools`), over HTTP behind the guard of the gateway, or in memory
+    state         frozen plans with their preflights, and runs with their progress (`workplace`)
+    goes out      requests to the scheduler under the agent's name "agent:NAME"; proposals for persons
+    always holds  nothing here decides what an agent may do: the scheduler keeps the approvals, and checks each request
+                  right before it is sent (`scheduler.safety.grants`). No text from outside is read as anything but text
+
+`plan` is pure: a plan, its canonical form, its id, and the exact requests that a person approves. `twin` is the
+simulated run of a plan, in a process of its own. `commands` holds `afspm approve`, the decision of a person.
+"""

@@ -1,0 +1,52 @@
+"""`Agent`: the component that lets agents take part in an experiment by the Model Context Protocol."""
+
+from __future__ import annotations
+
+from afspm.model import Frame
+from afspm.plugins.web.gateway.gateway import MOST_REQUESTS, Gateway
+from afspm.plugins.web.watch import Bell
+from afspm.record.run_json import experiment_name
+
+
+class Agent(Gateway):
+    """Serves thirteen tools at `/mcp`: an agent looks, proposes plans, measures what a person has approved, and stops.
+
+    An agent acts as `<component>:<name>`. The scheduler keeps its approvals and checks each of its requests; nothing
+    in this process, or in the client of a model, can allow more. Settings are those of the Gateway.
+    """
+
+    served = "agent server"
+    usual_port = 8091
+    requires = ("afspm[agent]",)
+    needs_approval = True
+
+    def on_start(self) -> None:
+        # imported here: a file is checked also where the extra `agent` is not installed
+        from afspm.plugins.agent.preflight import Preflight
+        from afspm.plugins.agent.serving import application
+        from afspm.plugins.agent.tools import AgentTools
+        from afspm.plugins.agent.workplace import Workplace
+        from afspm.plugins.web.gateway.measurements import Measurements
+        from afspm.plugins.web.persons import Persons
+
+        launch = self._context.launch
+        bound = self.open_port()
+        archive, watch = self.watch_run()
+        self._watch = watch
+        bell = Bell()
+        watch.on_change(bell.ring)
+        self._persons = Persons(launch, self.clock, watch)
+        self._place = Workplace(
+            watch, bell, archive, Measurements(self.state_file("measurements.json"), watch, self.clock.monotonic_s),
+            self._persons, Frame.SAMPLE if launch.sample_coordinates else Frame.TIP,
+            experiment=experiment_name(self.run_dir, "afspm"), simulated=self.simulated, run_dir=self.run_dir,
+            file=self.state_file("runs.json"),
+        )  # fmt: skip
+        tools = AgentTools(self._place, Preflight())
+        app = application(tools, self._passwords, host=self._host, origins=self._origins)
+        self.serve(app, bound, most_requests=MOST_REQUESTS)
+
+    def on_message(self, envelope: str, message: object) -> None:
+        time_ns = self.packet_time_ns()
+        self._place.take(message, time_ns)
+        self._watch.take(envelope.partition("_")[0], message, time_ns, envelope)  # last: it wakes waiting calls

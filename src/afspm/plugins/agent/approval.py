@@ -1,0 +1,109 @@
+"""What a person sends to approve a plan, to give a grant, or to revoke both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from afspm.basics.errors import InvalidValue
+from afspm.basics.plain_data import Plain
+from afspm.basics.units import si
+from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, names
+from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
+
+PLAN_LASTS_S = 3600.0
+DRIFT_PART = 0.1
+"""Part of the smallest scan as the largest drift of the sample between preflight and scan."""
+DRIFT_M = 10e-9
+"""The same for plans without a scan."""
+_FIELDS = ("agent", "for", "region", "parameters", "counts")
+
+
+def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:
+    """Return the approval of a proposed plan, and the plan.
+
+    Raises:
+        InvalidValue: the proposal has no preflight, or its id is not the hash of its plan.
+    """
+    plan = plan_of(proposal.plan)
+    if plan.id != proposal.id:
+        raise InvalidValue(f"the plan of {proposal.id} has another hash: {plan.id}")
+    if not proposal.preflight:
+        raise InvalidValue(f"{proposal.id} has no preflight", hint="the agent calls the tool preflight first")
+    sizes = [min(step.size_m) for step in plan.steps if isinstance(step, ScanStep)]
+    steps = tuple(one.step for one in plan.requests(frame))
+    grant = Grant(
+        proposal.who, plan.id, steps, lasts_s=PLAN_LASTS_S, drift_m=min(sizes) * DRIFT_PART if sizes else DRIFT_M
+    )
+    return fresh(grant, json.loads(proposal.preflight).get("facts") or {}), plan
+
+
+def of_table(table: Mapping[str, object], facts: Plain) -> Grant:
+    """Return a grant from a table of a TOML file.
+
+    Args:
+        facts: as of `Scope.approval_facts`.
+
+    Raises:
+        InvalidValue, UnitError: a field is unknown or missing, or a quantity can't be used.
+    """
+    unknown, missing = [key for key in table if key not in _FIELDS], [one for one in _FIELDS[:2] if one not in table]
+    if unknown or missing:
+        raise InvalidValue(
+            f"unknown: {', '.join(unknown)}" if unknown else f"missing: {', '.join(missing)}",
+            where="grant",
+            hint=f"fields: {', '.join(_FIELDS)}",
+        )
+    ranges = []
+    for name, pair in _table(table, "parameters").items():
+        low, high = (si(one, names.BASE_PARAMETERS.get(name) or "") for one in _pair(pair, name))
+        ranges.append(GrantedRange(name, low, high))
+    counts = []
+    for action, count in _table(table, "counts").items():
+        if isinstance(count, bool) or not isinstance(count, int):
+            raise InvalidValue(f"{action}: {count!r} is not a whole number", where="grant, counts")
+        counts.append(GrantedCount(action, count))
+    region = _table(table, "region")
+    region_m: tuple[float, ...] = ()
+    if region:
+        if set(region) != {"x", "y"}:
+            raise InvalidValue("a region has x and y", where="grant, region")
+        (left, right), (low, high) = (tuple(si(one, "m") for one in _pair(region[axis], axis)) for axis in "xy")
+        region_m = ((left + right) / 2, (low + high) / 2, right - left, high - low)
+    lasts = table["for"]
+    if not isinstance(lasts, str):
+        raise InvalidValue('`for` is a time with its unit, as in "2 h"', where="grant, for")
+    grant = Grant(
+        str(table["agent"]), region_m=region_m, ranges=tuple(ranges), counts=tuple(counts), lasts_s=si(lasts, "s")
+    )
+    if grant.revokes:
+        raise InvalidValue("a grant lasts longer than no time", where="grant, for")
+    return fresh(replace(grant, drift_m=0.0), facts)
+
+
+def fresh(grant: Grant, facts: Plain) -> Grant:
+    """Return an approval that is valid for these facts: run, limits, coordinates and the time of the check."""
+    offset_m = facts.get("offset_m")
+    return replace(
+        grant,
+        run=str(facts.get("run") or ""),
+        limits=str(facts.get("limits") or ""),
+        since_ns=int(facts.get("now_ns") or 0),
+        offset_m=() if offset_m is None else tuple(map(float, offset_m)),
+    )
+
+
+def _table(table: Mapping[str, object], key: str) -> Mapping[str, object]:
+    found = table.get(key, {})
+    if not isinstance(found, Mapping):
+        raise InvalidValue(f"{key} is not a table", where="grant")
+    return found
+
+
+def _pair(value: object, where: str) -> tuple[str, str]:
+    if not isinstance(value, Sequence) or isinstance(value, str) or len(value) != 2:
+        raise InvalidValue("two quantities are needed, from the lower to the higher", where=f"grant, {where}")
+    if not all(isinstance(one, str) for one in value):
+        raise InvalidValue("quantities are text with their units", where=f"grant, {where}")
+    return (value[0], value[1])

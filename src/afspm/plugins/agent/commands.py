@@ -1,0 +1,131 @@
+"""`afspm approve`: a person decides about the plans of agents. `afspm agent`: the server over stdin and stdout."""
+
+from __future__ import annotations
+
+import json
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from afspm.cli.arguments import MEANWHILE, RUNS, Where
+from afspm.cli.joining import acting, looking
+
+if TYPE_CHECKING:
+    from afspm.model import Grant, Proposal
+
+NAME_VARIABLE = "AFSPM_AGENT"
+"""Environment variable with name and token of an agent: NAME:TOKEN."""
+
+approve_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
+agent_app = typer.Typer(add_completion=False, rich_markup_mode="markdown", rich_help_panel=MEANWHILE)
+
+
+@approve_app.command()
+def approve(
+    proposal: Annotated[str, typer.Argument(help="The id of a proposal; without one, all are listed.")] = "",
+    where: Where = RUNS,
+    grant: Annotated[
+        Path | None, typer.Option(help="Give the grant in this TOML file.", exists=True, dir_okay=False)
+    ] = None,
+    revoke: Annotated[str, typer.Option(metavar="AGENT", help="End all approvals of an agent.")] = "",
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
+) -> None:
+    """Approve a plan that an agent proposes, give an agent a grant, or revoke both.
+
+    Before it asks, it shows every request that the agent may then send. The scheduler holds the agent to them, and to
+    the limits of the experiment. An approval ends with MANUAL, after an hour, or with `--revoke`.
+    """
+    from afspm.basics.errors import InvalidValue
+    from afspm.model import Grant
+    from afspm.plugins.agent.approval import of_table
+
+    if revoke:
+        with acting(where) as scope:
+            scope.approve(Grant(revoke))
+        typer.echo(f"all approvals of {revoke} have ended")
+        return
+    if grant is not None:
+        with acting(where) as scope:
+            wanted = of_table(tomllib.loads(grant.read_text(encoding="utf-8")), scope.approval_facts())
+            typer.echo("\n".join(grant_lines(wanted)))
+            _confirm(yes)
+            scope.approve(wanted)
+        typer.echo(f"{wanted.agent} has the grant")
+        return
+    proposals, frame = _proposals(where)
+    if not proposal:
+        for one in proposals:
+            state = "has a preflight" if one.preflight else "has no preflight"
+            typer.echo(f"{one.id}  {one.who}  {state}  {_title(one)}")
+        return
+    found = next((one for one in proposals if one.id == proposal), None)
+    if found is None:
+        raise InvalidValue(f"there is no proposal {proposal}", hint="`afspm approve` lists them")
+    _approve(where, found, sample=frame, yes=yes)
+
+
+@agent_app.command()
+def agent(url: Annotated[str, typer.Argument(help="Of the agent server, as its log line says it.")]) -> None:
+    """Serve the tools of a running experiment over stdin and stdout, for clients that start their server themselves.
+
+    Name and token of the agent are in the environment: AFSPM_AGENT=NAME:TOKEN.
+    """
+    import asyncio
+
+    from afspm.plugins.agent.bridge import serve
+
+    asyncio.run(serve(url, os.environ.get(NAME_VARIABLE, "")))
+
+
+def grant_lines(grant: Grant) -> list[str]:
+    """Return a grant in words."""
+    from afspm.basics.formatting import area_text, duration_text, position_text, quantity
+    from afspm.model.names import BASE_PARAMETERS
+
+    region = grant.region
+    where = "no place" if region is None else f"{area_text(region.size_m)} at {position_text(region.center_m)}"
+    lines = [f"{grant.agent}, for {duration_text(grant.lasts_s)}", f"  place: {where}"]
+    for one in grant.ranges:
+        unit = BASE_PARAMETERS.get(one.parameter) or ""
+        lines.append(f"  {one.parameter}: {quantity(one.low, unit)} to {quantity(one.high, unit)}")
+    lines += [f"  {each.action}: {each.count} times" for each in grant.counts]
+    return [*lines, "  nothing else"]
+
+
+def _approve(where: Path, proposal: Proposal, *, sample: bool, yes: bool) -> None:
+    from afspm.model import Frame
+    from afspm.plugins.agent.approval import of_plan
+    from afspm.plugins.agent.untrusted import escaped
+
+    frame = Frame.SAMPLE if sample else Frame.TIP
+    grant, plan = of_plan(proposal, frame)
+    preflight = json.loads(proposal.preflight)
+    typer.echo(f"{proposal.who} proposes, in its own words: {_title(proposal)}")
+    for number, request in enumerate(plan.requests(frame), 1):
+        typer.echo(f"  {number}. {escaped(request.text)}")
+    typer.echo(f"simulated: {preflight.get('seconds')} s, harm {preflight.get('harm')}")
+    for reason in preflight.get("refusals") or ():
+        typer.echo(f"  the limits will refuse {escaped(reason)}")
+    _confirm(yes)
+    with acting(where) as scope:
+        scope.approve(grant)
+    typer.echo(f"{proposal.id} is approved, for one run within an hour")
+
+
+def _proposals(where: Path) -> tuple[list[Proposal], bool]:
+    with looking(where) as follower:
+        return list(follower.overview.proposals.values()), follower.launch.sample_coordinates
+
+
+def _title(proposal: Proposal) -> str:
+    from afspm.plugins.agent.untrusted import escaped
+
+    return f'"{escaped(str(json.loads(proposal.plan).get("title", "")))}"'
+
+
+def _confirm(yes: bool) -> None:
+    if not yes:
+        typer.confirm("Approve?", abort=True)

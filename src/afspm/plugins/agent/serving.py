@@ -1,0 +1,23 @@
+"""The server over HTTP, behind the guard of the gateway."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from mcp.server.transport_security import TransportSecuritySettings
+
+from afspm.plugins.agent.tools import AgentTools
+from afspm.plugins.web.asgi import AsgiApp
+from afspm.plugins.web.gateway.guard import GatewayGuard
+from afspm.plugins.web.passwords import Passwords
+
+PATH = "/mcp"
+
+
+def application(tools: AgentTools, passwords: Passwords, *, host: str, origins: Collection[str] = ()) -> AsgiApp:
+    """Return the application. The guard checks name, token, origin and host of each request before it."""
+    # the guard does it for both eras of the protocol, and off loopback as well
+    security = TransportSecuritySettings(enable_dns_rebinding_protection=False)
+    app = tools.server().streamable_http_app(streamable_http_path=PATH, transport_security=security, host=host)
+    guarded: AsgiApp = GatewayGuard(app, passwords, host, origins)
+    return guarded

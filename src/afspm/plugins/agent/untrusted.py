@@ -1,0 +1,25 @@
+"""Text from outside: file names, notes, metadata, messages of controllers. It is data, wherever it comes from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+LONGEST = 200
+MOST = 50
+
+
+def escaped(text: str) -> str:
+    """Return a text cut at `LONGEST` characters, with everything that is not printable escaped."""
+    cut = "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text[:LONGEST])
+    return f"{cut}…" if len(text) > LONGEST else cut
+
+
+def untrusted(texts: Mapping[str, object]) -> dict[str, object]:
+    """Return the field of an answer that holds text from outside; empty texts are left out."""
+    found: dict[str, object] = {}
+    for name, value in texts.items():
+        if isinstance(value, str):
+            found[name] = escaped(value)
+        elif isinstance(value, Sequence):
+            found[name] = [escaped(str(one)) for one in value[:MOST]]
+    return {"untrusted": {name: value for name, value in found.items() if value}} if any(found.values()) else {}

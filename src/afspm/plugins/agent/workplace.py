@@ -1,0 +1,289 @@
+"""Proposals and runs of agents, and their requests to the scheduler, each under the agent's name."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+from afspm import wire
+from afspm.basics.plain_data import Plain
+from afspm.client.targets import Target
+from afspm.model import (
+    CLOCK_REQUEST,
+    RELAY_REQUEST,
+    STOPPED_BY_AGENT,
+    Approvals,
+    ControlResponse,
+    Frame,
+    Proposal,
+    RelayedMessage,
+    Response,
+)
+from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, Step, plan_of
+from afspm.plugins.web.archive import Archive
+from afspm.plugins.web.gateway.measurements import Measurement, Measurements
+from afspm.plugins.web.gateway.models import MeasurementState
+from afspm.plugins.web.gateway.problems import RefusalCode, RefusedRequest, of_error, refused
+from afspm.plugins.web.gateway.services import READER
+from afspm.plugins.web.person_commands import PersonCommands
+from afspm.plugins.web.watch import Bell, Watch
+from afspm.storage.memory import Memory
+from afspm.transport.process.parent import StopRequested
+
+LEASE_S = 30.0
+"""Real: an agent whose process is gone loses control after this time."""
+RENEW_S = 10.0
+STOP_ANSWERED_S = 5.0
+STOP_AGAIN_S = 0.5
+MOST_RUNS = 200
+MOST_PROPOSALS = 200
+STOPPER = " stop"
+"""Ending of the name under which an agent stops: its own connection may be waiting for the microscope."""
+
+T = TypeVar("T")
+_log = logging.getLogger("afspm.plugins.agent")
+
+
+class Requests(Protocol):
+    """Sends requests under names; `web.persons.Persons` does it by the network."""
+
+    def name_of(self, person: str) -> str: ...
+
+    def submit(self, person: str, action: Callable[[PersonCommands], T]) -> Future[T]:
+        """Carry out an action in the thread of a person."""
+
+
+@dataclass
+class Run:
+    """A plan, or one measurement, that was begun.
+
+    Attributes:
+        step: number of the present step, from 1.
+        results: ids of finished scans and spectra.
+        refusal: as a `RefusalModel`, of a failed run.
+    """
+
+    id: str
+    who: str
+    plan: str
+    steps: int
+    state: str = "running"
+    step: int = 0
+    results: list[str] = field(default_factory=list)
+    refusal: dict[str, object] | None = None
+
+
+class Workplace:
+    """What agents share: the experiment as it was published, their proposals, their runs. For one event loop.
+
+    Args:
+        watch, archive: the experiment so far.
+        requests: sends requests.
+        file: keeps runs over a restart of this process; None: they end with it.
+
+    Attributes:
+        approvals: in force, as the scheduler published them last.
+    """
+
+    def __init__(
+        self,
+        watch: Watch,
+        bell: Bell,
+        archive: Archive,
+        measurements: Measurements,
+        requests: Requests,
+        frame: Frame,
+        *,
+        experiment: str,
+        simulated: bool,
+        run_dir: Path,
+        file: Path | None = None,
+    ) -> None:
+        self.watch, self.bell, self.archive, self.measurements = watch, bell, archive, measurements
+        self.requests, self.frame = requests, frame
+        self.experiment, self.simulated, self.run_dir = experiment, simulated, run_dir
+        self.approvals = Approvals()
+        self.proposals: dict[str, Proposal] = {}
+        self._memory = Memory(file)
+        self.runs: dict[str, Run] = {}
+        for facts in self._memory.get("runs", ()):
+            run = Run(**facts)
+            # control has been lost with the process, and an approved plan is for one run
+            run.state = "interrupted" if run.state == "running" else run.state
+            self.runs[run.id] = run
+        self._tasks: dict[str, asyncio.Task[None]] = {}
+
+    # --- published messages: from the component's thread ---
+
+    def take(self, thing: object, time_ns: int) -> None:
+        """Process a published message."""
+        self.measurements.on_packet(thing, time_ns)
+        if isinstance(thing, Approvals):
+            self.approvals = thing
+        elif isinstance(thing, Proposal):
+            known = dict(self.proposals)  # replaced: the event loop reads it meanwhile
+            known[thing.id] = thing
+            while len(known) > MOST_PROPOSALS:
+                del known[next(iter(known))]
+            self.proposals = known
+
+    # --- requests ---
+
+    async def do(self, person: str, action: Callable[[PersonCommands], T]) -> T:
+        """Carry out an action under a name. Raises RefusedRequest."""
+        try:
+            # shielded: a client that disconnects does not cancel its request to the scheduler
+            future = self.requests.submit(person, action)
+            return await asyncio.shield(asyncio.wrap_future(future))
+        except (
+            Exception,
+            StopRequested,
+        ) as error:  # any error becomes a refusal; StopRequested: the experiment ended meanwhile
+            raise of_error(error) from error
+
+    async def ask(self, person: str, action: Callable[[PersonCommands], Response]) -> Response:
+        """Carry out a request to the scheduler. Raises RefusedRequest if it is unsuccessful."""
+        response = await self.do(person, action)
+        if not response.ok:
+            raise refused(response)
+        return response
+
+    async def facts(self) -> Plain:
+        """Return the facts that a preflight is made for: run, limits, offset of the coordinates, time."""
+        response = await self.ask(READER, lambda commands: commands.request(CLOCK_REQUEST))
+        found: Plain = json.loads(response.payload)
+        return {name: found.get(name) for name in ("run", "limits", "offset_m", "now_ns")}
+
+    # --- proposals ---
+
+    def proposal(self, id_: str) -> tuple[Proposal, Plan]:
+        """Return a proposal and its plan. Raises RefusedRequest: there is none."""
+        found = self.proposals.get(id_)
+        if found is None:
+            raise RefusedRequest(RefusalCode.NOT_FOUND, f"there is no proposal {id_}")
+        return found, plan_of(found.plan)
+
+    async def publish(self, person: str, plan: Plan, preflight: str = "") -> Proposal:
+        """Publish a proposal, for persons and for the record."""
+        now_ns = self.watch.clock.now_ns()
+        proposal = Proposal(now_ns, self.requests.name_of(person), plan.id, plan.canonical(), preflight)
+        relayed = RelayedMessage(*wire.encode(proposal))
+        await self.ask(person, lambda commands: commands.request(RELAY_REQUEST, relayed))
+        self.take(proposal, now_ns)
+        return proposal
+
+    # --- runs ---
+
+    def begin(self, person: str, plan: Plan, *, proposal: str) -> Run:
+        """Begin to carry out a plan; returns at once. Raises RefusedRequest: another run of this agent goes on."""
+        who = self.requests.name_of(person)
+        if any(one.who == who and one.state == "running" for one in self.runs.values()):
+            raise RefusedRequest(RefusalCode.NOT_FREE, "a run of yours goes on; wait for its end, or stop")
+        number = max((int(one) for one in self.runs), default=0) + 1
+        run = Run(str(number), who, proposal, len(plan.steps))
+        self.runs[run.id] = run
+        self._save()
+        self._tasks[run.id] = asyncio.ensure_future(self._carry_out(person, run, plan))
+        self._tasks[run.id].add_done_callback(lambda _: self._tasks.pop(run.id, None))
+        return run
+
+    async def stop(self, person: str) -> bool:
+        """Flag `stopped-by-agent`; return whether the scheduler has accepted it already, else it is tried again."""
+        for run in self.runs.values():
+            if run.who == self.requests.name_of(person) and (task := self._tasks.get(run.id)) is not None:
+                task.cancel()
+        flagging = asyncio.ensure_future(self._flag(f"{person}{STOPPER}"))
+        self._tasks[f"stop {person}"] = flagging
+        flagging.add_done_callback(lambda _: self._tasks.pop(f"stop {person}", None))
+        await asyncio.wait({flagging}, timeout=STOP_ANSWERED_S)
+        return flagging.done()
+
+    async def _flag(self, person: str) -> None:
+        number = self.watch.problems.number(STOPPED_BY_AGENT)
+        while True:
+            try:
+                response = await self.do(person, lambda commands: commands.flag(number))
+                if response.ok:
+                    return
+                why = response.reason
+            except RefusedRequest as error:
+                if error.model.code is RefusalCode.EXPERIMENT_ENDED:
+                    return
+                why = error.model.reason
+            _log.warning("stop of %s is tried again: %s", person, why)
+            await asyncio.sleep(STOP_AGAIN_S)
+
+    async def _carry_out(self, person: str, run: Run, plan: Plan) -> None:
+        try:
+            await self.ask(person, lambda commands: commands.request_control())
+            await self._renew(person)
+            for step in plan.steps:
+                run.step += 1
+                self._save()
+                await self._step(person, run, step)
+            run.state = "done"
+        except RefusedRequest as error:
+            run.state, run.refusal = "failed", error.model.model_dump(mode="json")
+        except asyncio.CancelledError:
+            run.state = "stopped"
+        except Exception as error:  # of this program: the run has failed, and the agent must learn of it
+            _log.exception("a run of %s failed", run.who)
+            run.state, run.refusal = "failed", of_error(error).model.model_dump(mode="json")
+        finally:
+            self._save()
+        try:
+            await self.do(person, lambda commands: commands.release_control())
+        except RefusedRequest as error:  # the lease ends it
+            _log.info("%s could not release control: %s", run.who, error.model.reason)
+
+    async def _step(self, person: str, run: Run, step: Step) -> None:
+        match step:
+            case SetStep():
+                await self.ask(person, lambda commands: commands.set(step.parameter, step.value))
+            case MoveStep():
+                refusal = await self.do(person, lambda commands: commands.prepare_spectrum(step.to_m))
+                if refusal is not None:
+                    raise refused(refusal)
+            case ScanStep() | SpectrumStep():
+                await self._measure(person, run, step.target(self.frame))
+
+    async def _measure(self, person: str, run: Run, target: Target) -> None:
+        key = f"{run.id}-{run.step}"
+        one: Measurement = await self.do(person, self.measurements.take(run.who, key, target))
+        loop = asyncio.get_running_loop()
+        renewed_s = loop.time()
+        while one.state == MeasurementState.RUNNING.value:
+            await self.bell.wait(1.0)
+            if loop.time() - renewed_s >= RENEW_S:
+                await self._renew(person)
+                renewed_s = loop.time()
+            one = self.measurements.find(run.who, key) or one
+        model = one.model()
+        if model.refusal is not None:
+            raise RefusedRequest(model.refusal.code, model.refusal.reason)
+        run.results.append(model.result or "")
+
+    async def _renew(self, person: str) -> None:
+        response = await self.do(person, lambda commands: commands.renew(LEASE_S))
+        if not response.ok and response.code != ControlResponse.NO_RESPONSE:
+            raise refused(response)
+
+    def _save(self) -> None:
+        while len(self.runs) > MOST_RUNS:
+            oldest = next((one for one in self.runs.values() if one.state != "running"), None)
+            if oldest is None:
+                break
+            del self.runs[oldest.id]
+        self._memory["runs"] = [asdict(one) for one in self.runs.values()]
+        self._memory.save(synced=False)
+
+
+def with_preflight(proposal: Proposal, preflight: Plain) -> Proposal:
+    """Return a proposal with the result of its simulated run."""
+    return replace(proposal, preflight=json.dumps(preflight, sort_keys=True))

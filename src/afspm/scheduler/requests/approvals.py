@@ -1,0 +1,78 @@
+"""Approvals of agents in a step of the scheduler: a person's decision, and the requests that are sent under it."""
+
+from __future__ import annotations
+
+import math
+
+from afspm.model import ControlRequest, ControlResponse, ProbePosition, Request
+from afspm.model.geometry import XY
+from afspm.scheduler.control import control_change
+from afspm.scheduler.control.arbitration import ArbitrationEvent, ControlInput
+from afspm.scheduler.coordinate_frame import MappedRequest
+from afspm.scheduler.events import RequestIn
+from afspm.scheduler.publishing.own_packets import publish
+from afspm.scheduler.requests import answers
+from afspm.scheduler.requests.forwarder import ForwardedRequest
+from afspm.scheduler.safety.grants import limits_digest
+from afspm.scheduler.state import StateDraft
+from afspm.wire.messages import APPROVALS
+
+_ORIGIN = Request(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0)))
+
+
+def decide(draft: StateDraft, event: RequestIn) -> None:
+    """Answer a person's approval, or the end of one; an agent without an approval loses control."""
+    grant = event.request.subject
+    draft.grants, why = draft.grants.given(event.name, grant, draft.now_ns, offset_m(draft))
+    if why:
+        answers.answer(draft, event, ControlResponse.FAILURE, why)
+        return
+    draft.log("INFO", f"{event.name} {'revoked the approvals of' if grant.revokes else 'approved'} {grant.agent}")
+    if not draft.grants.has_approval(grant.agent, draft.now_ns):
+        control_change.decide(draft, ControlInput(ArbitrationEvent.REVOKED, grant.agent))
+    answers.answer(draft, event, ControlResponse.SUCCESS)
+
+
+def publish_changes(draft: StateDraft) -> None:
+    """Publish the approvals if this step changed them."""
+    now = draft.grants.book.approvals()
+    if now != draft.before.grants.book.approvals():
+        publish(draft, APPROVALS.name, draft.env.codec.encode(now))
+
+
+def facts(draft: StateDraft) -> dict[str, object]:
+    """Return the facts that a preflight is made for; none where the experiment has no agent."""
+    if not draft.env.settings.rules.agents:
+        return {}
+    offset = offset_m(draft)
+    return {"limits": limits_digest(draft.env.settings.limits), "offset_m": None if offset is None else list(offset)}
+
+
+def offset_m(draft: StateDraft) -> XY | None:
+    """Return the microscope's coordinates of the components' origin; None where both have the same coordinates."""
+    if not draft.frame.maps(draft.now_ns):
+        return None
+    _, mapped = draft.frame.outgoing("", _ORIGIN, draft.now_ns)
+    # NaN where the frame can't map now: then no approval is fresh
+    xy_m = mapped.request.subject.xy_m if isinstance(mapped, MappedRequest) else (math.nan, math.nan)
+    return (float(xy_m[0]), float(xy_m[1]))
+
+
+def refused(draft: StateDraft, job: ForwardedRequest) -> str:
+    """Return the reason why a command lacks an approval or breaks the limits of its role; "" if it may be sent."""
+    until_s = draft.lease.asked_until_s()
+    # a frozen scheduler finds the request and the end of the lease at the same time
+    if draft.env.settings.rules.is_agent(job.client) and until_s is not None and draft.now_s > until_s:
+        return f"the lease of {job.client} has ended"
+    position = draft.limits.state.position
+    return draft.grants.refused(job.client, job.request, draft.now_ns, offset_m(draft), position)
+
+
+def sending(draft: StateDraft, job: ForwardedRequest) -> None:
+    """Spend a command that is about to be sent."""
+    draft.grants = draft.grants.sending(job.client, job.request, draft.now_ns, offset_m(draft))
+
+
+def done(draft: StateDraft, job: ForwardedRequest) -> None:
+    """Store the success of a command."""
+    draft.grants = draft.grants.done(job.client, job.request)

@@ -1,0 +1,504 @@
+"""Approvals of agents: which requests of an agent a person has approved, and which of them are left.
+
+An agent is a component whose commands need the approval of a person (`Rules.agents`). An approval is either of one
+plan, whose requests the agent sends in order and exactly as approved, or a grant: a region, ranges and counts within
+which the agent measures by itself. Both are one more set of limits for that name, beside [limits] and [limits.roles].
+
+    comes in      approvals, and ends of approvals; requests of agents, at arrival and right before they are sent
+    state         `GrantBook`: approvals in force, and the uses of the last hour; saved before a request is sent
+    always holds  a request is spent at most once under its id, and only a request that was certainly not carried out is
+                  returned; without an approval no command of an agent is sent
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from afspm.basics.frozen import replace
+from afspm.model import (
+    CLOCK_REQUEST,
+    LEASE_REQUEST,
+    RELAY_REQUEST,
+    Approval,
+    Approvals,
+    ControlRequest,
+    Grant,
+    GrantedCount,
+    PositionChange,
+    ProbePosition,
+    Region,
+    RegionChange,
+    RelayedMessage,
+    Request,
+    ScanParameters,
+    component_of,
+    names,
+)
+from afspm.model.geometry import XY
+from afspm.model.names import BASE_PARAMETERS
+from afspm.model.positions import PROBE_CHANGES, REGION_CHANGES, SHAPE_CHANGES, KnownPosition
+from afspm.model.snapshot import to_plain
+from afspm.scheduler.control.arbitration import ArbitrationState, Rules
+from afspm.scheduler.safety.limit_checker import LimitChecker, is_get
+from afspm.scheduler.safety.limit_state import LimitState
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
+from afspm.wire.messages import LOG, PROCESSES
+
+AGENT_LEASE_S = 60.0
+"""Lease of an agent that requests none, real."""
+LONGEST_AGENT_LEASE_S = 600.0
+STALE_S = 3600.0
+"""Experiment time after which a preflight is too old to be approved, and an approved plan to be begun."""
+_HOUR_NS = 3600 * 10**9
+_PROBE_M = 5e-9
+"""Controllers round: a probe within this square is where it was set."""
+_STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
+"""These end what the agent began, and need no approval."""
+_PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))
+_OF_SUPERVISORS = frozenset({PROCESSES.name, LOG.name})
+_SET_REGION, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
+_COMMANDS = frozenset(
+    map(
+        int,
+        (
+            ControlRequest.ACTION,
+            ControlRequest.PARAM,
+            ControlRequest.SET_SCAN_PARAMS,
+            ControlRequest.SET_ZCTRL_PARAMS,
+            ControlRequest.SET_PROBE_POS,
+        ),
+    )
+)
+_ALWAYS = frozenset({int(ControlRequest.ACTION_SUPPORT), int(ControlRequest.RELEASE_CTRL), CLOCK_REQUEST})
+
+
+@dataclass(frozen=True)
+class SpentRequest:
+    """A request that was sent under an approval.
+
+    Attributes:
+        plan: the approved plan; empty: a grant, or none was needed.
+        action: the action that it counts as; empty: none.
+    """
+
+    request_id: str
+    request: int
+    payload: bytes
+    at_ns: int
+    plan: str = ""
+    action: str = ""
+
+
+@dataclass(frozen=True)
+class HeldGrant:
+    """An approval in force.
+
+    Attributes:
+        by: the person who approved.
+        step: of a plan: the number of requests sent.
+        used: of a grant: uses by action.
+    """
+
+    grant: Grant
+    by: str
+    given_ns: int
+    step: int = 0
+    used: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def until_ns(self) -> int:
+        return self.given_ns + round(self.grant.lasts_s * 1e9)
+
+    def left(self) -> tuple[GrantedCount, ...]:
+        return tuple(GrantedCount(one.action, one.count - self.used.get(one.action, 0)) for one in self.grant.counts)
+
+
+@dataclass(frozen=True)
+class AgentPlace:
+    """The places that the agent in control has set since it got control."""
+
+    who: str = ""
+    region: Region | None = None
+    probe_m: XY | None = None
+
+    def after(self, who: str, request: Request) -> AgentPlace:
+        """Return the places after a request was carried out."""
+        place = self if self.who == who else AgentPlace(who)
+        match request.subject:
+            case ScanParameters(region=Region() as region):
+                return replace(place, region=region)
+            case ScanParameters(region=RegionChange()):
+                return replace(place, region=None)  # a part of a place: the whole is not known here
+            case ProbePosition(xy_m=xy_m):
+                return replace(place, probe_m=xy_m)
+            case PositionChange():
+                return replace(place, probe_m=None)
+        return place
+
+    def for_action(self, who: str, action: str) -> Region | None:
+        """Return the region in which an action is expected to happen; None: the agent has not set its place."""
+        if self.who != who:
+            return None
+        if action == names.START_SCAN:
+            return self.region
+        return None if self.probe_m is None else Region(self.probe_m, (_PROBE_M, _PROBE_M))
+
+
+@dataclass(frozen=True)
+class GrantBook:
+    """Approvals and their uses; survives a restart.
+
+    Attributes:
+        plans, grants: by agent.
+        spent: by agent, the requests of the last hour, oldest first.
+        placed: see `AgentPlace`.
+        disturbed_ns: when a problem was flagged, or MANUAL set, last.
+    """
+
+    plans: Mapping[str, HeldGrant] = field(default_factory=dict)
+    grants: Mapping[str, HeldGrant] = field(default_factory=dict)
+    spent: Mapping[str, tuple[SpentRequest, ...]] = field(default_factory=dict)
+    placed: AgentPlace = field(default_factory=AgentPlace)
+    disturbed_ns: int = 0
+
+    def approvals(self) -> Approvals:
+        """Return the part that is published."""
+        return Approvals(
+            tuple(
+                Approval(agent, one.grant.plan, one.by, one.until_ns, len(one.grant.steps) - one.step, one.left())
+                for held in (self.plans, self.grants)
+                for agent, one in sorted(held.items())
+            )
+        )
+
+
+def limits_digest(limits: ExperimentLimits) -> str:
+    """Return a short text that changes with any limit."""
+    plain = json.dumps(to_plain(limits, lists=True), sort_keys=True)
+    return hashlib.sha256(plain.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class GrantChecker:
+    """Decides about requests of agents, and about approvals."""
+
+    rules: Rules = field(default_factory=Rules)
+    limits: ExperimentLimits = field(default_factory=ExperimentLimits)
+    run: str = ""
+    book: GrantBook = field(default_factory=GrantBook)
+
+    # --- approvals ---
+
+    def given(self, by: str, grant: Grant, now_ns: int, offset_m: XY | None) -> tuple[GrantChecker, str]:
+        """Take a person's decision. Return also the reason why it is refused, or ""."""
+        if not self.rules.may_approve(by):
+            return self, f"{by} does not have the role approve ([control.roles])"
+        if not self.rules.is_agent(grant.agent):
+            agents = ", ".join(sorted(self.rules.agents)) or "none"
+            return self, f"{grant.agent} is not an agent of this experiment; agents: {agents}"
+        if grant.revokes:
+            return self.without(grant.agent), ""
+        if why := self._stale(grant, now_ns, offset_m):
+            return self, f"the approval is stale: {why}"
+        held = HeldGrant(grant, by, now_ns)
+        if grant.plan:
+            return self._with(plans={**self.book.plans, grant.agent: held}), ""
+        return self._with(grants={**self.book.grants, grant.agent: held}), ""
+
+    def without(self, agent: str) -> GrantChecker:
+        """Remove all approvals of an agent."""
+        return self._with(plans=_less(self.book.plans, agent), grants=_less(self.book.grants, agent))
+
+    def has_approval(self, agent: str, now_ns: int) -> bool:
+        """Return whether an approval of an agent is in force."""
+        return any(one.until_ns > now_ns for one in self._held(agent))
+
+    def control_changed(
+        self, before: ArbitrationState, after: ArbitrationState, by_hand: frozenset[int], now_ns: int
+    ) -> GrantChecker:
+        """End the approvals that a change of control makes stale.
+
+        Args:
+            by_hand: the problems that a person solves.
+        """
+        book = self.book
+        flagged = after.problems.keys() - before.problems.keys()
+        is_manual = after.mode is not before.mode
+        if flagged or is_manual:
+            book = replace(book, plans={}, disturbed_ns=now_ns)
+        if is_manual or flagged & {*by_hand, self.rules.stop}:
+            book = replace(book, grants={})
+        if before.holder != after.holder:
+            # a plan is approved for one run without interruption
+            former = before.holder or ""
+            begun = former in book.plans and book.plans[former].step > 0
+            book = replace(book, plans=_less(book.plans, former) if begun else book.plans, placed=AgentPlace())
+        return self if book is self.book else replace(self, book=book)
+
+    def _stale(self, grant: Grant, now_ns: int, offset_m: XY | None) -> str:
+        book = self.book
+        if grant.run != self.run:
+            return f"it is for the run {grant.run or '(none)'}, this is {self.run or '(none)'}"
+        if grant.limits != limits_digest(self.limits):
+            return "the limits have changed since the preflight"
+        if book.disturbed_ns >= grant.since_ns:
+            return "a problem was flagged, or the mode changed, since the preflight"
+        if not 0 <= now_ns - grant.since_ns <= STALE_S * 1e9:
+            return "the preflight is older than an hour"
+        return self._drifted(grant, offset_m)
+
+    def _drifted(self, grant: Grant, offset_m: XY | None) -> str:
+        if (grant.origin_m is None) != (offset_m is None):
+            return "the coordinates of components have changed since the preflight"
+        if grant.origin_m is None or offset_m is None:
+            return ""
+        moved_m = math.dist(grant.origin_m, offset_m)
+        is_near = moved_m <= grant.drift_m  # False also for NaN: the place is not known
+        return "" if is_near else f"the sample has drifted by {moved_m * 1e9:.3g} nm"
+
+    # --- requests of an agent: at arrival ---
+
+    def refused_at_arrival(self, who: str, request: Request, now_ns: int) -> str:
+        """Return the reason why an agent may not send a request; "" if it may be decided further."""
+        if not self.rules.is_agent(who):
+            return ""
+        kind, subject = request.kind, request.subject
+        if kind in _ALWAYS or is_get(request):
+            return ""
+        if kind == ControlRequest.ADD_EXP_PRBLM:
+            return "" if subject == self.rules.stop else f"{who} is an agent: it may flag stopped-by-agent only"
+        if kind == RELAY_REQUEST:
+            relayed = isinstance(subject, RelayedMessage) and subject.message not in _OF_SUPERVISORS
+            return "" if relayed else f"{who} is an agent: it may not publish this"
+        if kind == LEASE_REQUEST:
+            is_short = isinstance(subject, float) and subject <= LONGEST_AGENT_LEASE_S
+            return "" if is_short else f"the lease of an agent is at most {LONGEST_AGENT_LEASE_S:g} s"
+        if kind not in _COMMANDS and kind != ControlRequest.REQUEST_CTRL:
+            return f"{who} is an agent: only a person may do this"
+        if kind == ControlRequest.REQUEST_CTRL and subject:
+            return f"{who} is an agent: it solves no problems"
+        if not request.id and kind in _COMMANDS:
+            return "a command of an agent needs an id"
+        if not self.has_approval(who, now_ns):
+            return f"{who} has no approval in force; a person approves a plan or gives a grant"
+        return ""
+
+    # --- requests of an agent: right before they are sent ---
+
+    def depends_on(self, who: str, request: Request) -> list[str]:
+        """Return the parameters to read before a request is checked."""
+        needed: dict[str, None] = {}
+        for limits in self._sets_of_limits(who):
+            needed.update(dict.fromkeys(LimitChecker(limits).depends_on(request)))
+        return list(needed)
+
+    def refused(self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition) -> str:
+        """Return the reason why a command may not be sent now; "" if it may.
+
+        Args:
+            position: where the microscope stands, in its own coordinates.
+        """
+        if why := self._refused_by_role(who, request, now_ns, offset_m, position):
+            return why
+        if not self.rules.is_agent(who):
+            return ""
+        # checked here as well: an approval may have ended while the request waited
+        if why := self.refused_at_arrival(who, request, now_ns):
+            return why
+        if (known := self._spent(who, request.id)) is not None:
+            is_same = (known.request, known.payload) == (request.kind, request.payload)
+            return "" if is_same else "this id is of another request"
+        if why := self._refused_at_place(who, request, now_ns, offset_m, position):
+            return why
+        plan, grant = self.book.plans.get(who), self.book.grants.get(who)
+        why_not = "no plan is approved"
+        if plan is not None and not (why_not := self._refused_by_plan(plan, request, now_ns, offset_m)):
+            return ""
+        if grant is None:
+            return f"{why_not}, and there is no grant"
+        refused = self._refused_by_grant(grant, who, request, now_ns)
+        return f"{refused}; {why_not}" if refused and plan is not None else refused
+
+    def sending(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
+        """Spend a checked request that is about to be sent."""
+        is_agent = self.rules.is_agent(who)
+        if not is_agent and self._role(who) is None:
+            return self
+        if request.id and self._spent(who, request.id) is not None:
+            return self
+        book, plan = self.book, self.book.plans.get(who)
+        action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+        approved = ""
+        if plan is not None and not self._refused_by_plan(plan, request, now_ns, offset_m):
+            approved = plan.grant.plan
+            book = replace(book, plans={**book.plans, who: replace(plan, step=plan.step + 1)})
+        elif action and action not in _STOPS and (grant := book.grants.get(who)) is not None:
+            used = {**grant.used, action: grant.used.get(action, 0) + 1}
+            book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
+        kept = tuple(one for one in book.spent.get(who, ()) if now_ns - one.at_ns < _HOUR_NS)
+        spent = SpentRequest(request.id, request.kind, request.payload, now_ns, approved, action)
+        return replace(self, book=replace(book, spent={**book.spent, who: (*kept, spent)}))
+
+    def not_done(self, who: str, request: Request) -> GrantChecker:
+        """Return a request that was certainly not carried out."""
+        if not request.id or (spent := self._spent(who, request.id)) is None:
+            return self
+        book = self.book
+        plan, grant = book.plans.get(who), book.grants.get(who)
+        if spent.plan:
+            if plan is not None and plan.grant.plan == spent.plan:
+                book = replace(book, plans={**book.plans, who: replace(plan, step=plan.step - 1)})
+        elif spent.action and grant is not None and grant.used.get(spent.action):
+            used = {**grant.used, spent.action: grant.used[spent.action] - 1}
+            book = replace(book, grants={**book.grants, who: replace(grant, used=used)})
+        rest = tuple(one for one in book.spent[who] if one is not spent)
+        return replace(self, book=replace(book, spent={**book.spent, who: rest}))
+
+    def done(self, who: str, request: Request) -> GrantChecker:
+        """Store a success: a place that the agent has set, and the end of a plan."""
+        book = self.book
+        if request.kind in (_SET_REGION, _SET_PROBE) and self.rules.is_agent(who):
+            book = replace(book, placed=book.placed.after(who, request))
+        plan = book.plans.get(who)
+        if plan is not None and plan.step >= len(plan.grant.steps):
+            book = replace(book, plans=_less(book.plans, who))
+        return self if book is self.book else replace(self, book=book)
+
+    # --- within ---
+
+    def _held(self, agent: str) -> list[HeldGrant]:
+        return [held[agent] for held in (self.book.plans, self.book.grants) if agent in held]
+
+    def _spent(self, who: str, request_id: str) -> SpentRequest | None:
+        return next((one for one in self.book.spent.get(who, ()) if one.request_id == request_id), None)
+
+    def _role(self, who: str) -> RoleLimits | None:
+        return self.limits.roles.get(who) or self.limits.roles.get(component_of(who))
+
+    def _sets_of_limits(self, who: str) -> list[ExperimentLimits]:
+        role, placed = self._role(who), self.book.placed
+        found = [] if role is None else [role.limits]
+        # with any region, so that the microscope is asked where it stands before an action
+        places = (placed.region, None if placed.probe_m is None else Region(placed.probe_m, (_PROBE_M, _PROBE_M)))
+        return found + [ExperimentLimits(region=one) for one in places if one is not None and placed.who == who]
+
+    def _refused_by_role(
+        self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition
+    ) -> str:
+        role = self._role(who)
+        if role is None or is_get(request):
+            return ""
+        if why := _outside(role.limits, who, request, now_ns, offset_m, position):
+            return why
+        if request.kind != ControlRequest.ACTION:
+            others = _others(request, role.limits) if role.parameters_only else []
+            return f"{others[0]} is not among the parameters of {who} ({role.source})" if others else ""
+        action = str(request.subject)
+        if role.actions is not None and action not in role.actions and action not in _STOPS:
+            return f"{action} is not among the actions of {who} ({role.source})"
+        most = role.per_hour.get(action)
+        lately = [one for one in self.book.spent.get(who, ()) if one.action == action and now_ns - one.at_ns < _HOUR_NS]
+        if most is not None and len(lately) >= most and self._spent(who, request.id) is None:
+            return f"{who} has used {action} {len(lately)} times within an hour, {most} are allowed ({role.source})"
+        return ""
+
+    def _refused_by_plan(self, held: HeldGrant, request: Request, now_ns: int, offset_m: XY | None) -> str:
+        grant = held.grant
+        if request.kind == ControlRequest.ACTION and request.subject in _STOPS:
+            return ""
+        if held.until_ns <= now_ns:
+            return f"the approval of {grant.plan} has run out"
+        if held.step >= len(grant.steps):
+            return f"all of {grant.plan} was carried out"
+        if why := self._drifted(grant, offset_m):
+            return f"the approval of {grant.plan} is stale: {why}"
+        step = grant.steps[held.step]
+        if (step.request, step.payload) != (request.kind, request.payload):
+            return f"this is not request {held.step + 1} of {grant.plan}"
+        return ""
+
+    def _refused_at_place(
+        self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition
+    ) -> str:
+        # a person at the panel, or another component before, may have set another place than the one approved
+        action = str(request.subject) if request.kind == ControlRequest.ACTION else ""
+        if not action or action in _STOPS:
+            return ""
+        place = self.book.placed.for_action(who, action)
+        if place is None:
+            return f"{who} has not set the place for {action} since it got control"
+        set_by = ExperimentLimits(region=place, region_source=f"set by {who}")
+        return _outside(set_by, who, request, now_ns, offset_m, position)
+
+    def _refused_by_grant(self, held: HeldGrant, who: str, request: Request, now_ns: int) -> str:
+        grant = held.grant
+        if held.until_ns <= now_ns:
+            return "the grant has run out"
+        if request.kind == ControlRequest.ACTION:
+            action = str(request.subject)
+            if action in _STOPS:
+                return ""
+            left = next((one.count for one in held.left() if one.action == action), None)
+            if left is None:
+                return f"the grant does not include the action {action}"
+            if left <= 0:
+                return f"the grant's number of {action} is used up"
+            if grant.region is None:
+                return "the grant has no region"
+            placed = self.book.placed.for_action(who, action)
+            # rotated as it may be: its corners, as of a request that sets it
+            asked = Request(_SET_REGION, ScanParameters(placed))
+            refusal = LimitChecker(_limits_of(grant)).check(who, asked, now_ns)
+            return "" if refusal is None else refusal.reason
+        if others := _others(request, _limits_of(grant)):
+            return f"the grant does not include {others[0]}"
+        refusal = LimitChecker(_limits_of(grant)).check(who, request, now_ns)
+        return "" if refusal is None else refusal.reason
+
+    def _with(self, **changes: object) -> GrantChecker:
+        return replace(self, book=replace(self.book, **changes))  # type: ignore[arg-type]
+
+
+def _less(held: Mapping[str, HeldGrant], agent: str) -> dict[str, HeldGrant]:
+    return {name: one for name, one in held.items() if name != agent}
+
+
+def _limits_of(grant: Grant) -> ExperimentLimits:
+    return ExperimentLimits(
+        parameters={
+            one.parameter: Limit(one.low, one.high, unit=BASE_PARAMETERS.get(one.parameter), source="the grant")
+            for one in grant.ranges
+        },
+        region=grant.region,
+        region_source="the grant",
+    )
+
+
+def _others(request: Request, limits: ExperimentLimits) -> list[str]:
+    # the parameters that a request sets beside those of the limits; a malformed one has none, and breaks the limits
+    places = _PLACES if limits.region is not None else frozenset()
+    return [
+        name for name in LimitChecker(limits).names_set_by(request) if name not in places | limits.parameters.keys()
+    ]
+
+
+def _outside(
+    limits: ExperimentLimits,
+    who: str,
+    request: Request,
+    now_ns: int,
+    offset_m: XY | None,
+    position: KnownPosition,
+) -> str:
+    # in the coordinates of components: a place is known in those of the microscope, which are the same without a frame
+    known = LimitState() if offset_m is not None else LimitState(position=position)
+    # a part of a place would be completed from the microscope; the whole is what a person sees
+    checker = LimitChecker(limits)
+    if (refusal := checker.check(who, request, now_ns)) is None and request.kind == ControlRequest.ACTION:
+        # with a frame the microscope is moved to the place that the agent has set, which was checked then
+        refusal = None if offset_m is not None else replace(checker, state=known).check_place(request)
+    return "" if refusal is None else refusal.reason

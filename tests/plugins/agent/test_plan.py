@@ -1,0 +1,142 @@
+"""A plan: strict, with one canonical form, and the requests that a person approves."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from afspm import wire
+from afspm.basics.errors import InvalidValue
+from afspm.model import Frame, Proposal, Region, ScanParameters
+from afspm.plugins.agent.approval import of_plan, of_table
+from afspm.plugins.agent.plan import plan_of, read_plan, read_step
+
+SCAN = {"do": "scan", "center": ["10 nm", "0 nm"], "size": ["500 nm", "0.5 um"], "pixels": [64, 32]}
+STEPS = [
+    {"do": "set", "parameter": "tip-bias-voltage", "value": "500 mV"},
+    SCAN,
+    {"do": "move", "to": ["-1 um", "0 nm"]},
+    {"do": "spectrum", "at": ["0 nm", "20 nm"]},
+]
+FACTS = {"run": "night", "limits": "abc", "offset_m": None, "now_ns": 5}
+
+
+def plan(*steps: Any, title: str = "t") -> Any:
+    return read_plan({"title": title, "steps": list(steps or STEPS)})
+
+
+def test_same_plan_in_other_units_has_the_same_id() -> None:
+    other = {**SCAN, "center": ["0.01 um", "0 m"], "size": ["0.5 um", "500 nm"], "angle": "0 rad"}
+    assert plan(SCAN).id == plan(other).id
+    assert plan(SCAN).id != plan({**SCAN, "pixels": [32, 64]}).id
+    assert plan(SCAN).id != plan(SCAN, title="u").id
+
+
+def test_canonical_form_gives_the_plan_back() -> None:
+    one = plan()
+    assert plan_of(one.canonical()) == one
+    assert plan_of(plan_of(one.canonical()).canonical()).id == one.id
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"title":"t","steps":[{"do":"jump"}]}', '{ "title":"t","steps":[]}'])
+def test_other_text_is_no_canonical_form(text: str) -> None:
+    with pytest.raises(InvalidValue):
+        plan_of(text)
+
+
+def test_canonical_form_with_an_added_field_is_refused() -> None:
+    facts = json.loads(plan(SCAN).canonical())
+    facts["steps"][0]["force"] = True
+    with pytest.raises(InvalidValue):
+        plan_of(json.dumps(facts, sort_keys=True, separators=(",", ":")))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {**SCAN, "center": ["10", "0 nm"]},
+        {**SCAN, "center": [1e-8, 0.0]},
+        {**SCAN, "center": ["nan nm", "0 nm"]},
+        {**SCAN, "center": ["inf nm", "0 nm"]},
+        {**SCAN, "center": ["10 V", "0 nm"]},
+        {**SCAN, "center": "10 nm"},
+        {**SCAN, "center": ["2 m", "0 m"]},
+        {**SCAN, "size": ["0 nm", "1 nm"]},
+        {**SCAN, "size": ["-1 nm", "1 nm"]},
+        {**SCAN, "pixels": [True, 2]},
+        {**SCAN, "pixels": [1.0, 2]},
+        {**SCAN, "pixels": ["1", "2"]},
+        {**SCAN, "pixels": [10**6, 2]},
+        {**SCAN, "force": True},
+        {"do": "scan"},
+        {"do": "set", "parameter": "tip-bias-voltage", "value": "0.5"},
+        {"do": "set", "parameter": "tip-bias-voltage", "value": "nan"},
+        {"do": "set", "parameter": "tip-bias-voltage", "value": 0.5},
+        {"do": "set", "parameter": "tip bias", "value": "0.5 V"},
+        {"do": "set", "parameter": "x", "value": "a\u202eb"},
+        {"do": "action", "name": "x-crash"},
+        None,
+        "scan",
+    ],
+)
+def test_wrong_step_is_refused(wrong: Any) -> None:
+    with pytest.raises(InvalidValue):
+        read_step(wrong)
+
+
+def test_requests_are_the_bytes_that_are_sent() -> None:
+    requests = plan().requests(Frame.TIP)
+    assert [one.text.split(" ")[0] for one in requests] == ["set", "place:", "scan", "move", "move", "spectrum"]
+    sent = wire.decode_request([bytes([requests[1].kind]), requests[1].step.payload])
+    assert isinstance(sent.subject, ScanParameters)
+    assert sent.subject.shape == (64, 32)
+    assert isinstance(sent.subject.region, Region)
+    assert sent.subject.region.center_m == pytest.approx((10e-9, 0.0))
+
+
+def test_approval_of_a_plan_is_that_plan() -> None:
+    one = plan()
+    preflight = json.dumps({"facts": FACTS})
+    grant, shown = of_plan(Proposal(1, "agent:claude", one.id, one.canonical(), preflight), Frame.TIP)
+    assert (grant.plan, grant.run, grant.limits, grant.since_ns, len(grant.steps)) == (one.id, "night", "abc", 5, 6)
+    assert grant.drift_m == pytest.approx(50e-9)
+    assert shown == one
+
+
+@pytest.mark.parametrize("change", [{"id": "0" * 16}, {"preflight": ""}])
+def test_proposal_with_another_hash_or_without_preflight_is_not_approved(change: dict[str, str]) -> None:
+    one = plan()
+    fields = {"id": one.id, "plan": one.canonical(), "preflight": json.dumps({"facts": FACTS}), **change}
+    with pytest.raises(InvalidValue):
+        of_plan(Proposal(1, "agent:claude", **fields), Frame.TIP)
+
+
+def test_grant_of_a_table() -> None:
+    table = {
+        "agent": "agent:claude", "for": "2 h", "region": {"x": ["-1 um", "3 um"], "y": ["0 um", "1 um"]},
+        "parameters": {"tip-bias-voltage": ["-500 mV", "0.5 V"]}, "counts": {"start-scan": 3},
+    }  # fmt: skip
+    grant = of_table(table, FACTS)
+    assert grant.region_m == pytest.approx((1e-6, 0.5e-6, 4e-6, 1e-6))
+    assert (grant.ranges[0].low, grant.ranges[0].high, grant.lasts_s) == (-0.5, 0.5, 7200.0)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"for": 2},
+        {"for": "0 s"},
+        {"counts": {"start-scan": True}},
+        {"counts": {"start-scan": 1.5}},
+        {"region": {"x": ["0 um", "1 um"]}},
+        {"region": {"x": ["1 um", "0 um"], "y": ["0 um", "1 um"]}},
+        {"parameters": {"tip-bias-voltage": [0.1, 0.2]}},
+        {"parameters": {"tip-bias-voltage": ["1 V", "0 V"]}},
+        {"treatments": 1},
+    ],
+)
+def test_wrong_grant_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InvalidValue):
+        of_table({"agent": "agent:claude", "for": "2 h", **wrong}, FACTS)

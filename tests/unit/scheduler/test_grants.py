@@ -1,0 +1,500 @@
+"""Approvals of agents: nothing is sent without one, nothing twice, nothing outside."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from tests.unit.scheduler.logic_lab import Lab, killed, published, replies
+
+from afspm.basics.errors import InvalidValue
+from afspm.model import (
+    GRANT_REQUEST,
+    HIGHEST_PROBLEM,
+    LEASE_REQUEST,
+    RELAY_REQUEST,
+    RESTART_REQUEST,
+    STOPPED_BY_AGENT,
+    Approvals,
+    ControlMode,
+    ControlRequest,
+    ControlResponse,
+    Feedback,
+    Grant,
+    GrantedCount,
+    GrantedRange,
+    GrantedStep,
+    Note,
+    Parameter,
+    Problem,
+    ProblemNames,
+    ProcessStates,
+    Region,
+    RegionChange,
+    RelayedMessage,
+    Request,
+    ScanParameters,
+    ScopeState,
+    names,
+)
+from afspm.scheduler.control.arbitration import RoleTable
+from afspm.scheduler.events import Forward, Tick
+from afspm.scheduler.safety.grants import limits_digest
+from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
+from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
+
+AGENT, ADA, STOP = "agent:claude", "dashboard:Ada", HIGHEST_PROBLEM
+OK, REFUSED = ControlResponse.SUCCESS, ControlResponse.FAILURE
+UM = 1e-6
+HERE = Region((0.0, 0.0), (0.5 * UM, 0.5 * UM))
+FAR = Region((3 * UM, 0.0), (0.5 * UM, 0.5 * UM))
+ACTION, PARAM, SCAN = int(ControlRequest.ACTION), int(ControlRequest.PARAM), int(ControlRequest.SET_SCAN_PARAMS)
+LIMITS = ExperimentLimits(parameters={names.TIP_BIAS_VOLTAGE: Limit(-5.0, 5.0, unit="V")})
+ROLE = RoleLimits(
+    ExperimentLimits(
+        parameters={names.TIP_BIAS_VOLTAGE: Limit(-1.0, 1.0, unit="V")}, region=Region((0.0, 0.0), (4 * UM, 4 * UM))
+    ),
+    parameters_only=True,
+    actions=(names.START_SCAN,),
+    per_hour={names.START_SCAN: 4},
+)
+
+
+def settings(limits: ExperimentLimits = LIMITS) -> SchedulerSettings:
+    roles = RoleTable(operate=("dashboard",), approve=("dashboard",))
+    control = ControlSettings(agents=("agent",), roles=roles)
+    rules = control.rules(ProblemNames({STOPPED_BY_AGENT: STOP}))
+    return SchedulerSettings(control=control, rules=rules, limits=limits, run=RunFacts(name="night"))
+
+
+class AgentLab:
+    """A scheduler with an agent, a person and a microscope that answers every request."""
+
+    def __init__(self, limits: ExperimentLimits = LIMITS) -> None:
+        self.settings = settings(limits)
+        self.lab = Lab(self.settings)
+        self.lab.translator()
+        self.place: Region = FAR
+        self.ids = 0
+
+    def grant(self, **changes: Any) -> Grant:
+        given = {
+            "region_m": (0.0, 0.0, 2 * UM, 2 * UM),
+            "ranges": (GrantedRange(names.TIP_BIAS_VOLTAGE, -0.5, 0.5),),
+            "counts": (GrantedCount(names.START_SCAN, 2),),
+        }
+        return replace(self.approval(), **{**given, **changes})
+
+    def approval(self, **changes: Any) -> Grant:
+        fresh = Grant(
+            AGENT, lasts_s=1800.0, run="night", limits=limits_digest(self.settings.limits), since_ns=self.lab.now_ns - 1
+        )
+        return replace(fresh, **changes)
+
+    def plan(self, *wanted: tuple[int, Any], **changes: Any) -> Grant:
+        steps = tuple(GrantedStep(kind, self.lab.codec.encode(subject)) for kind, subject in wanted)
+        return replace(self.approval(), plan="abc", steps=steps, **changes)
+
+    def give(self, grant: Grant, by: str = ADA) -> ControlResponse:
+        return self.lab.says(by, GRANT_REQUEST, grant)
+
+    def do(
+        self, kind: int, subject: Any = None, id_: str = "", answers: ControlResponse | None = OK, who: str = AGENT
+    ) -> str:
+        """Send a request of the agent: the reason of its refusal; "" if the microscope got it."""
+        self.ids += 1
+        before = len(self.lab.forwarded)
+        effects = self.lab.ask(who, kind, subject, id_ or f"{who}/1/{self.ids}")
+        left, low = (self.place.center_m[i] - self.place.size_m[i] / 2 for i in (0, 1))
+        effects += self.lab.answer_reads(
+            scan_size_x=str(self.place.size_m[0]), scan_size_y=str(self.place.size_m[1]),
+            scan_top_left_x=str(left), scan_top_left_y=str(low), scan_angle="0",
+            probe_pos_x="0", probe_pos_y="0",
+        )  # fmt: skip
+        new = [one for one in self.lab.forwarded[before:] if (one.request.kind, one.request.subject) == (kind, subject)]
+        if new and answers is not None:
+            if isinstance(subject, ScanParameters) and isinstance(subject.region, Region) and answers is OK:
+                self.place = subject.region
+            self.lab.answer(new[-1], answers)
+        if new:
+            return ""
+        return replies(effects)[-1].response.reason or "refused"
+
+    def begin(self, *grants: Grant) -> AgentLab:
+        for grant in grants:
+            assert self.give(grant) is OK
+        assert self.lab.take_control(AGENT) is OK
+        return self
+
+
+@pytest.fixture
+def agent() -> AgentLab:
+    return AgentLab()
+
+
+def sent(lab: Lab, of: int = ACTION) -> list[Forward]:
+    return [one for one in lab.forwarded if one.request.kind == of]
+
+
+# --- without an approval --------------------------------------------------------------------------------------------
+
+
+def test_agent_without_approval_gets_no_control_and_no_command(agent: AgentLab) -> None:
+    assert agent.lab.take_control(AGENT) is REFUSED
+    assert "has no approval" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
+    assert agent.lab.holder is None
+
+
+def test_agent_reads_without_an_approval(agent: AgentLab) -> None:
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE), answers=None) == ""
+
+
+@pytest.mark.parametrize(
+    ("kind", "subject"),
+    [
+        (ControlRequest.SET_CONTROL_MODE, int(ControlMode.MANUAL)),
+        (ControlRequest.END_EXPERIMENT, None),
+        (RESTART_REQUEST, "recorder"),
+        (ControlRequest.RMV_EXP_PRBLM, int(Problem.TIP_SHAPE_CHANGED)),
+        (ControlRequest.ADD_EXP_PRBLM, int(Problem.TIP_SHAPE_CHANGED)),
+        (ControlRequest.REQUEST_CTRL, int(Problem.TIP_SHAPE_CHANGED)),
+        (LEASE_REQUEST, 3600.0),
+    ],
+)
+def test_agent_does_nothing_that_only_a_person_does(agent: AgentLab, kind: int, subject: Any) -> None:
+    agent.begin(agent.grant())
+    assert agent.lab.says(AGENT, kind, subject, "agent:claude/1/x") is REFUSED
+    assert agent.lab.holder == AGENT
+
+
+def test_agent_relays_its_notes_but_no_reports_of_processes(agent: AgentLab) -> None:
+    note = Note(agent.lab.now_ns, AGENT, "clean island", None, agent.lab.now_ns)
+    assert agent.lab.says(AGENT, RELAY_REQUEST, RelayedMessage("Note", agent.lab.codec.encode(note))) is OK
+    states = ProcessStates(agent.lab.now_ns, "supervisor", ())
+    relayed = RelayedMessage("ProcessStates", agent.lab.codec.encode(states))
+    assert agent.lab.says(AGENT, RELAY_REQUEST, relayed) is REFUSED
+
+
+@pytest.mark.parametrize("by", [AGENT, "agent", "agent:other", "series", "gateway:Ada"])
+def test_only_a_person_with_the_role_approves(agent: AgentLab, by: str) -> None:
+    assert agent.give(agent.grant(), by) is REFUSED
+    assert agent.give(agent.grant(), ADA) is OK
+
+
+def test_agent_never_has_the_role_approve() -> None:
+    agent = AgentLab()
+    roles = RoleTable(approve=("agent", "agent:claude", "agent:other"))
+    agent.settings = replace(agent.settings, rules=replace(agent.settings.rules, roles=roles))
+    agent.lab = Lab(agent.settings)
+    assert agent.give(agent.grant(), "agent:other") is REFUSED
+
+
+def test_only_an_agent_is_approved(agent: AgentLab) -> None:
+    assert agent.give(agent.grant(agent="series")) is REFUSED
+
+
+# --- stale approvals ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"run": "yesterday"},
+        {"limits": "other"},
+        {"since_ns": 0},
+        {"offset_m": (0.0, 0.0), "drift_m": 1e-9},
+    ],
+)
+def test_stale_approval_is_refused(agent: AgentLab, changes: dict[str, Any]) -> None:
+    assert agent.give(agent.grant(**changes)) is REFUSED
+
+
+@pytest.mark.parametrize("disturb", ["problem", "manual"])
+def test_preflight_before_a_problem_or_manual_is_stale(agent: AgentLab, disturb: str) -> None:
+    approval = agent.grant()
+    if disturb == "problem":
+        agent.lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+        agent.lab.clear("classifier", Problem.TIP_SHAPE_CHANGED)
+    else:
+        agent.lab.mode(ADA, ControlMode.MANUAL)
+        agent.lab.mode(ADA, ControlMode.AUTOMATED)
+    assert agent.give(approval) is REFUSED
+    agent.lab.later(experiment_s=1.0)
+    assert agent.give(agent.grant()) is OK
+
+
+def test_problem_ends_a_plan_and_leaves_a_grant(agent: AgentLab) -> None:
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
+    agent.begin(agent.grant(), agent.plan((PARAM, bias)))
+    agent.lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    agent.lab.clear("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert agent.lab.take_control(AGENT) is OK
+    assert "(the grant)" in agent.do(PARAM, bias)
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.4", "V")) == ""
+
+
+def test_manual_ends_all_approvals(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    agent.lab.mode(ADA, ControlMode.MANUAL)
+    agent.lab.mode(ADA, ControlMode.AUTOMATED)
+    assert agent.lab.take_control(AGENT) is REFUSED
+
+
+def test_approval_ends_with_its_time(agent: AgentLab) -> None:
+    agent.begin(agent.grant(lasts_s=60.0))
+    agent.lab.later(experiment_s=61.0)
+    assert "no approval" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
+
+
+def test_one_packet_revokes_and_takes_control(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.lab.scope_is(ScopeState.SCANNING)
+    assert agent.give(Grant(AGENT)) is OK
+    assert agent.lab.holder is None
+    assert sent(agent.lab)[-1].request.subject == names.STOP_SCAN
+    assert agent.lab.take_control(AGENT) is REFUSED
+
+
+# --- a plan ---------------------------------------------------------------------------------------------------------
+
+
+def plan_of(agent: AgentLab) -> Grant:
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
+    return agent.plan((PARAM, bias), (SCAN, ScanParameters(HERE, (64, 64))), (ACTION, names.START_SCAN))
+
+
+def test_plan_is_carried_out_once_in_its_order(agent: AgentLab) -> None:
+    bias, place = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V"), ScanParameters(HERE, (64, 64))
+    agent.begin(plan_of(agent))
+    assert "not request 1" in agent.do(SCAN, place)
+    assert "not request 1" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.8", "V"))
+    assert agent.do(PARAM, bias) == ""
+    assert "not request 2" in agent.do(PARAM, bias)
+    assert agent.do(SCAN, place) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    assert "no approval" in agent.do(PARAM, bias)
+
+
+def test_interrupted_plan_needs_a_new_approval(agent: AgentLab) -> None:
+    agent.begin(plan_of(agent))
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")) == ""
+    agent.lab.says(AGENT, ControlRequest.RELEASE_CTRL)
+    assert agent.lab.take_control(AGENT) is REFUSED
+
+
+def test_refused_step_may_be_repeated_and_one_of_unknown_outcome_not(agent: AgentLab) -> None:
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")
+    agent.begin(plan_of(agent))
+    assert agent.do(PARAM, bias, answers=ControlResponse.NOT_FREE) == ""
+    assert agent.do(PARAM, bias, answers=ControlResponse.NO_RESPONSE) == ""
+    assert "not request 2" in agent.do(PARAM, bias)
+
+
+def test_repeated_id_with_another_content_is_refused(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V")
+    assert agent.do(PARAM, bias, "agent:claude/1/a", ControlResponse.NO_RESPONSE) == ""
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V"), "agent:claude/1/a") != ""
+
+
+def test_scan_of_a_plan_does_not_start_where_a_person_has_moved_it(agent: AgentLab) -> None:
+    agent.begin(plan_of(agent))
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.9", "V")) == ""
+    assert agent.do(SCAN, ScanParameters(HERE, (64, 64))) == ""
+    agent.place = FAR
+    assert "outside the region" in agent.do(ACTION, names.START_SCAN)
+
+
+# --- a grant --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "subject"),
+    [
+        (PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.6", "V")),
+        (PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "nan", "V")),
+        (PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.6")),
+        (PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "600", "mV")),
+        (PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "inf", "V")),
+        (PARAM, Parameter(names.SCAN_SPEED, "1e-6", "m/s")),
+        (PARAM, Parameter(names.SCAN_SIZE_X, "1e-6", "m")),
+        (PARAM, Parameter(names.FEEDBACK_ON, "off")),
+        (int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(on=False)),
+        (int(ControlRequest.SET_ZCTRL_PARAMS), Feedback(setpoint=1e-9)),
+        (SCAN, ScanParameters(FAR)),
+        (SCAN, ScanParameters(RegionChange(left_m=0.0))),
+        (ACTION, names.PULSE),
+        (ACTION, "x-crash"),
+        (ACTION, names.START_SPEC),
+        (ACTION, names.START_SCAN),  # the place was set by another component
+    ],
+)
+def test_request_outside_of_the_grant_is_refused(agent: AgentLab, kind: int, subject: Any) -> None:
+    agent.begin(agent.grant())
+    agent.place = HERE
+    assert agent.do(kind, subject) != ""
+
+
+def test_grant_counts_its_scans(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    for _ in range(2):
+        assert agent.do(SCAN, ScanParameters(HERE)) == ""
+        assert agent.do(ACTION, names.START_SCAN) == ""
+    assert "used up" in agent.do(ACTION, names.START_SCAN)
+
+
+def test_refused_scan_does_not_count(agent: AgentLab) -> None:
+    agent.begin(agent.grant(counts=(GrantedCount(names.START_SCAN, 1),)))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN, answers=ControlResponse.NOT_FREE) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    assert "used up" in agent.do(ACTION, names.START_SCAN)
+
+
+def test_counts_survive_a_kill_before_the_answer(agent: AgentLab) -> None:
+    agent.begin(agent.grant(counts=(GrantedCount(names.START_SCAN, 1),)))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN, answers=None) == ""
+    again = killed(agent.lab, agent.settings)
+    assert again.core.state.grants.book.approvals().approvals[0].left == (GrantedCount(names.START_SCAN, 0),)
+
+
+def test_approvals_are_published_at_each_change(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    told = [agent.lab.codec.decode(one.payload) for one in published(agent.lab.effects) if one.envelope == "Approvals"]
+    assert [one.approvals[0].left[0].count for one in told] == [2, 1]
+    agent.give(Grant(AGENT))
+    newest = [one for one in published(agent.lab.effects) if one.envelope == "Approvals"][-1]
+    assert agent.lab.codec.decode(newest.payload) == Approvals()
+
+
+# --- [limits.roles] -------------------------------------------------------------------------------------------------
+
+
+def test_limits_of_the_role_hold_also_for_an_approved_plan() -> None:
+    agent = AgentLab(replace(LIMITS, roles={"agent": ROLE}))
+    bias = Parameter(names.TIP_BIAS_VOLTAGE, "2", "V")
+    agent.begin(agent.plan((PARAM, bias)))
+    assert "above the highest" in agent.do(PARAM, bias)
+
+
+def test_limits_of_the_role_bound_actions_parameters_and_region() -> None:
+    agent = AgentLab(replace(LIMITS, roles={"agent": ROLE}))
+    speed = Parameter(names.SCAN_SPEED, "1e-6", "m/s")
+    agent.begin(agent.plan((PARAM, speed)))
+    assert "not among the parameters" in agent.do(PARAM, speed)
+    agent.give(agent.plan((ACTION, names.PULSE)))
+    assert "not among the actions" in agent.do(ACTION, names.PULSE)
+    agent.give(agent.plan((SCAN, ScanParameters(FAR))))
+    assert "outside the region" in agent.do(SCAN, ScanParameters(FAR))
+
+
+def test_limits_of_the_role_count_over_approvals() -> None:
+    agent = AgentLab(replace(LIMITS, roles={"agent": ROLE}))
+    agent.begin(agent.grant(counts=(GrantedCount(names.START_SCAN, 3),)))
+    assert agent.do(SCAN, ScanParameters(HERE)) == ""
+    for _ in range(3):
+        assert agent.do(ACTION, names.START_SCAN) == ""
+    agent.give(agent.grant(counts=(GrantedCount(names.START_SCAN, 3),)))
+    assert agent.do(ACTION, names.START_SCAN) == ""
+    assert "within an hour" in agent.do(ACTION, names.START_SCAN)
+    agent.lab.later(experiment_s=3601.0)
+    agent.give(agent.grant())
+    assert agent.do(ACTION, names.START_SCAN) == ""
+
+
+def test_limits_of_a_role_hold_for_a_component_that_is_no_agent() -> None:
+    agent = AgentLab(replace(LIMITS, roles={"series": ROLE}))
+    assert agent.lab.take_control("series") is OK
+    assert "above the highest" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "2", "V"), who="series")
+    assert agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.5", "V"), who="series") == ""
+
+
+# --- lease and stop -------------------------------------------------------------------------------------------------
+
+
+def test_agent_without_a_lease_of_its_own_loses_control_after_a_minute(agent: AgentLab) -> None:
+    agent.begin(agent.grant())
+    agent.lab.later(real_s=61.0)
+    agent.lab.step(Tick())
+    assert agent.lab.holder is None
+    assert "not in control" in agent.do(PARAM, Parameter(names.TIP_BIAS_VOLTAGE, "0.1", "V"))
+
+
+def test_stop_needs_no_approval_and_only_a_person_clears_it(agent: AgentLab) -> None:
+    agent.lab.take_control("series")
+    agent.lab.scope_is(ScopeState.SCANNING)
+    assert agent.lab.flag(AGENT, STOP) is OK
+    assert agent.lab.holder is None
+    assert sent(agent.lab)[-1].request.subject == names.STOP_SCAN
+    assert agent.lab.take_control("series") is ControlResponse.WRONG_EXP_PROBLEM
+    for who in (AGENT, "series", "corrector"):
+        assert agent.lab.clear(who, STOP) is REFUSED
+    assert agent.lab.clear(ADA, STOP) is OK
+    assert agent.lab.take_control("series") is OK
+
+
+def test_stop_takes_control_from_a_solver_too(agent: AgentLab) -> None:
+    agent.lab.flag("classifier", Problem.TIP_SHAPE_CHANGED)
+    assert agent.lab.take_control("corrector", Problem.TIP_SHAPE_CHANGED) is OK
+    assert agent.lab.flag(AGENT, STOP) is OK
+    assert agent.lab.holder is None
+    assert agent.lab.take_control("corrector", Problem.TIP_SHAPE_CHANGED) is ControlResponse.WRONG_EXP_PROBLEM
+
+
+def test_stop_stops_the_scan_though_problems_do_not(agent: AgentLab) -> None:
+    control = replace(agent.settings.control, stop_scan_on_problem=False, stop_scan_on_manual=False)
+    agent.settings = replace(agent.settings, control=control, watchdog=control.watchdog())
+    agent.lab = Lab(agent.settings)
+    agent.lab.translator()
+    agent.lab.scope_is(ScopeState.SCANNING)
+    agent.lab.flag(AGENT, STOP)
+    assert sent(agent.lab)[-1].request.subject == names.STOP_SCAN
+
+
+def test_person_in_manual_is_not_stopped_by_an_agent(agent: AgentLab) -> None:
+    agent.lab.mode(ADA, ControlMode.MANUAL)
+    agent.lab.scope_is(ScopeState.SCANNING)
+    before = len(sent(agent.lab))
+    assert agent.lab.flag(AGENT, STOP) is OK
+    assert len(sent(agent.lab)) == before
+
+
+# --- the message ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"region_m": (0.0, 0.0, float("nan"), 1e-6)},
+        {"region_m": (0.0, 0.0, 1e-6)},
+        {"region_m": (0.0, 0.0, -1e-6, 1e-6)},
+        {"lasts_s": float("inf")},
+        {"lasts_s": -1.0},
+        {"plan": "abc"},
+        {"steps": (GrantedStep(1),)},
+        {"ranges": (GrantedRange("a", 1.0, 0.0),)},
+        {"ranges": (GrantedRange("a", float("nan"), 1.0),)},
+        {"counts": (GrantedCount("a", -1),)},
+        {"counts": (GrantedCount("a", 10**6),)},
+    ],
+)
+def test_malformed_grant_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InvalidValue):
+        Grant(**{"agent": AGENT, **wrong})
+
+
+def test_grant_survives_the_wire() -> None:
+    from afspm import wire
+
+    grant = Grant(
+        AGENT, "", (), (0.0, 1e-9, 1e-6, 2e-6), (GrantedRange("a", -1.0, 1.0),), (GrantedCount("start-scan", 3),),
+        600.0, "night", "abc", 5 * 10**9, (1e-9, 2e-9), 1e-8,
+    )  # fmt: skip
+    asked = wire.decode_request(wire.encode_request(Request(GRANT_REQUEST, grant, id="1")))
+    assert asked.subject == grant
