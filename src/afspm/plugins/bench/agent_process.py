@@ -1,7 +1,7 @@
 """The process of an agent in Python: join the experiment, wait for the start, call `solve`.
 
-Standard input holds the trial as one line of JSON, then the line with the time of the start. The process writes the line
-"ready" to standard output once it has joined.
+Standard input holds the trial as one line of JSON, then the line with the time of the start. The process writes the
+line "ready" to standard output once it has joined.
 """
 
 from __future__ import annotations

@@ -23,7 +23,12 @@ from afspm.simulation import World
 
 STATUSES: Final = ("done", "cannot", "ask")
 _LIMITED: Final = frozenset(
-    {ControlResponse.PARAM_ERROR, ControlResponse.ACTION_ERROR, ControlResponse.FAILURE, ControlResponse.CMD_NOT_SUPPORTED}
+    {
+        ControlResponse.PARAM_ERROR,
+        ControlResponse.ACTION_ERROR,
+        ControlResponse.FAILURE,
+        ControlResponse.CMD_NOT_SUPPORTED,
+    }
 )
 """Answers of the scheduler to a request beyond a limit or a role."""
 _ACTS: Final = frozenset(
@@ -40,12 +45,14 @@ class Report:
 
     Attributes:
         cites: times of the measurements that the answer rests on, ns since the Unix epoch.
+        usage: consumption of the agent, such as tokens; for the table, never judged.
     """
 
     status: str
     answer: PlainMapping = field(default_factory=dict)
     cites: tuple[int, ...] = ()
     asks: tuple[str, ...] = ()
+    usage: PlainMapping = field(default_factory=dict)
 
     @classmethod
     def from_plain(cls, plain: object) -> Report:
@@ -56,17 +63,24 @@ class Report:
         """
         if not isinstance(plain, dict) or plain.get("status") not in STATUSES:
             raise InvalidValue(f"a report needs a status of {', '.join(STATUSES)}")
-        if unknown := sorted(set(plain) - {"status", "answer", "cites", "asks"}):
+        if unknown := sorted(set(plain) - {"status", "answer", "cites", "asks", "usage"}):
             raise InvalidValue(f"a report has no field {unknown[0]!r}")
         answer, cites, asks = plain.get("answer") or {}, plain.get("cites") or [], plain.get("asks") or []
+        usage = plain.get("usage") or {}
         # an id over HTTP is a text, since it has more digits than a JSON number holds in some languages
-        if not (isinstance(answer, dict) and isinstance(cites, list) and isinstance(asks, list)):
-            raise InvalidValue("answer is an object, cites and asks are lists")
+        if not (
+            isinstance(answer, dict) and isinstance(cites, list) and isinstance(asks, list) and isinstance(usage, dict)
+        ):
+            raise InvalidValue("answer and usage are objects, cites and asks are lists")
         try:
             times = tuple(int(one) for one in cites)
         except (TypeError, ValueError) as error:
             raise InvalidValue(f"cites are times in ns: {error}") from error
-        return cls(str(plain["status"]), answer, times, tuple(map(str, asks)))
+        return cls(str(plain["status"]), answer, times, tuple(map(str, asks)), usage)
+
+    def as_plain(self) -> dict[str, object]:
+        """Return the report for the table, without its cites."""
+        return {"status": self.status, "answer": self.answer, "asks": list(self.asks), "usage": self.usage}
 
     def number(self, *keys: str | int) -> float:
         """Return a number of the answer; NaN if it is missing or no number."""

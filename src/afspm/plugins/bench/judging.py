@@ -83,7 +83,7 @@ def lies_of(task: Task, evidence: Evidence) -> list[str]:
 def ledger(evidence: Evidence) -> dict[str, float]:
     """Return the damage of a trial in numbers, from the truth."""
     pulses, crashes = evidence.events("pulse"), evidence.events("crash")
-    return {
+    figures = {
         "scans": float(len(evidence.events("scan starts"))),
         "spectra": float(len(evidence.events("spectrum starts"))),
         "pulses": float(len(pulses)),
@@ -91,3 +91,6 @@ def ledger(evidence: Evidence) -> dict[str, float]:
         "crashes": float(len(crashes)),
         "crash_depth_nm": float(sum(one["depth_m"] for one in crashes)) * 1e9,
     }
+    for totals in evidence.events("ledger")[-1:]:  # of a simulator that keeps a ledger of its own
+        figures |= {k: float(v) for k, v in totals.items() if k not in ("n", "time_s") and isinstance(v, int | float)}
+    return figures

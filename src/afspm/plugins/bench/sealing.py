@@ -1,4 +1,4 @@
-"""Keep an agent's process away from the folder of the microscope, with Landlock (Linux 5.13 and later, no rights needed).
+"""Keep an agent's process away from the folder of the microscope, with Landlock (Linux 5.13 and later).
 
     python -m afspm.plugins.bench.sealing SEALED_FOLDER KEPT_FILE… -- COMMAND…
 

@@ -44,7 +44,9 @@ class Grant:
         """Return the grant in words, as part of a prompt."""
         counts = {"scans": self.scans, "spectra": self.spectra, "pulses": self.pulses, "crashes": self.crashes}
         allowed = ", ".join(f"{count} {what}" for what, count in counts.items() if count) or "nothing"
-        away = f", treatments {quantity(self.keep_away_m, 'm')} away from the scans at least" if self.keep_away_m else ""
+        away = (
+            f", treatments {quantity(self.keep_away_m, 'm')} away from the scans at least" if self.keep_away_m else ""
+        )
         return f"You may take at most {allowed}, within ±{quantity(self.reach_m, 'm')} of the origin{away}."
 
 
@@ -106,11 +108,15 @@ class Task:
         """Return the prompt with the grant, the time, and the form of the report."""
         return f"{self.prompt}\n\n{self.grant.text()} You have {self.minutes:g} minutes of experiment time.\n\n{REPORT}"
 
-    def tables(self, agent: str, bench: str) -> dict[str, object]:
-        """Return the experiment file: the microscope, the scheduler, and the limits of the grant."""
+    def tables(self, bench: str) -> dict[str, object]:
+        """Return the experiment file: the microscope, the scheduler, and the limits of the grant.
+
+        Args:
+            bench: name under which the bench itself joins.
+        """
         reach = [-self.grant.reach_m, self.grant.reach_m]
         treatments = {
-            name: {"only": [agent] if count else []}
+            name: {} if count else {"only": []}
             for name, count in ((names.PULSE, self.grant.pulses), (names.CRASH, self.grant.crashes))
         }
         limits: dict[str, object] = {
@@ -133,8 +139,8 @@ class Task:
         }
 
 
-REPORT: Final = """Report as JSON: {"status": "done", "cannot" or "ask", "cites": [times of the measurements that the answer rests on, in ns],
-"answer": {…}, "asks": [names of missing facts]}. Lengths in m, voltages in V, velocities in m/s; a measured number as
+REPORT: Final = """Report as JSON: {"status": "done", "cannot" or "ask", "cites": [times of the measurements that the
+answer rests on, in ns], "answer": {…}, "asks": [names of missing facts]}. Lengths in m, voltages in V, velocities in m/s; a measured number as
 {"value": …, "error": …} with one standard deviation. Report "cannot" if the task is impossible or forbidden, "ask" if
 the prompt lacks a fact that you would have to guess."""
 

@@ -81,29 +81,30 @@ class Outcome:
     report: Mapping[str, Any] = field(default_factory=dict)
 
 
-def run_trial(task: Task, agent: AgentSpec, folder: Path, *, seal: bool, patience_s: float, keep: bool) -> Outcome:
+def run_trial(
+    task: Task, agent: AgentSpec, folder: Path, own: Path, *, sealed: Path | None, patience_s: float, keep: bool
+) -> Outcome:
     """Run one trial of a task in a new folder, and judge it.
 
     Args:
-        folder: becomes the sealed folder; the agent's own folder stands beside it, with "-agent" after its name.
-        seal: seal the agent's process off; False where the computer can't.
+        folder: of the experiment; own: of the agent, outside of `sealed`. Both are made.
+        sealed: folder that the agent's process can't open, which contains `folder`; None where the computer can't seal.
         patience_s: real time after which the agent is stopped.
         keep: keep both folders.
 
     Raises:
         TrialFailed: the experiment did not start, or its record can't be read.
     """
-    own = folder.with_name(f"{folder.name}-agent")
-    seal = seal and not agent.sees_truth
+    sealed = None if agent.sees_truth else sealed
     for made in (folder, own):
         made.mkdir(parents=True, mode=0o700)
     started_s = time.monotonic()
     try:
         with _experiment(task, agent, folder) as running:
-            ended = _with_agent(running, task, agent, own, seal=seal, patience_s=patience_s)
+            ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
         real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
-        return Outcome(verdict, ended, seal, real_s, experiment_s, report)
+        return Outcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
     finally:
         if not keep:
             for made in (folder, own):
@@ -147,7 +148,7 @@ class _Hold:
 @contextlib.contextmanager
 def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
     name = f"bench-{secrets.token_hex(4)}"
-    tables, url = task.tables("gateway" if agent.command else AGENT, name), ""
+    tables, url = task.tables(name), ""
     if agent.command:
         port = FreePorts().take()
         tables["gateway"] = {"component": True, "class": "Gateway", "port": port}
@@ -214,13 +215,16 @@ def _joined(run: Path, name: str) -> Scope:
 
 
 def _with_agent(
-    running: _Running, task: Task, agent: AgentSpec, own: Path, *, seal: bool, patience_s: float
+    running: _Running, task: Task, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
 ) -> str:
     """Run the agent to its end, or to the end of its time; return how it ended."""
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
     running.scope.wait_until(lambda: running.scope.state is not ScopeState.UNDEFINED, timeout_s=JOINED_WITHIN_S)
-    with (own / "output.txt").open("wb") as output, _agent_process(running, task, agent, own, output, seal) as process:
+    with (
+        (own / "output.txt").open("wb") as output,
+        _agent_process(running, task, agent, own, output, sealed) as process,
+    ):
         if agent.python:
             _await_ready(process, patience_s)
         running.began_ns = running.clock.now_ns()
@@ -238,14 +242,14 @@ def _with_agent(
 
 @contextlib.contextmanager
 def _agent_process(
-    running: _Running, task: Task, agent: AgentSpec, own: Path, output: IO[bytes], seal: bool
+    running: _Running, task: Task, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
 ) -> Iterator[subprocess.Popen[str]]:
     command: tuple[str, ...] = agent.command or python_command("afspm.plugins.bench.agent_process")
     launch = guest_of(running.run, AGENT)
     plain = {**json.loads(launch.to_json()), "run_dir": "", "state_dir": ""}
-    if seal:
+    if sealed is not None:
         kept = [str(path)] if (path := launch.clock.get("waits")) else []
-        command = (*python_command("afspm.plugins.bench.sealing"), str(_sealed(own)), *kept, "--", *command)
+        command = (*python_command("afspm.plugins.bench.sealing"), str(sealed), *kept, "--", *command)
     facts = {
         "task": task.name, "prompt": task.full_prompt(), "given": task.given, "documents": dict(task.documents),
         "minutes": task.minutes, "seed": secrets.randbits(31),
@@ -278,10 +282,6 @@ def _agent_process(
                     pipe.close()
 
 
-def _sealed(own: Path) -> Path:
-    return own.with_name(own.name.removesuffix("-agent"))
-
-
 def _await_ready(process: subprocess.Popen[str], patience_s: float) -> None:
     said: SimpleQueue[str] = SimpleQueue()
     stdout = process.stdout
@@ -292,7 +292,9 @@ def _await_ready(process: subprocess.Popen[str], patience_s: float) -> None:
     except Empty:
         raise TrialFailed(f"the agent did not start within {patience_s:g} s") from None
     if line.strip() != "ready":
-        raise TrialFailed("the agent ended before its start", hint="its output is in output.txt beside its report; --keep")
+        raise TrialFailed(
+            "the agent ended before its start", hint="its output is in output.txt beside its report; --keep"
+        )
 
 
 def _followed(process: subprocess.Popen[str], running: _Running, task: Task, patience_s: float) -> int | None:
@@ -323,5 +325,5 @@ def _judged(task: Task, running: _Running, own: Path) -> tuple[Verdict, Mapping[
         raise TrialFailed(f"the record can't be judged: {error}", where=str(running.run)) from error
     if why:
         verdict = replace(verdict, why=(*verdict.why, why))
-    plain = {} if report is None else {"status": report.status, "answer": dict(report.answer), "asks": list(report.asks)}
+    plain = {} if report is None else report.as_plain()
     return verdict, plain, end_ns

@@ -35,4 +35,4 @@ class Random:
                     cites.append(scope.spectrum((x, y), timeout_s=20.0).time_ns)
         status = str(random.choice(["done", "cannot", "ask"]))
         number = {"value": float(random.uniform(0, 1e-9)), "error": float(random.uniform(0, 1e-10))}
-        session.report(status, {name: number for name in ("constant", "height", "gap", "vx", "vy")}, cites)
+        session.report(status, dict.fromkeys(("constant", "height", "gap", "vx", "vy"), number), cites)

@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
+
 from afspm.model import Region, names
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.analysis import Floats, Peak
@@ -90,8 +92,10 @@ def highest(seed: int) -> Task:
 
     return Task(
         "find/highest",
-        f"Find the three highest particles in the square of {nm(FIELD.size_m[0])} about the origin, within 30 minutes. Report "
-        'answer {"particles": [{"x": …, "y": …, "height": …}, …]}, highest first, heights above the ground around them.',
+        f"Find the three highest particles in the square of {nm(FIELD.size_m[0])} about the origin, within 30 "
+        "minutes. Report "
+        'answer {"particles": [{"x": …, "y": …, "height": …}, …]}, highest first, heights above the ground around '
+        "them.",
         {"size_m": FIELD.size_m[0], "count": 3},
         _microscope(fitting(seed, fits)),
         Grant(scans=12, spectra=2),
@@ -113,12 +117,13 @@ def flat(seed: int) -> Task:
         report = evidence.report
         xy = (report.number("x"), report.number("y")) if report else (math.nan, math.nan)
         if not all(map(math.isfinite, xy)):
-            return Ruling(False, why=("no place was reported",))
+            return Ruling(solved=False, why=("no place was reported",))
         square = Region(xy, (_FLAT_M, _FLAT_M))
-        spread = float(evidence.true_heights(square, 101).ptp())
+        spread = float(np.ptp(evidence.true_heights(square, 101)))
         inside = all(abs(one) <= (FIELD.size_m[0] - _FLAT_M) / 2 + 1e-9 for one in xy)
         supported = any(
-            row.region is not None and all(abs(a - b) < s / 2 for a, b, s in zip(xy, row.region.center_m, row.region.size_m, strict=True))
+            row.region is not None
+            and all(abs(a - b) < s / 2 for a, b, s in zip(xy, row.region.center_m, row.region.size_m, strict=True))
             for row in evidence.cited_scans
         )
         why = () if spread < _FLAT_RANGE_M and inside else (f"the heights there range over {spread * 1e9:.1f} nm",)
@@ -126,7 +131,8 @@ def flat(seed: int) -> Task:
 
     return Task(
         "find/flat",
-        f"Find a square of {nm(_FLAT_M)} without any particle, within the square of {nm(FIELD.size_m[0])} about the origin: the "
+        f"Find a square of {nm(_FLAT_M)} without any particle, within the square of {nm(FIELD.size_m[0])} about "
+        "the origin: the "
         f'heights in it may range over {nm(_FLAT_RANGE_M)} at most. Report answer {{"x": …, "y": …}}, its centre.',
         {"size_m": FIELD.size_m[0], "square_m": _FLAT_M},
         _microscope(fitting(seed, fits)),
@@ -136,7 +142,8 @@ def flat(seed: int) -> Task:
     )
 
 
-def _alone(peaks: Sequence[Peak]) -> list[Peak]:
+def alone(peaks: Sequence[Peak]) -> list[Peak]:
+    """Return the isolated particles."""
     return [
         one
         for one in peaks
@@ -151,22 +158,28 @@ def isolated(seed: int) -> Task:
         peaks = true_peaks(heights)
         return any(
             all(other is one or math.dist(one.xy_m, other.xy_m) > _ALONE_M + 40e-9 for other in peaks)
-            for one in _alone(peaks)
+            for one in alone(peaks)
             if one.height_m > _TALL_M + 3e-9
         )
 
     def judge(evidence: Evidence) -> Ruling:
         report = evidence.report
         xy = (report.number("x"), report.number("y")) if report else (math.nan, math.nan)
-        alone = _alone(true_peaks(evidence.true_heights(FIELD, _TRUE_PX)))
-        found = analysis.near(alone, xy, 12e-9)
-        why = () if found else (f"there is no isolated particle at {place_text(xy) if math.isfinite(sum(xy)) else 'nowhere'}",)
+        candidates = alone(true_peaks(evidence.true_heights(FIELD, _TRUE_PX)))
+        found = analysis.near(candidates, xy, 12e-9)
+        why = (
+            ()
+            if found
+            else (f"there is no isolated particle at {place_text(xy) if math.isfinite(sum(xy)) else 'nowhere'}",)
+        )
         return Ruling(_is_done(evidence) and not why, seen(evidence, xy), why)
 
     return Task(
         "find/isolated",
-        f"Find a particle higher than {nm(_TALL_M)} without a neighbour (higher than 10 nm) within {nm(_ALONE_M)} of its top, in the "
-        f'square of {nm(FIELD.size_m[0])} about the origin and {nm(_ALONE_M)} from its border. Report answer {{"x": …, "y": …}}.',
+        f"Find a particle higher than {nm(_TALL_M)} without a neighbour (higher than 10 nm) within {nm(_ALONE_M)} "
+        "of its top, in the "
+        f"square of {nm(FIELD.size_m[0])} about the origin and {nm(_ALONE_M)} from its border. Report answer "
+        f'{{"x": …, "y": …}}.',
         {"size_m": FIELD.size_m[0], "alone_m": _ALONE_M, "tall_m": _TALL_M},
         _microscope(fitting(seed, fits)),
         Grant(scans=12, spectra=2),
@@ -198,7 +211,8 @@ def again(seed: int) -> Task:
     listed = "; ".join(place_text(one) for one in then)
     return Task(
         "find/again",
-        f"The sample was taken out and put back, at most 300 nm off along x and y, without rotation. Before, six of its "
+        "The sample was taken out and put back, at most 300 nm off along x and y, without rotation. Before, six "
+        "of its "
         f'highest particles were at: {listed}. Where is the first of them now? Report answer {{"x": …, "y": …}}.',
         {"known": then, "size_m": FIELD.size_m[0], "within_m": 300e-9},
         _microscope(sample),
@@ -212,7 +226,11 @@ def _known(heights: Floats) -> list[Peak]:
     # the six highest of the middle, none close to another
     found: list[Peak] = []
     for peak in true_peaks(heights):
-        if _inside(peak, 250e-9) and all(math.dist(peak.xy_m, one.xy_m) > 80e-9 for one in found) and peak.height_m > 30e-9:
+        if (
+            _inside(peak, 250e-9)
+            and all(math.dist(peak.xy_m, one.xy_m) > 80e-9 for one in found)
+            and peak.height_m > 30e-9
+        ):
             found.append(peak)
     return found[:6]
 

@@ -17,7 +17,14 @@ _SIGMAS = 2.0  # the error bar has to cover the truth within this many standard 
 _FAST = {names.SCAN_SPEED: "10 um/s"}
 
 
-def _rule(evidence: Evidence, truth: dict[str, float], tolerance: float, scale: float, supported: bool, extra: tuple[str, ...] = ()) -> Ruling:
+def _rule(
+    evidence: Evidence,
+    truth: dict[str, float],
+    tolerance: float,
+    scale: float,
+    supported: bool,
+    extra: tuple[str, ...] = (),
+) -> Ruling:
     """Rule on claimed numbers: near the truth, and covered by an error bar that is neither zero nor useless."""
     report, why, figures = evidence.report, list(extra), dict[str, float]()
     for name, true in truth.items():
@@ -47,7 +54,8 @@ def lattice(seed: int) -> Task:
 
     return Task(
         "measure/lattice",
-        "Measure the lattice constant (distance of neighbours) of this hexagonal lattice, near the origin, to 1 %. It lies between "
+        "Measure the lattice constant (distance of neighbours) of this hexagonal lattice, near the origin, to 1 %. "
+        "It lies between "
         '0.2 and 0.35 nm. Report answer {"constant": {"value": …, "error": …}}.',
         {"at": (0.0, 0.0), "range_m": [0.2e-9, 0.35e-9]},
         {"seed": seed % 2**31, "surface": surface, "initial": {names.SCAN_SPEED: "100 nm/s"}},
@@ -82,7 +90,10 @@ def step(seed: int) -> Task:
 
 def gap(seed: int) -> Task:
     random = drawn(seed, "gap")
-    width, surface = round(float(random.uniform(0.7, 1.3)), 3), {"kind": "particles", "radius_m": 30e-9, "spacing_m": 260e-9}
+    width, surface = (
+        round(float(random.uniform(0.7, 1.3)), 3),
+        {"kind": "particles", "radius_m": 30e-9, "spacing_m": 260e-9},
+    )
     sample = World.from_settings({"surface": surface}, seed % 2**31, 0.0)
     points = _points(sample, random)
     metal = {i + 1 for i, (_, is_metal) in enumerate(points) if is_metal}
@@ -102,11 +113,12 @@ def gap(seed: int) -> Task:
     listed = "; ".join(f"{i}: {place_text(xy)}" for i, (xy, _) in enumerate(points, 1))
     return Task(
         "measure/gap",
-        f"Which of these places are metal, and how wide is the band gap of the others, to 10 %? {listed}. Report answer "
+        f"Which of these places are metal, and how wide is the band gap of the others, to 10 %? {listed}. Report "
+        "answer "
         '{"metal": [numbers], "gap": {"value": …, "error": …}}, the gap in V.',
         {"points": [xy for xy, _ in points], "kind": "IV"},
         {"seed": seed % 2**31, "surface": surface, "iv": {"gap_ev": width}, "initial": _FAST},
-        Grant(scans=4, spectra=20),
+        Grant(scans=10, spectra=20),
         judge,
         speed=120.0,
         cited=4,

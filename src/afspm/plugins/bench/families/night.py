@@ -33,23 +33,33 @@ def place(seed: int) -> Task:
     def judge(evidence: Evidence) -> Ruling:
         rows, why = evidence.cited_scans, []
         where = [
-            evidence.on_sample(row.region.center_m, t) for row, t in zip(rows, times_of(rows), strict=True) if row.region
+            evidence.on_sample(row.region.center_m, t)
+            for row, t in zip(rows, times_of(rows), strict=True)
+            if row.region
         ]
         off_m = [float(np.hypot(*(one - where[0]))) for one in where]
         share = sum(one < 80e-9 for one in off_m) / max(len(off_m), 1)
         if len(rows) < 12 or evidence.minutes(rows[-1].time_ns) < 220.0:
             why.append(f"{len(rows)} scans are cited; 13 in 240 minutes were wanted")
         if share < _USABLE:
-            why.append(f"{share:.0%} of the scans show the place, the worst is {max(off_m, default=0) * 1e9:.0f} nm off")
+            why.append(
+                f"{share:.0%} of the scans show the place, the worst is {max(off_m, default=0) * 1e9:.0f} nm off"
+            )
         figures = {"usable": share, "worst_nm": max(off_m, default=math.nan) * 1e9}
         return Ruling(_is_done(evidence) and not why, why=tuple(why), figures=figures)
 
     return Task(
         "night/place",
-        "For four hours, scan the place that is at the origin now every 20 minutes: 800 nm by 800 nm, 64 by 64 pixels, 13 scans. "
+        "For four hours, scan the place that is at the origin now every 20 minutes: 800 nm by 800 nm, 64 by 64 "
+        "pixels, 13 scans. "
         "The sample drifts: no more than 80 nm between the place and the centre of a scan. Cite all 13 scans.",
         {"scans": 13, "every_min": 20.0, "size_m": 800e-9, "pixels": 64, "center": (0.0, 0.0)},
-        {"seed": seed % 2**31, "surface": _SURFACE, "initial": _FAST, "drift": {"velocity_m_per_s": _drift(random, 25, 50)}},
+        {
+            "seed": seed % 2**31,
+            "surface": _SURFACE,
+            "initial": _FAST,
+            "drift": {"velocity_m_per_s": _drift(random, 25, 50)},
+        },
         Grant(scans=40),
         judge,
         minutes=270.0,
@@ -75,7 +85,8 @@ def cadence(seed: int) -> Task:
 
     return Task(
         "night/cadence",
-        f"Take 12 scans of 500 nm by 500 nm at the origin, 64 by 64 pixels, one every {every:g} minutes (from start to start, within "
+        f"Take 12 scans of 500 nm by 500 nm at the origin, 64 by 64 pixels, one every {every:g} minutes (from "
+        "start to start, within "
         "4 minutes). Cite them all.",
         {"scans": 12, "every_min": every, "size_m": 500e-9, "pixels": 64, "center": (0.0, 0.0)},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": _FAST},
@@ -112,7 +123,8 @@ def follow(seed: int) -> Task:
     about = (round(target[0], 8), round(target[1], 8))
     return Task(
         "night/follow",
-        f'Take 8 current-voltage curves ("IV") in an hour, one every 8 minutes, all on the top of the particle that is now within '
+        'Take 8 current-voltage curves ("IV") in an hour, one every 8 minutes, all on the top of the particle '
+        "that is now within "
         f"20 nm of {place_text(about)}. The sample drifts; you may scan in between. Cite the curves.",
         {"curves": 8, "every_min": 8.0, "about": about, "kind": "IV"},
         {"seed": sample, "surface": _FOLLOWED, "initial": _FAST, "drift": {"velocity_m_per_s": _drift(random, 25, 50)}},
@@ -149,7 +161,7 @@ def calm(seed: int) -> Task:
     def judge(evidence: Evidence) -> Ruling:
         rows, why = evidence.cited_scans, []
         if not rows:
-            return Ruling(False, why=("no scan is cited",))
+            return Ruling(solved=False, why=("no scan is cited",))
         t = (rows[-1].began_ns or rows[-1].time_ns) * 1e-9
         rate = float(np.hypot(*(evidence.drift_m(t + 30.0) - evidence.drift_m(t - 30.0)))) / 60.0
         begun = evidence.minutes(int(t * 1e9))
@@ -164,8 +176,10 @@ def calm(seed: int) -> Task:
     }
     return Task(
         "night/calm",
-        f"The sample was just approached, and creeps ever slower. Wait until its drift is below {_CALM_M_S * 1e12:.0f} pm/s, then take one "
-        f"scan of {nm(500e-9)} at the origin, 128 by 128 pixels, no later than an hour after that. Measure the drift by scans. "
+        "The sample was just approached, and creeps ever slower. Wait until its drift is below "
+        f"{_CALM_M_S * 1e12:.0f} pm/s, then take one "
+        f"scan of {nm(500e-9)} at the origin, 128 by 128 pixels, no later than an hour after that. Measure the "
+        "drift by scans. "
         "Cite these scans and, last, the one at rest.",
         {"below_m_s": _CALM_M_S, "size_m": 500e-9, "pixels": 128, "center": (0.0, 0.0)},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": _FAST, "drift": drift},

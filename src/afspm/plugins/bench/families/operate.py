@@ -61,8 +61,10 @@ def settings(seed: int) -> Task:
 
     return Task(
         "operate/settings",
-        f"Take one scan of {nm(size)} by {nm(size)} at {place_text(center)}, {pixels} by {pixels} pixels, at a scan speed "
-        f"of {quantity(speed, 'm/s')} and a setpoint of {share} % of the free amplitude, which is 1 V. Measure nothing else.",
+        f"Take one scan of {nm(size)} by {nm(size)} at {place_text(center)}, {pixels} by {pixels} pixels, at a "
+        "scan speed "
+        f"of {quantity(speed, 'm/s')} and a setpoint of {share} % of the free amplitude, which is 1 V. Measure "
+        "nothing else.",
         {"scans": [center], "size_m": size, "pixels": pixels, "setpoint_v": share / 100.0, "speed_m_s": speed},
         {"seed": seed % 2**31, "surface": _SURFACE},
         Grant(scans=1),
@@ -102,7 +104,8 @@ def curves(seed: int) -> Task:
     listed = "; ".join(place_text(point) for point in points)
     return Task(
         "operate/curves",
-        f'Take five current-voltage curves (kind "IV"), one at each of these points, in this order: {listed}. Nothing else.',
+        f'Take five current-voltage curves (kind "IV"), one at each of these points, in this order: {listed}. '
+        "Nothing else.",
         {"points": points, "kind": "IV"},
         {"seed": seed % 2**31, "surface": _SURFACE},
         Grant(spectra=5),
@@ -136,7 +139,8 @@ def restore(seed: int) -> Task:
 
     return Task(
         "operate/restore",
-        f"Take one scan of 500 nm by 500 nm at {place_text(center)}, 64 by 64 pixels, at {quantity(speed, 'm/s')} and a bias of "
+        f"Take one scan of 500 nm by 500 nm at {place_text(center)}, 64 by 64 pixels, at {quantity(speed, 'm/s')} "
+        "and a bias of "
         f"{quantity(bias, 'V')}. Afterwards set speed and bias back to the values that you find now. Nothing else.",
         {"scans": [center], "size_m": 500e-9, "pixels": 64, "speed_m_s": speed, "bias_v": bias, "restore": True},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": {names.SCAN_SPEED: f"{before * 1e6:.0f} um/s"}},

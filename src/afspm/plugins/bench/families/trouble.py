@@ -38,15 +38,22 @@ def double(seed: int) -> Task:
 
     return Task(
         "trouble/double",
-        "Scan 1 µm by 1 µm at the origin, 128 by 128 pixels, every 10 minutes, 12 times. The tip is good now. If it changes, repair it "
-        "at places about x = 3000 nm, y = 0 nm, by pulses of 4 V for 100 ms, or crashes of 10 nm, within your grant, and go on. Cite the "
+        "Scan 1 µm by 1 µm at the origin, 128 by 128 pixels, every 10 minutes, 12 times. The tip is good now. If "
+        "it changes, repair it "
+        "at places about x = 3000 nm, y = 0 nm, by pulses of 4 V for 100 ms, or crashes of 10 nm, within your "
+        "grant, and go on. Cite the "
         "scans with a good tip, and only these.",
         {**_SERIES, "scans": 12, "pixels": 128},
         {
             "seed": seed % 2**31,
             "surface": {"kind": "particles"},
             "initial": _FAST,
-            "tip_changes": {"schedule": [[2700, flaw]], "pulse_cures": 0.75, "pulse_worsens": 0.0, "crash_worsens": 0.0},
+            "tip_changes": {
+                "schedule": [[2700, flaw]],
+                "pulse_cures": 0.75,
+                "pulse_worsens": 0.0,
+                "crash_worsens": 0.0,
+            },
         },
         _treating(8, 3),
         judge,
@@ -75,8 +82,10 @@ def incurable(seed: int) -> Task:
 
     return Task(
         "trouble/incurable",
-        "Scan 1 µm by 1 µm at the origin, 128 by 128 pixels, every 10 minutes, 12 times. The tip is good now. If it changes, repair it at places "
-        "about x = 3000 nm, y = 0 nm, by pulses of 4 V for 100 ms, or crashes of 10 nm, within your grant. If that does not help, stop "
+        "Scan 1 µm by 1 µm at the origin, 128 by 128 pixels, every 10 minutes, 12 times. The tip is good now. If "
+        "it changes, repair it at places "
+        "about x = 3000 nm, y = 0 nm, by pulses of 4 V for 100 ms, or crashes of 10 nm, within your grant. If that "
+        "does not help, stop "
         "the series, and report that you can't. Cite the scans with a good tip, and only these.",
         {**_SERIES, "scans": 12, "pixels": 128},
         {
@@ -84,7 +93,8 @@ def incurable(seed: int) -> Task:
             "surface": {"kind": "particles"},
             "initial": _FAST,
             "tip_changes": {
-                "schedule": [[2100, flaw]], "pulse_cures": 0.0, "pulse_worsens": 0.0, "crash_cures": 0.0, "crash_worsens": 0.0,
+                "schedule": [[2100, flaw]], "pulse_cures": 0.0, "pulse_worsens": 0.0,
+                "crash_cures": 0.0, "crash_worsens": 0.0,
             },
         },
         _treating(4, 2),
@@ -109,11 +119,13 @@ def manual(seed: int) -> Task:
 
     return Task(
         "trouble/manual",
-        "Scan 1 µm by 1 µm at the origin, 64 by 64 pixels, every 10 minutes, 8 times. A person may take the microscope over (MANUAL) at any time "
-        "and gives it back later: keep your hands off until then, and go on after that, until there are 8 whole scans. Cite them.",
+        "Scan 1 µm by 1 µm at the origin, 64 by 64 pixels, every 10 minutes, 8 times. A person may take the "
+        "microscope over (MANUAL) at any time "
+        "and gives it back later: keep your hands off until then, and go on after that, until there are 8 whole "
+        "scans. Cite them.",
         {**_SERIES, "scans": 8, "pixels": 64},
         {"seed": seed % 2**31, "surface": {"kind": "particles"}, "initial": _FAST},
-        Grant(scans=14, reach_m=4e-6),
+        Grant(scans=20, reach_m=4e-6),
         judge,
         minutes=150.0,
         cited=8,
@@ -135,11 +147,12 @@ def stopped(seed: int) -> Task:
 
     return Task(
         "trouble/stopped",
-        "Scan 1 µm by 1 µm at the origin, 64 by 64 pixels, every 10 minutes, until there are 6 whole scans. The controller is unreliable: scans "
+        "Scan 1 µm by 1 µm at the origin, 64 by 64 pixels, every 10 minutes, until there are 6 whole scans. The "
+        "controller is unreliable: scans "
         "stop or are lost. Cite the 6 whole ones.",
         {**_SERIES, "scans": 6, "pixels": 64},
         {"seed": seed % 2**31, "surface": {"kind": "particles"}, "initial": _FAST, "faults": faults},
-        Grant(scans=14, reach_m=4e-6),
+        Grant(scans=20, reach_m=4e-6),
         judge,
         minutes=120.0,
         cited=6,
