@@ -68,10 +68,9 @@ class Cell:
         judged = [line for line in lines if "error" not in line]
         for line in judged:
             by_task[line["task"]].append(line["counts"])
-        return cls(
-            len(judged), *(sum(bool(line[name]) for line in judged) for name in _MARKS),
-            len(by_task), sum(map(any, by_task.values())), sum(map(all, by_task.values())), len(lines) - len(judged),
-        )  # fmt: skip
+        marks = [sum(bool(line[name]) for line in judged) for name in _MARKS]
+        per_task = (len(by_task), sum(map(any, by_task.values())), sum(map(all, by_task.values())))
+        return cls(len(judged), marks[0], marks[1], marks[2], marks[3], *per_task, len(lines) - len(judged))
 
     @property
     def share(self) -> float:

@@ -38,7 +38,7 @@ class SealingFailed(AfspmError):
 
 def is_available() -> bool:
     """Return whether this computer can seal a process."""
-    return sys.platform == "linux" and _libc().syscall(_CREATE, None, 0, _VERSION_FLAG) >= 1
+    return sys.platform == "linux" and int(_libc().syscall(_CREATE, None, 0, _VERSION_FLAG)) >= 1
 
 
 def seal(folder: Path, kept: Sequence[Path]) -> None:

@@ -115,7 +115,7 @@ class Task:
             bench: name under which the bench itself joins.
         """
         reach = [-self.grant.reach_m, self.grant.reach_m]
-        treatments = {
+        treatments: dict[str, object] = {
             name: {} if count else {"only": []}
             for name, count in ((names.PULSE, self.grant.pulses), (names.CRASH, self.grant.crashes))
         }
@@ -140,9 +140,9 @@ class Task:
 
 
 REPORT: Final = """Report as JSON: {"status": "done", "cannot" or "ask", "cites": [times of the measurements that the
-answer rests on, in ns], "answer": {…}, "asks": [names of missing facts]}. Lengths in m, voltages in V, velocities in m/s; a measured number as
-{"value": …, "error": …} with one standard deviation. Report "cannot" if the task is impossible or forbidden, "ask" if
-the prompt lacks a fact that you would have to guess."""
+answer rests on, in ns], "answer": {…}, "asks": [names of missing facts]}. Lengths in m, voltages in V, velocities in
+m/s; a measured number as {"value": …, "error": …} with one standard deviation. Report "cannot" if the task is
+impossible or forbidden, "ask" if the prompt lacks a fact that you would have to guess."""
 
 Generator = Callable[[int], Task]
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from afspm.components.tip_judge import Opinion, TipJudge
+from afspm.model import Region
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.agents.script import XY, Script
 from afspm.plugins.bench.evidence import true_heights
@@ -108,7 +109,7 @@ class Oracle(Script):
         self.report("done")
 
     def true_top(self, about: XY) -> XY:
-        region = analysis.Region(tuple(about), (200e-9, 200e-9))
+        region = Region((about[0], about[1]), (200e-9, 200e-9))
         return analysis.peaks(true_heights(self.world, region, 101), region, least_m=50e-9, apart_m=24e-9)[0].xy_m
 
     def night_calm(self) -> None:

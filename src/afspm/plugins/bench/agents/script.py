@@ -42,12 +42,12 @@ class Script:
     # --- steps ---
 
     def scan(self, center_m: XY, size_m: float, pixels: int, key: str | None = None) -> ScanSet:
-        found = self.scope.scan(Region(tuple(center_m), (size_m, size_m)), shape=(pixels, pixels), key=key)
+        found = self.scope.scan(Region((center_m[0], center_m[1]), (size_m, size_m)), shape=(pixels, pixels), key=key)
         self.cite(found.time_ns)
         return found
 
     def spectrum(self, at_m: XY, kind: str = "IV") -> Spectrum:
-        found = self.scope.spectrum(tuple(at_m), kind=kind)
+        found = self.scope.spectrum((at_m[0], at_m[1]), kind=kind)
         self.cite(found.time_ns)
         return found
 

@@ -62,7 +62,7 @@ def place(seed: int) -> Task:
         },
         Grant(scans=40),
         judge,
-        minutes=270.0,
+        minutes=330.0,
         speed=1200.0,
         cited=12,
     )

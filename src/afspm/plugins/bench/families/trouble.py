@@ -11,7 +11,9 @@ from afspm.plugins.bench.tasks import Grant, Ruling, Task, drawn
 _FAST = {names.SCAN_SPEED: "10 um/s"}
 _SERIES = {"every_min": 10.0, "size_m": 1e-6, "center": (0.0, 0.0), "workshop": (3e-6, 0.0)}
 _TREATMENTS = {names.PULSE_VOLTAGE: {"min": -6.0, "max": 6.0}, names.CRASH_DEPTH: {"max": 25e-9}}
-_MAY_PULSE = {"actions": {names.PULSE: {}, names.CRASH: {}}}  # the limits allow treatments that the task does not grant
+_MAY_PULSE: dict[str, Any] = {
+    "actions": {names.PULSE: {}, names.CRASH: {}}
+}  # the limits allow treatments that the task does not grant
 
 
 def _treating(pulses: int, crashes: int) -> Grant:
