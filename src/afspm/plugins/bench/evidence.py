@@ -65,8 +65,8 @@ class Report:
             raise InvalidValue(f"a report needs a status of {', '.join(STATUSES)}")
         if unknown := sorted(set(plain) - {"status", "answer", "cites", "asks", "usage"}):
             raise InvalidValue(f"a report has no field {unknown[0]!r}")
-        answer, cites, asks = plain.get("answer") or {}, plain.get("cites") or [], plain.get("asks") or []
-        usage = plain.get("usage") or {}
+        answer, cites, asks = plain.get("answer", {}), plain.get("cites", []), plain.get("asks", [])
+        usage = plain.get("usage", {})
         # an id over HTTP is a text, since it has more digits than a JSON number holds in some languages
         if not (
             isinstance(answer, dict) and isinstance(cites, list) and isinstance(asks, list) and isinstance(usage, dict)

@@ -70,14 +70,15 @@ def seal(folder: Path, kept: Sequence[Path]) -> None:
 def _allowed(folder: Path, kept: Sequence[Path], rights: int) -> Iterator[tuple[Path, int]]:
     for step in (folder, *folder.parents[:-1]):
         for sibling in step.parent.iterdir():
-            if sibling != step:
+            # a rule on a link would allow its target, and some link leads to a folder above the sealed one
+            if sibling != step and not sibling.is_symlink():
                 yield sibling, rights if sibling.is_dir() else rights & _FILE_RIGHTS
     for file in kept:
         yield file, rights & _FILE_RIGHTS
 
 
 def _allow(libc: ctypes.CDLL, rules: int, path: Path, allowed: int) -> None:
-    # a sibling that vanishes, or a dangling link, needs no rule
+    # a sibling that vanishes needs no rule
     with contextlib.suppress(OSError):
         opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
         try:
