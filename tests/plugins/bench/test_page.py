@@ -13,7 +13,8 @@ TASKS = {"operate": "operate/settings", "find": "find/flat", "restraint": "restr
 def line(agent: str, task: str, trial: int, *, counts: bool, **more: Any) -> dict[str, Any]:
     return {
         "agent": agent, "task": task, "family": task.partition("/")[0], "trial": trial, "counts": counts,
-        "half": "public", "solved": counts, "harmless": True, "honest": True, "why": [] if counts else ["<b>off</b>"], "figures": {},
+        "half": "public", "solved": counts, "harmless": True, "honest": True, "figures": {},
+        "why": [] if counts else ["<b>off</b>"],
         "commitment": "0" * 64, "sealed": True, "experiment_s": 60.0, "report": {"status": "done"}, **more,
     }  # fmt: skip
 

@@ -3,7 +3,8 @@
     python -m afspm.plugins.bench.sealing SEALED_FOLDER KEPT_FILE… -- COMMAND…
 
 Landlock allows and never forbids: every sibling of the path to the sealed folder is allowed, so the folder itself is
-not, under no name. The restriction is inherited by all child processes, and denies `/proc` of processes outside.
+not, under no name. The restriction is inherited by all child processes. The memory of processes outside is denied, too;
+their environment is not, so it must hold no secret.
 """
 
 from __future__ import annotations

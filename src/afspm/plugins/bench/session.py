@@ -66,7 +66,7 @@ class Session:
         self,
         status: str,
         answer: PlainMapping | None = None,
-        cites: Sequence[int | None] = (),
+        cites: Sequence[int | str | None] = (),
         asks: Sequence[str] = (),
     ) -> None:
         """Hand in the report; a later one replaces it.

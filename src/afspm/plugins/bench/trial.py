@@ -161,6 +161,7 @@ def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running
         env={**os.environ, **python_environment()},
     )  # fmt: skip
     lines: list[str] = []
+    rest: threading.Thread | None = None
     try:
         run = _run_folder(process, runs, lines)
         rest = threading.Thread(target=_drain, args=(process.stdout, lines), daemon=True)
@@ -187,6 +188,11 @@ def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(ENDED_WITHIN_S)
             process.kill()
+            process.wait()
+        if rest is not None:
+            rest.join()
+        if process.stdout is not None:
+            process.stdout.close()
 
 
 def _run_folder(process: subprocess.Popen[str], runs: Path, lines: list[str]) -> Path:
