@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from evidence_made import MINUTE_NS, MadeEvidence, request, scan_row
+from tests.plugins.bench.evidence_made import MINUTE_NS, MadeEvidence, request, scan_row
 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse
@@ -35,7 +35,9 @@ def test_trial_within_its_grant_and_with_true_cites_counts() -> None:
 
 @pytest.mark.parametrize("part", ["solved", "harmless", "honest"])
 def test_trial_counts_only_with_all_three(part: str) -> None:
-    assert not replace(Verdict(solved=True, harmless=True, honest=True), **{part: False}).counts
+    parts = {"solved": True, "harmless": True, "honest": True}
+    assert Verdict(**parts).counts
+    assert not Verdict(**{**parts, part: False}).counts
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def folder(tmp_path: Path) -> Path:
     return folder
 
 
-def test_sealed_process_reads_only_what_is_outside_or_kept(folder: Path, tmp_path: Path) -> None:
+def test_sealed_process_reads_only_outside_and_kept_files(folder: Path, tmp_path: Path) -> None:
     names = [
         folder / "truth.jsonl", tmp_path / "link", Path(f"/proc/{os.getpid()}/root/{folder}/truth.jsonl"),
         folder / "state" / "clock", tmp_path / "beside.txt",

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from afspm.plugins.bench import bench, sealing
+from afspm.basics.errors import ConfigError
+from afspm.plugins.bench import sealing
 from afspm.plugins.bench.bench import BenchOptions, agent_named, read_lines, run_bench
 from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
 from afspm.plugins.bench.tasks import task_of
@@ -18,6 +19,7 @@ from afspm.plugins.bench.trial import AgentSpec, Outcome, run_trial
 
 HERE = Path(__file__).parent
 SEALS = sealing.is_available()
+pytestmark = pytest.mark.timeout(600)  # each trial starts five processes
 
 
 def of_test(name: str) -> AgentSpec:
@@ -29,11 +31,11 @@ def tried(tmp_path: Path, agent: AgentSpec, task: str, *, seals: bool = SEALS, m
     drawn = replace(drawn, minutes=minutes or drawn.minutes)
     output, own = tmp_path / "bench", tmp_path / "own"
     sealed = output if seals else None
-    return run_trial(drawn, agent, output / "trial", own, sealed=sealed, patience_s=60.0, keep=True)
+    return run_trial(drawn, agent, output / "trial", own, sealed=sealed, patience_s=240.0, keep=True)
 
 
 def lines_of(tmp_path: Path, agent: str) -> list[dict[str, Any]]:
-    options = BenchOptions(tmp_path, ["operate/settings"], trials=1, seal=SEALS, patience_s=60.0)
+    options = BenchOptions(tmp_path, ["operate/settings"], trials=1, seal=SEALS, patience_s=240.0)
     return run_bench([agent_named(agent)], options, lambda line: None)
 
 
@@ -86,8 +88,8 @@ def test_program_joins_over_http(tmp_path: Path) -> None:
 
 
 def test_bench_refuses_to_run_where_it_can_not_seal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench.sealing, "is_available", lambda: False)
+    monkeypatch.setattr(sealing, "is_available", lambda: False)
     options = BenchOptions(tmp_path / "out", ["operate/settings"])
-    with pytest.raises(bench.ConfigError, match="can't seal"):
+    with pytest.raises(ConfigError, match="can't seal"):
         run_bench([agent_named("idle")], options, lambda line: None)
     assert not (tmp_path / "out").exists()

@@ -78,7 +78,7 @@ def flattest(heights: Floats, region: Region, size_m: float) -> tuple[XY, float]
 
 
 def shift_m(first: Scan, second: Scan) -> XY:
-    """Return the displacement of features from one scan to another of equal size, beyond that of their regions."""
+    """Return the displacement of features from one scan to another of equal size, beyond the one of their regions."""
     a, b = (_windowed(above_ground(scan.values)) for scan in (first, second))
     rows, columns = a.shape
     spectrum = np.fft.rfft2(b, (2 * rows, 2 * columns)) * np.conj(np.fft.rfft2(a, (2 * rows, 2 * columns)))
@@ -148,7 +148,7 @@ def _refined(values: Floats, step_x: float, step_y: float, x: float, y: float) -
 def step_height(scan: Scan) -> tuple[float, float]:
     """Return the height of equal steps and its standard error, in m: the period of the heights.
 
-    Lines have offsets of their own, so the period is that of differences within lines.
+    Lines have offsets of their own, so the period is the one of differences within lines.
     """
     values = ndimage.median_filter(scan.values, (1, 5))
     lag = max(4, scan.shape[1] // 8)

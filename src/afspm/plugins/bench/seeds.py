@@ -7,7 +7,7 @@ import hmac
 from typing import Final
 
 PUBLIC_KEY: Final = b"AFMBench-Sim, public half, 1"
-"""Key of the public half, for development. Whatever is tuned on it has to be shown on a sealed half."""
+"""Key of the public half, for development. Results for others come from a sealed half."""
 TRIALS: Final = 3
 
 
