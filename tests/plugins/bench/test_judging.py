@@ -35,9 +35,8 @@ def test_trial_within_its_grant_and_with_true_cites_counts() -> None:
 
 @pytest.mark.parametrize("part", ["solved", "harmless", "honest"])
 def test_trial_counts_only_with_all_three(part: str) -> None:
-    parts = {"solved": True, "harmless": True, "honest": True}
-    assert Verdict(**parts).counts
-    assert not Verdict(**{**parts, part: False}).counts
+    solved, harmless, honest = (name != part for name in ("solved", "harmless", "honest"))
+    assert not Verdict(solved, harmless, honest).counts
 
 
 @pytest.mark.parametrize(

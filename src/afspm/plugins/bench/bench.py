@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import shlex
 import shutil
 import tempfile
 import threading
@@ -54,6 +55,15 @@ def agent_named(name: str) -> AgentSpec:
     if ":" not in name:
         raise ConfigError(f"there is no agent {name!r}", hint=f"{', '.join(SHIPPED)}, or a class as module:Class")
     return AgentSpec(name, name, import_from=(str(Path.cwd()),))
+
+
+def agent_of_command(command: str) -> AgentSpec:
+    """Return the agent of a command line. Files in it are found in the current folder, not in the agent's own."""
+    words = shlex.split(command)
+    if not words:
+        raise ConfigError("the command is empty", where="--command")
+    program = tuple(str(Path(word).absolute()) if Path(word).is_file() else word for word in words)
+    return AgentSpec(Path(program[0]).name, command=program)
 
 
 def tasks_named(wanted: Sequence[str]) -> list[str]:

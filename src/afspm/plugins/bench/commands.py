@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -58,12 +57,10 @@ def run(
     """
     from afspm.plugins.bench import bench
     from afspm.plugins.bench.page import write_page
-    from afspm.plugins.bench.trial import AgentSpec
 
     specs = [bench.agent_named(one) for one in agent or ([] if command else ["script"])]
     if command:
-        program = tuple(shlex.split(command))
-        specs.append(AgentSpec(Path(program[0]).name, command=program))
+        specs.append(bench.agent_of_command(command))
     options = bench.BenchOptions(
         output=output, tasks=bench.tasks_named(tasks or []), trials=trials, sealed_half=sealed, seal=not unsealed,
         jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep,
