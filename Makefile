@@ -48,9 +48,11 @@ test: $(COLLECTED)
 
 ## the rest: whole experiments, samples, snippets of the docs, faults of controllers, mutants. What is APART, or needs more
 ## (root, compilers, an hour), has a target of its own, below
+# Fewer at a time than of the quick ones: each starts some ten processes, and more wait longer for each other than they gain
+SLOW_AT_A_TIME ?= 5
 # A power cut is tried alone: the scheduler publishes what a disk has not taken within 0.2 s, which may be lost
 test-all: $(COLLECTED)
-	@$(PYTEST) -n $(TESTS_AT_A_TIME) --dist worksteal -m slow $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
+	@$(PYTEST) -n $(SLOW_AT_A_TIME) --dist worksteal -m slow $(addprefix --ignore ,$(APART) tests/system/hosts $(POWER_CUT))
 	@$(PYTEST) $(POWER_CUT)
 
 ## the page, the gateway, clients in other languages, the installed wheel, and each row of the benchmark once

@@ -6,6 +6,7 @@ Run by the Makefile: `python3 tools/bootstrap.py demo` (what a plain install hol
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
@@ -106,5 +107,11 @@ def _make_venv() -> None:
     sys.exit(f"Python's venv module is incomplete here; on Debian: apt install {package}")
 
 
+def _wanted(arguments: list[str]) -> str:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("wanted", nargs="?", default="all", choices=("demo", "test", "all", "gateway", "coverage"))
+    return str(parser.parse_args(arguments).wanted)
+
+
 if __name__ == "__main__":
-    main(*(sys.argv[1:] or ["all"]))
+    main(_wanted(sys.argv[1:]))

@@ -22,7 +22,7 @@ fn compile_messages() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// `libsodium-sys-stable` has built libsodium and tells where, or was told by `SODIUM_LIB_DIR`; the `zmq` crate's libzmq
+/// `libsodium-sys-stable` builds libsodium, or uses that of `SODIUM_LIB_DIR`, and passes its path on; the `zmq` crate's libzmq
 /// has no CURVE.
 fn compile_libzmq() -> Result<(), Box<dyn Error>> {
     let (library, include) = match env::var("SODIUM_LIB_DIR") {

@@ -49,7 +49,8 @@ def _python(folder: str) -> list[Path]:
 def _pages() -> list[Path]:
     decisions = ROOT / "docs" / "explanation" / "decisions"
     pages = [file for file in sorted((ROOT / "docs").rglob("*.md")) if decisions not in file.parents]
-    return [*pages, *sorted(ROOT.glob("*.md"))]
+    samples = sorted((ROOT / "experiments").rglob("*.md"))
+    return [*pages, *sorted(ROOT.glob("*.md")), *sorted((ROOT / "src").rglob("*.md")), *samples]
 
 
 def _sentences(source: str) -> Iterator[tuple[int, str]]:

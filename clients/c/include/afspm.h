@@ -98,7 +98,7 @@ AFSPM_API int afspm_problems(const afspm_client *client, int *numbers, int capac
 
 /* --- what comes --- */
 
-/* Wait until the scheduler is connected, and everything that it has kept is here. */
+/* Wait until the scheduler is connected and all packets of its cache have arrived. */
 AFSPM_API int afspm_wait_ready(const afspm_client *client, double timeout_s);
 /* The oldest packet that was not given out yet and whose envelope begins with `prefix` ("" for all). */
 AFSPM_API int afspm_next(const afspm_client *client, const char *prefix, double timeout_s, afspm_packets **packet);

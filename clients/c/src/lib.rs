@@ -305,7 +305,7 @@ pub unsafe extern "C" fn afspm_problems(
     })
 }
 
-// --- what comes ---
+// --- packets ---
 
 #[no_mangle]
 pub unsafe extern "C" fn afspm_wait_ready(handle: *const Handle, timeout_s: c_double) -> c_int {

@@ -1,4 +1,4 @@
-//! The handle on an experiment: what is published, what is asked for, and the end.
+//! The handle of an experiment: published packets, requests, and the end.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -18,20 +18,20 @@ use crate::shared::{earlier, Pending, Shared};
 use crate::wire::{self, Response};
 use crate::{sockets, zmq};
 
-const LONGER_THAN_THE_SCHEDULER: f64 = 1.2; // what it says when it gives up on the microscope is an answer
+const LONGER_THAN_THE_SCHEDULER: f64 = 1.2; // so that its NO_RESPONSE arrives before the timeout
 pub(crate) const NO_RESPONSE: u8 = ControlResponse::RepNoResponse as u8;
 const PROBLEMS: [(&str, u8); 4] =
     [("tip-shape-changed", 1), ("device-malfunction", 2), ("feedback-non-optimal", 3), ("thermal-drift", 4)];
 
-/// A component's handle on its experiment, for any number of threads: clones are the same handle.
+/// A component's handle of its experiment, for any number of threads; clones share one connection.
 ///
-/// Calls block until they are done; timeouts are in real time, and `None` waits for as long as it takes. After the end
+/// Calls block until they are done; timeouts are in real time, and `None` waits without limit. After the end
 /// of the experiment every call returns [`Error::Ended`], after the end of standard input [`Error::Stopped`].
 #[derive(Clone)]
 pub struct Client {
     pub(crate) shared: Arc<Shared>,
     pub(crate) requests: Arc<AtomicU64>,
-    /// One thread at a time asks for control, or measures.
+    /// Held by the thread that requests control, or measures.
     pub(crate) asking: Arc<Mutex<()>>,
     pub(crate) measuring: Arc<Mutex<crate::measure::Memory>>,
     threads: Arc<Threads>,
@@ -71,11 +71,11 @@ impl Drop for Threads {
     }
 }
 
-/// What the client holds to be true now.
+/// The newest published states.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
     pub in_control: bool,
-    /// None: none was published yet.
+    /// None: not yet published.
     pub control: Option<ControlStatus>,
     pub scope_state: ScopeState,
     pub scan_parameters: Option<ScanParameters>,
@@ -85,10 +85,10 @@ pub struct Snapshot {
 }
 
 impl Client {
-    /// Take part in the experiment that has started this process: read the launch line from standard input.
+    /// Join the experiment that started this process: read the launch line from standard input.
     ///
     /// Standard input then belongs to the client, see [`Client::line`]. When it ends, calls return [`Error::Stopped`],
-    /// and a process that is still there 1.5 s later is ended with the exit code 81.
+    /// and a process that still runs 1.5 s later is ended with the exit code 81.
     pub fn launched() -> Result<Client> {
         parent::leave_interrupts_to_parent();
         let mut pipe = Pipe::take()?;
@@ -98,7 +98,7 @@ impl Client {
         Ok(client)
     }
 
-    /// Join a running experiment by the folder of its run, under a name of its own, as `afspm.connect` does.
+    /// Join a running experiment by the folder of its run, under another name, as `afspm.connect` does.
     pub fn join(run: impl AsRef<Path>, name: &str) -> Result<Client> {
         let launch = Launch::of_guest(run.as_ref(), name)?;
         let patience = launch.request_timeout();
@@ -107,7 +107,7 @@ impl Client {
         Ok(client)
     }
 
-    /// Connect as a launch line says.
+    /// Connect as described by a launch line.
     pub fn open(launch: Launch) -> Result<Client> {
         let life = sockets::new_life();
         let session = if launch.run.is_empty() { life } else { format!("{}-{life}", launch.run) };
@@ -123,7 +123,7 @@ impl Client {
         Ok(Client { shared, requests, asking, measuring: Arc::new(Mutex::new(memory)), threads })
     }
 
-    /// Leave the experiment: give back control, say that the process closes on purpose, and end all calls.
+    /// Leave the experiment: release control, send the closing beat, and end all calls.
     pub fn close(&self) {
         self.threads.end();
     }
@@ -138,7 +138,7 @@ impl Client {
         &self.shared.launch.name
     }
 
-    /// Return a setting of the component's table in the experiment file; null if it is not there.
+    /// Return a setting of the component's table in the experiment file; null without it.
     pub fn setting(&self, name: &str) -> &Value {
         &self.shared.launch.settings[name]
     }
@@ -153,12 +153,12 @@ impl Client {
         eprintln!("{level} {text}");
     }
 
-    /// Allow the program to compute for so long between two calls; the default is 30 s. Beyond that it counts as frozen.
+    /// Set the longest time between two calls, by default 30 s. After it the process counts as frozen.
     pub fn allow_step(&self, longest: Duration) {
         self.shared.activity.allow(longest);
     }
 
-    /// Return what is known of microscope and control.
+    /// Return the newest published states of microscope and control.
     pub fn state(&self) -> Snapshot {
         let state = self.shared.lock();
         Snapshot {
@@ -171,9 +171,9 @@ impl Client {
         }
     }
 
-    // --- what comes ---
+    // --- packets ---
 
-    /// Wait until the scheduler is connected, and everything that it has kept is here.
+    /// Wait until the scheduler is connected and all packets of its cache have arrived.
     pub fn wait_ready(&self, timeout: Option<Duration>) -> Result<()> {
         let needs_replay = !self.shared.launch.sockets.subscribe.is_empty();
         let needs_control = self.shared.launch.sockets.control.is_some();
@@ -183,9 +183,9 @@ impl Client {
         ready.ok_or_else(|| Error::TimedOut("the scheduler does not answer; is the experiment running?".into()))
     }
 
-    /// Return the oldest packet that was not returned yet and whose envelope begins with `prefix`.
+    /// Return the oldest unread packet whose envelope begins with `prefix`.
     ///
-    /// Packets wait in up to 256 MB of memory; beyond that the oldest are dropped, and a warning says how many.
+    /// Packets wait in up to 256 MB of memory; beyond that the oldest are dropped, and their number is logged.
     pub fn next(&self, prefix: &str, timeout: Option<Duration>) -> Result<Arc<Packet>> {
         let found = self.shared.wait(until(timeout), |state| {
             let packet = state.next_packet(prefix)?;
@@ -198,7 +198,7 @@ impl Client {
         Ok(packet)
     }
 
-    /// Return the next line of standard input after the launch line, for programs that are told more than that.
+    /// Return the next line of standard input after the launch line, for programs with more input.
     pub fn line(&self, timeout: Option<Duration>) -> Result<String> {
         let line = self.shared.wait(until(timeout), |state| state.lines.pop_front())?;
         line.ok_or_else(|| Error::TimedOut("no line came in time".into()))
@@ -211,15 +211,15 @@ impl Client {
         format!("{}/{}/{number}", self.shared.launch.name, self.shared.session)
     }
 
-    /// Send a request, and return its answer, whatever it is.
+    /// Send a request, and return its answer, also a refusal.
     ///
-    /// Without an answer it is repeated with the same id, which has it executed once; a scheduler that is away is waited
-    /// for. If none comes: REP_NO_RESPONSE, with the detail 1 if it was never sent, else 2.
+    /// Without an answer it is repeated with the same id, so that it is executed once. The wait lasts while no scheduler is
+    /// connected. Without any answer: REP_NO_RESPONSE, with the detail 1 if it was never sent, otherwise 2.
     pub fn request(&self, number: u8, object: &[u8]) -> Result<Response> {
         self.request_as(&self.next_id(), number, object, None)
     }
 
-    /// `request` under an id that an earlier life may have used.
+    /// `request` with an id that an earlier life may have used.
     pub(crate) fn request_as(&self, id: &str, number: u8, object: &[u8], until: Option<Instant>) -> Result<Response> {
         self.shared.lock().pending.insert(id.to_owned(), Pending::default());
         let answer = self.repeat(id, number, object, until);
@@ -249,7 +249,7 @@ impl Client {
             })?;
             match heard {
                 Some(Some(answer)) => return Ok(Some(answer)),
-                Some(None) => {} // a connection that was lost is the scheduler's restart, not its silence
+                Some(None) => {} // a lost connection is a restart of the scheduler, not silence
                 None if until.is_some_and(|until| Instant::now() >= until) => break,
                 None => tried += 1,
             }
@@ -257,7 +257,7 @@ impl Client {
         Ok(None)
     }
 
-    /// `request`, of which anything but success is an error.
+    /// `request`, with an error for anything but success.
     pub(crate) fn command(&self, what: &str, kind: ControlRequest, object: &[u8]) -> Result<Response> {
         let response = self.request(kind as u8, object)?;
         if response.is_success() {
@@ -267,29 +267,29 @@ impl Client {
         }
     }
 
-    /// Return a parameter's value, as text, in its unit.
+    /// Return the value of a parameter as text, in its unit.
     pub fn get(&self, parameter: &str) -> Result<Parameter> {
         let object = wire::parameter(parameter, None, None);
         wire::parameter_from(&self.command(parameter, ControlRequest::ReqParam, &object)?.object)
     }
 
-    /// Set a parameter, and return what is then in force. It needs control.
+    /// Set a parameter, and return the value in force. Needs control.
     pub fn set(&self, parameter: &str, value: &str, unit: Option<&str>) -> Result<Parameter> {
         let object = wire::parameter(parameter, Some(value), unit);
         wire::parameter_from(&self.command(parameter, ControlRequest::ReqParam, &object)?.object)
     }
 
-    /// Set what is given of the z feedback. It needs control.
+    /// Set the given parts of the z feedback. Needs control.
     pub fn set_feedback(&self, feedback: &Feedback) -> Result<()> {
         self.command("the feedback", ControlRequest::ReqSetZctrlParams, &wire::feedback(feedback)).map(drop)
     }
 
-    /// Have the microscope do something by its name, such as "x-retract". It needs control.
+    /// Perform an action by its name, such as "x-retract". Needs control.
     pub fn action(&self, name: &str) -> Result<()> {
         self.command(name, ControlRequest::ReqAction, &wire::action(name)).map(drop)
     }
 
-    /// Return whether the microscope has an action of this name; nothing is done.
+    /// Return whether the microscope has an action, without performing it.
     pub fn supports(&self, action: &str) -> Result<bool> {
         let response = self.request(ControlRequest::ReqActionSupport as u8, &wire::action(action))?;
         match ControlResponse::try_from(i32::from(response.response)) {
@@ -299,19 +299,19 @@ impl Client {
         }
     }
 
-    /// Return the number of a problem by its name: one of the wire's, or one that the experiment file names.
+    /// Return the number of a problem by its name: one of the wire format's or of the experiment file's.
     pub fn problem(&self, name: &str) -> Result<u8> {
         let known = PROBLEMS.iter().find(|(known, _)| *known == name).map(|(_, number)| *number);
         let named = known.or_else(|| self.shared.launch.problems.get(name).copied());
         named.ok_or_else(|| Error::Invalid(format!("there is no problem {name:?}")))
     }
 
-    /// Flag a problem: control is taken from its holder until the problem is cleared.
+    /// Flag a problem: it revokes control until a component clears the problem.
     pub fn flag(&self, problem: u8) -> Result<()> {
         self.command("flagging a problem", ControlRequest::ReqAddExpPrblm, &[problem]).map(drop)
     }
 
-    /// Remove the flag of a problem.
+    /// Clear a problem.
     pub fn clear(&self, problem: u8) -> Result<()> {
         self.command("clearing a problem", ControlRequest::ReqRmvExpPrblm, &[problem]).map(drop)
     }
@@ -329,7 +329,7 @@ impl Client {
         }
     }
 
-    /// Publish how far the component is: `done` of `of`.
+    /// Publish the component's progress: `done` of `of`.
     pub fn progress(&self, done: u64, of: u64) -> Result<()> {
         let timestamp = Some(wire::timestamp(self.now_ns()));
         let name = Some(self.name().to_owned());
@@ -337,7 +337,7 @@ impl Client {
         self.tell("Progress", &progress)
     }
 
-    /// Write a remark of 1 to 1000 characters into the record: on the scan that was finished at `scan_ns`, or on now.
+    /// Write a remark of 1 to 1000 characters into the record, on the scan finished at `scan_ns` or on now.
     pub fn note(&self, text: &str, scan_ns: Option<i64>) -> Result<()> {
         let now_ns = self.now_ns();
         self.tell(
@@ -362,7 +362,7 @@ impl Client {
     }
 }
 
-/// Return the moment when a timeout is over.
+/// Return the end of a timeout.
 pub(crate) fn until(timeout: Option<Duration>) -> Option<Instant> {
     timeout.and_then(|timeout| Instant::now().checked_add(timeout))
 }

@@ -1,4 +1,4 @@
-//! Having control: asking for it, waiting for it, noticing that it is gone, giving it back.
+//! Control: requesting it, waiting for it, noticing its loss, releasing it.
 
 use std::sync::PoisonError;
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use crate::proto::{ControlRequest, ControlResponse};
 use crate::shared::{earlier, State};
 use crate::wire::Response;
 
-const ASK_AGAIN: Duration = Duration::from_secs(10); // should a published control state ever not come
+const ASK_AGAIN: Duration = Duration::from_secs(10); // in case a published control state is not received
 const WRONG_PROBLEM: u8 = ControlResponse::RepWrongExpProblem as u8;
 /// Answers to a request for control that will be granted later.
 const WAIT_FOR: [u8; 3] =
@@ -18,30 +18,30 @@ const WAIT_FOR: [u8; 3] =
 /// Keeps control until it is dropped.
 pub struct Control<'a> {
     client: &'a Client,
-    /// There was none before.
+    /// Whether control was not held before.
     is_outermost: bool,
 }
 
 impl Drop for Control<'_> {
     fn drop(&mut self) {
         if self.is_outermost {
-            let _ = self.client.release_control(); // that it was lost, or the experiment is over, is fine
+            let _ = self.client.release_control(); // lost control or an ended experiment is no error here
         }
     }
 }
 
 impl Client {
-    /// Keep control until what is returned is dropped; waits for it first.
+    /// Wait for control, and hold it until the returned guard is dropped.
     ///
-    /// Within, control may still be lost to a problem or to MANUAL: then commands are refused, and measurements wait until
-    /// it is back. `solving` is the flagged problem that will be solved, 0 for none.
+    /// Meanwhile control may still be lost to a problem or to MANUAL: then commands are refused, and measurements wait for
+    /// it. `solving`: the flagged problem to solve, 0 for none.
     pub fn control(&self, solving: u8, timeout: Option<Duration>) -> Result<Control<'_>> {
         let is_outermost = self.shared.lock().hold.asked.is_none();
         self.request_control(solving, timeout)?;
         Ok(Control { client: self, is_outermost })
     }
 
-    /// `control` for languages without scopes: to be followed by one [`Client::release_control`].
+    /// `control` for languages without scopes; each call needs one [`Client::release_control`].
     pub fn request_control(&self, solving: u8, timeout: Option<Duration>) -> Result<()> {
         let before = self.shared.change(|state| {
             let hold = &mut state.hold;
@@ -58,13 +58,13 @@ impl Client {
         })
     }
 
-    /// Give control back; while another thread measures, at the end of that.
+    /// Release control; while another thread measures, at the end of its measurement.
     pub fn release_control(&self) -> Result<()> {
         self.shared.change(|state| state.hold.asked = None);
         self.give_back()
     }
 
-    /// Have control during a measurement.
+    /// Hold control during a measurement.
     pub(crate) fn hold(&self, until: Option<Instant>) -> Result<()> {
         self.shared.change(|state| state.hold.users += 1);
         self.regain(until).inspect_err(|_| self.shared.change(|state| state.hold.users -= 1))
@@ -77,12 +77,12 @@ impl Client {
 
     fn give_back(&self) -> Result<()> {
         if self.shared.change(|state| !state.hold.is_wanted() && std::mem::take(&mut state.hold.held)) {
-            self.request(ControlRequest::ReqReleaseCtrl as u8, b"")?; // that it was not ours any more is fine
+            self.request(ControlRequest::ReqReleaseCtrl as u8, b"")?; // a refusal means that it was lost before
         }
         Ok(())
     }
 
-    /// Be in control: at once if we are, else ask, wait for the control state to change, and ask again.
+    /// Return once in control: request it, wait for the control state to change, and request again.
     pub(crate) fn regain(&self, until: Option<Instant>) -> Result<()> {
         let _asking = self.asking.lock().unwrap_or_else(PoisonError::into_inner);
         let mut told = String::new();
@@ -116,7 +116,7 @@ impl Client {
         }
     }
 
-    /// Return an error if control will not be given however long it is waited for.
+    /// Return an error if control can't be granted after any wait.
     fn check_waiting(&self, response: &Response, solving: u8) -> Result<()> {
         let is_flagged = self.shared.lock().view.is_flagged(solving);
         if solving != 0 && response.response == WRONG_PROBLEM && !is_flagged {
@@ -130,7 +130,7 @@ impl Client {
 }
 
 impl State {
-    /// The state that names us may have come before the answer.
+    /// The state that names this component may arrive before the answer.
     fn gained(&mut self, name: &str) {
         self.hold.tenures += 1;
         self.hold.held = true;

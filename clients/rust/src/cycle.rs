@@ -1,4 +1,4 @@
-//! One scan or spectrum, followed through what the scheduler publishes. Pure: packets in, an outcome out.
+//! One scan or spectrum, followed by published packets. Pure: takes packets, returns an outcome.
 
 use std::sync::Arc;
 
@@ -8,11 +8,11 @@ use crate::model::{Message, Packet, Region, ScopeStatus};
 use crate::proto::ScopeState;
 
 const FITS: f64 = 1e-2; // of the size: a controller's rounding, not another region
-const SPOT_M: f64 = 20e-9; // a scanner with sensors reports where the tip was, some nanometres from where it was sent
-const MOVED: f64 = 0.5; // of the size: where drift is corrected, a scan lies where it turned out to have been taken
+const SPOT_M: f64 = 20e-9; // a scanner with sensors reports the measured position, some nanometres from the requested one
+const MOVED: f64 = 0.5; // of the size: with drift correction a scan is published at its registered position
 const SHEARED: f64 = 0.1;
 
-/// What is to be measured; None leaves what is set.
+/// A requested measurement; None: as set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum Target {
     Scan { region: Option<Region>, shape: Option<[usize; 2]>, drifts: bool },
@@ -44,7 +44,7 @@ impl Target {
         }
     }
 
-    /// Return whether a packet can be a result of this; None if it is none of its kind.
+    /// Return whether a packet can be a result of this target; None for another kind of packet.
     fn fits(&self, packet: &Packet) -> Option<bool> {
         match (self, &packet.message) {
             (Target::Scan { region, shape, drifts }, Message::Scan(scan)) => {
@@ -72,24 +72,24 @@ impl Target {
     }
 }
 
-/// How a cycle ended.
+/// The outcome of a cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Outcome {
     Completed,
-    /// The microscope says that it was stopped.
+    /// The microscope published an interruption.
     Interrupted,
-    /// The microscope is free and there is nothing: it was started anew in the middle, say.
+    /// The microscope is free without a result, for example after a restart of the translator.
     Vanished,
-    /// The results can't be those asked for.
+    /// The results do not match the request.
     Another,
 }
 
 /// The busy state, then results, then FREE.
 pub struct Cycle {
     target: Target,
-    /// What is not newer than this belongs to something earlier.
+    /// Packets up to this time belong to an earlier measurement.
     since_ns: Option<i64>,
-    /// It was asked for in an earlier life, or control was lost: others may have measured since.
+    /// It was requested in an earlier life, or control was lost: another component may have measured since.
     resumed: bool,
     pub begun: bool,
     pub outcome: Option<Outcome>,
@@ -107,7 +107,7 @@ impl Cycle {
         self.resumed = true;
     }
 
-    /// Take in what the scheduler published.
+    /// Process a packet of the scheduler.
     pub fn take(&mut self, packet: &Arc<Packet>) {
         let is_old = match packet.time_ns {
             Some(time_ns) => self.since_ns.is_some_and(|since_ns| time_ns <= since_ns),
@@ -129,7 +129,7 @@ impl Cycle {
 
     fn take_state(&mut self, status: ScopeStatus) {
         if status.state == self.target.busy() {
-            self.results.clear(); // what came before this began belongs to another
+            self.results.clear(); // results from before the start belong to another measurement
             (self.begun, self.other) = (true, false);
         } else if self.begun && status.state == ScopeState::SsInterrupted {
             self.outcome = Some(Outcome::Interrupted);

@@ -1,4 +1,4 @@
-//! What can go wrong, each with its remedy.
+//! The errors, each with its remedy.
 
 use std::fmt;
 
@@ -6,24 +6,24 @@ use crate::proto::ControlResponse;
 
 pub type Result<T> = std::result::Result<T, Error>;
 
-/// Why a call did not succeed.
+/// The reason why a call failed.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Error {
-    /// Scheduler, limit or microscope said no.
+    /// A refusal by the scheduler, a limit or the microscope.
     Refused(Refusal),
-    /// The time given was up.
+    /// The timeout is over.
     TimedOut(String),
-    /// The measurement failed again and again without a reason; a person should look.
+    /// The measurement failed repeatedly without a known reason: a person has to look.
     MeasurementFailed(String),
     /// The experiment has ended: exit with 80.
     Ended,
-    /// The parent has gone, or wants the process to stop: exit with 81.
+    /// The parent is gone, or stops the process: exit with 81.
     Stopped,
     /// Settings that can't work: exit with 78.
     Config(String),
-    /// An argument that makes no sense.
+    /// A meaningless argument.
     Invalid(String),
-    /// Bytes that are no message.
+    /// Bytes that violate the wire format.
     Wire(String),
     /// An address can't be used.
     Transport(String),
@@ -31,16 +31,16 @@ pub enum Error {
     File(String),
 }
 
-/// A response that is no success.
+/// An unsuccessful response.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refusal {
-    /// What was asked for.
+    /// The request.
     pub what: String,
     /// The number of a `ControlResponse`, or one that only a newer peer knows.
     pub response: u8,
     /// For a person; may be empty.
     pub reason: String,
-    /// What a program must know beside the response: 1, the request was not sent; 2, it may or may not have been
+    /// Details for programs beside the response: 1, the request was not sent; 2, it may or may not have been
     /// carried out; 3, the experiment has ended; 0 for none.
     pub detail: u8,
 }
@@ -52,7 +52,7 @@ pub fn response_name(response: u8) -> String {
 }
 
 impl Error {
-    /// Return the exit code by which a process tells its supervisor that it ends over this.
+    /// Return the exit code of a process that ends with this error.
     pub fn exit_code(&self) -> u8 {
         match self {
             Error::Ended => 80,

@@ -1,4 +1,4 @@
-//! Heartbeats from a thread of their own, so that a busy process is not taken for dead.
+//! Heartbeats from a separate thread, so that a busy process does not count as dead.
 
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Condvar, Mutex, PoisonError};
@@ -10,7 +10,7 @@ use crate::launch::Launch;
 use crate::sockets;
 use crate::zmq::{self, Context, Socket};
 
-/// The age of the current step, which tells a busy process from a frozen one.
+/// The age of the current step, which distinguishes a busy process from a frozen one.
 pub struct Activity {
     zero: Instant,
     since_ms: AtomicU64,
@@ -32,12 +32,12 @@ impl Activity {
         self.zero.elapsed().as_millis() as u64
     }
 
-    /// Allow a step, between two calls of the library, to take so long.
+    /// Set the longest step between two calls of the library.
     pub fn allow(&self, longest: Duration) {
         self.longest_ms.store(longest.as_millis() as u64, Ordering::Relaxed);
     }
 
-    /// Note that a thread waits, until what is returned is dropped.
+    /// Mark this thread as waiting until the returned guard is dropped.
     pub fn wait(&self) -> Waiting<'_> {
         self.waiting.fetch_add(1, Ordering::SeqCst);
         Waiting(self)
@@ -62,14 +62,14 @@ impl Drop for Waiting<'_> {
 
 type Stop = Arc<(Mutex<bool>, Condvar)>;
 
-/// Beats until it is dropped; the last beat says that the process closes on purpose.
+/// Sends beats until it is dropped; the last one is the closing beat.
 pub struct Heartbeat {
     stop: Stop,
     thread: Option<JoinHandle<()>>,
 }
 
 impl Heartbeat {
-    /// Begin, if the launch line names a listener.
+    /// Start the beats if the launch line names a listener.
     pub fn start(launch: &Launch, activity: &Arc<Activity>) -> Result<Option<Heartbeat>> {
         let Some(address) = &launch.sockets.heartbeat else { return Ok(None) };
         let socket = Context::new()?.socket(zmq::XPUB)?;

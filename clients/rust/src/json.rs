@@ -1,4 +1,4 @@
-//! Messages in protobuf's JSON mapping, by their names: for programs that handle any message, and for the C library.
+//! Messages in protobuf's JSON mapping, by name: for programs that handle any message, and for the C library.
 
 use std::sync::OnceLock;
 
@@ -40,7 +40,7 @@ pub fn from_json(name: &str, json: &str) -> Result<Vec<u8>> {
     Ok(message.encode_to_vec())
 }
 
-/// Decode the message `name` and encode it again; fields that are not known are kept.
+/// Decode the message `name` and encode it again; unknown fields are kept.
 pub fn recoded(name: &str, bytes: &[u8]) -> Result<Vec<u8>> {
     Ok(decoded(name, bytes)?.encode_to_vec())
 }

@@ -16,7 +16,7 @@ use crate::model::Packet;
 use crate::wire;
 use crate::zmq::Frame;
 
-/// What is going to be asked for.
+/// The intent: a measurement about to be requested.
 #[derive(Serialize, Deserialize)]
 pub struct Intent {
     pub key: String,
@@ -48,7 +48,7 @@ fn folder(launch: &Launch) -> Option<PathBuf> {
     (!launch.state_dir.as_os_str().is_empty()).then_some(folder)
 }
 
-/// Readable, safe on every file system, and different for different keys.
+/// Return a file name that is readable, safe on every file system, and unique for each key.
 fn path(launch: &Launch, key: &str) -> Option<PathBuf> {
     let plain: String = key
         .chars()
@@ -68,19 +68,19 @@ pub fn checked(key: &str) -> Result<&str> {
     Ok(key)
 }
 
-/// Return the intent that was written down and not fulfilled.
+/// Return the stored intent without a result.
 pub fn pending(launch: &Launch) -> Result<Option<Intent>> {
     let Some(file) = folder(launch).map(|folder| folder.join("pending.json")) else { return Ok(None) };
     read(&file)?.map(|bytes| parse(&file, &bytes)).transpose()
 }
 
-/// Write down what is going to be asked for, before it is.
+/// Store the intent before its request.
 pub fn intend(launch: &Launch, intent: &Intent) -> Result<()> {
     let Some(folder) = folder(launch) else { return Ok(()) };
     write(&folder.join("pending.json"), &[&serde_json::to_vec(intent).expect("plain values")])
 }
 
-/// Return the result of an earlier life, or of an earlier call, with the same key.
+/// Return the stored result of this key.
 pub fn find(launch: &Launch, key: &str, target: &Target) -> Result<Option<Measured>> {
     let Some(file) = path(launch, key) else { return Ok(None) };
     let Some(bytes) = read(&file)? else { return Ok(None) };
@@ -101,7 +101,7 @@ pub fn find(launch: &Launch, key: &str, target: &Target) -> Result<Option<Measur
     Ok(Some(Measured { packets, interruptions: head.interruptions }))
 }
 
-/// Keep the result; the intent is fulfilled.
+/// Store the result, and remove the intent.
 pub fn fulfil(launch: &Launch, key: &str, target: &Target, measured: &Measured) -> Result<()> {
     let (Some(file), Some(folder)) = (path(launch, key), folder(launch)) else { return Ok(()) };
     let bodies: Vec<Vec<u8>> = measured.packets.iter().map(|packet| wire::measurement(packet)).collect();
@@ -151,7 +151,7 @@ fn remove(file: &Path) -> Result<()> {
     }
 }
 
-/// Write a file completely and synced, or not at all.
+/// Write a file atomically, and flush it to the disk.
 fn write(file: &Path, parts: &[&[u8]]) -> Result<()> {
     let partial = file.with_extension("partial");
     let written = (|| {

@@ -1,4 +1,4 @@
-//! The launch line: one line of JSON from which a component learns its part in an experiment.
+//! The launch line: one line of JSON that describes a component's part in an experiment.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,14 +18,14 @@ pub struct Launch {
     /// Its settings in the experiment file.
     pub settings: Value,
     pub sockets: Sockets,
-    /// Prefixes of the envelopes that it listens to; None: all.
+    /// Prefixes of its envelopes; None: all.
     pub envelopes: Option<Vec<String>>,
     pub clock: Clock,
     /// Problems that the experiment file names.
     pub problems: BTreeMap<String, u8>,
     /// The folder of the run.
     pub run_dir: PathBuf,
-    /// Where to keep what must survive a restart; empty: nothing is kept.
+    /// The folder for data that survive a restart; empty: none survive.
     pub state_dir: PathBuf,
     pub beat_period_s: f64,
     pub beat_token: String,
@@ -33,11 +33,11 @@ pub struct Launch {
     #[serde(default = "three")]
     pub request_retries: u32,
     pub keys: Option<Keys>,
-    /// The identity of the run; empty: it is not known.
+    /// The identity of the run; empty: unknown.
     pub run: String,
-    /// True only where the microscope is simulated for certain.
+    /// True only if the microscope is certainly simulated.
     pub simulated: bool,
-    /// Places are those of the sample, which the scheduler maps to those of the tip.
+    /// Positions are in sample coordinates, which the scheduler maps to tip coordinates.
     pub sample_coordinates: bool,
 }
 
@@ -49,11 +49,11 @@ fn three() -> u32 {
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(default)]
 pub struct Sockets {
-    /// The publishers that it listens to; the first is the scheduler's.
+    /// The addresses of publishers; the first is the scheduler's.
     pub subscribe: Vec<String>,
-    /// The scheduler, for requests.
+    /// The scheduler's address for requests.
     pub control: Option<String>,
-    /// Where the supervisor listens for heartbeats.
+    /// The supervisor's address for heartbeats.
     pub heartbeat: Option<String>,
 }
 
@@ -69,7 +69,7 @@ pub struct Clock {
 impl Clock {
     /// Return the experiment's time in ns since 1970.
     ///
-    /// A simulated clock that waits for late components goes slower than this formula tells.
+    /// A simulated clock that waits for late components is slower than this formula.
     pub fn now_ns(&self) -> i64 {
         let real_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64);
         let Some(speed) = self.speed else { return real_ns };
@@ -78,7 +78,7 @@ impl Clock {
     }
 }
 
-/// The CURVE pair of the component, and whose key to expect where. Keys are Z85 text.
+/// The CURVE key pair of the component, and the owner of the key at each address. Keys are Z85 text.
 #[derive(Clone, Default, Deserialize)]
 #[serde(default)]
 pub struct Keys {
@@ -116,7 +116,9 @@ impl Launch {
     /// Read a launch line.
     pub fn from_json(line: &str) -> Result<Launch> {
         let read: std::result::Result<Launch, _> = serde_json::from_str(line);
-        let launch = read.map_err(|error| Error::Config(format!("the launch line can't be read: {error}")))?;
+        let mut launch = read.map_err(|error| Error::Config(format!("the launch line can't be read: {error}")))?;
+        // `{"insecure": "true"}`: other computers may be connected without keys
+        launch.keys = launch.keys.filter(|keys| !keys.secret.is_empty());
         if launch.name.is_empty() {
             return Err(Error::Config("the launch line names no process".into()));
         }

@@ -1,6 +1,6 @@
 //! Components for afspm experiments, which automate scanning probe microscopes.
 //!
-//! A component is a process with one purpose. It listens to what is measured, and asks the Microscope Scheduler for control,
+//! A component is a process with one purpose. It receives measurements, and requests from the Microscope Scheduler control,
 //! scans, spectra and settings. Lengths are in metres, angles in radians, times in nanoseconds since 1970.
 //!
 //! ```no_run
@@ -33,7 +33,7 @@ mod sockets;
 mod wire;
 mod zmq;
 
-/// The messages of the contract, `proto/*.proto`, as they are.
+/// The messages of the wire format, generated from `proto/*.proto`.
 pub mod proto {
     #![allow(missing_docs, clippy::all)]
     include!(concat!(env!("OUT_DIR"), "/afspm.rs"));
@@ -56,7 +56,7 @@ pub fn decode_packet(frames: &[&[u8]]) -> Result<Packet> {
     wire::packet(frames.iter().map(|frame| zmq::Frame::copy_of(frame)).collect())
 }
 
-/// Run a component that `afspm run` has started, and return its exit code.
+/// Run a component that `afspm run` started, and return its exit code.
 pub fn run(component: impl FnOnce(&Client) -> Result<()>) -> std::process::ExitCode {
     let ended = Client::launched().and_then(|client| {
         let result = component(&client);

@@ -1,4 +1,4 @@
-//! Taking a scan or spectrum, whatever gets in between: begun anew when control is back, once in all lives with a key.
+//! Measurement of a scan or spectrum, repeated after interruptions; with a key, once in all lives of the component.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, PoisonError};
@@ -13,13 +13,13 @@ use crate::proto::{ControlRequest, ControlResponse, ScopeState};
 use crate::shared::{earlier, Counts, Shared, State};
 use crate::wire::{self, Response};
 
-const BEGUN_WITHIN: Duration = Duration::from_secs(5); // from the success of the action to the state that says so
-const PATIENCE: Duration = Duration::from_secs(60); // that a translator may take to be there again
+const BEGUN_WITHIN: Duration = Duration::from_secs(5); // from the success of the action to its published state
+const PATIENCE: Duration = Duration::from_secs(60); // longest absence of a translator
 const RETRY: Duration = Duration::from_secs(1); // before an unreachable one is asked again
-const SETTLED_WITHIN: Duration = Duration::from_secs(2); // what was set is published, if it changed anything
+const SETTLED_WITHIN: Duration = Duration::from_secs(2); // a setting that changed something is published within this time
 const ASK_FREE_AGAIN: Duration = Duration::from_secs(5); // should the state FREE never come
 const MOST_FAILURES: u32 = 5; // in a row, that nothing explains
-const SAME: f64 = 1e-6; // of the size: closer than any controller positions
+const SAME: f64 = 1e-6; // of the size: finer than any controller positions
 const NOT_IN_CONTROL: [u8; 2] = [ControlResponse::RepNotInControl as u8, ControlResponse::RepWrongControlMode as u8];
 const NOT_FREE: u8 = ControlResponse::RepNotFree as u8;
 
@@ -161,7 +161,7 @@ impl Client {
             return Ok(found);
         }
         let mut memory = self.measuring.lock().unwrap_or_else(PoisonError::into_inner);
-        // what is cached must not be taken for ours
+        // cached results must not count as new ones
         self.waited(
             until,
             |state| (state.caught_up && state.connected).then_some(()),
@@ -173,7 +173,7 @@ impl Client {
         let result = self.take_up(&mut task, &mut memory).and_then(|()| self.finish(&mut task, &mut memory));
         let is_going_on = task.watch.is_some_and(|watch| self.outcome(watch).is_none());
         if result.is_err() && key.is_some() && is_going_on {
-            memory.unfinished = task.watch.take(); // what becomes of it is taken up by its key
+            memory.unfinished = task.watch.take(); // its key leads to the result later
         }
         self.drop_watch(&mut task);
         let measured = Measured { packets: newest_of_each(result?), interruptions: task.interruptions };
@@ -183,7 +183,7 @@ impl Client {
         Ok(measured)
     }
 
-    /// Continue what an earlier life, or an earlier call, was at, if it was this.
+    /// Continue this measurement if an earlier life or call had started it.
     fn take_up(&self, task: &mut Task, memory: &mut Memory) -> Result<()> {
         let Some(watch) = memory.unfinished.take() else { return Ok(()) };
         let intent = keyed::pending(&self.shared.launch)?;
@@ -219,7 +219,7 @@ impl Client {
         released.map(|()| packets)
     }
 
-    /// Attempt after attempt, until one is complete.
+    /// Repeat attempts until one is complete.
     fn measure(&self, task: &mut Task, memory: &mut Memory) -> Result<Vec<Arc<Packet>>> {
         loop {
             if let Some(watch) = task.watch {
@@ -262,7 +262,7 @@ impl Client {
             _ => "the microscope is free again without a result; was it restarted?".to_owned(),
         };
         self.log("WARNING", &format!("{} interrupted: {why}; retrying", task.target.what()));
-        // losing control explains itself and is waited for; all else must not go on for a night
+        // a loss of control is a known reason; all else must not go on for a night
         task.failures = if held { task.failures + 1 } else { 0 };
         if task.failures >= MOST_FAILURES {
             return Err(Error::MeasurementFailed(format!(
@@ -282,7 +282,7 @@ impl Client {
         self.regain(task.until)?;
         let is_new = task.watch.is_none();
         if task.watch.is_some_and(|watch| self.outcome(watch).is_some()) {
-            return Ok(()); // it had begun, and ended while control was waited for
+            return Ok(()); // it had started, and ended during the wait for control
         }
         if is_new {
             task.attempt += 1;
@@ -307,7 +307,7 @@ impl Client {
             self.drop_watch(task);
         }
         match self.get_over(task.target.start(), response, counts, task.until) {
-            // what was asked for before is answered from memory: it was refused then; another id tells what holds now
+            // an earlier id would return the earlier refusal from memory; another id returns the present answer
             Err(Error::Refused(_)) if !is_new => Ok(()),
             other => other,
         }
@@ -327,11 +327,11 @@ impl Client {
         )
     }
 
-    /// From the success of the action to the end of it.
+    /// Follow a measurement from the success of its action to its end.
     fn follow(&self, task: &mut Task, watch: u64) -> Result<()> {
         let timed_out = || Error::TimedOut(format!("the {} was not finished in time; it goes on", task.target.what()));
         loop {
-            // while the scheduler is away it is waited for as long as that lasts
+            // the wait lasts while the scheduler is away
             let connection = self.waited(task.until, |state| state.connected.then_some(state.connections), "")?;
             let begun = self.shared.wait(earlier(BEGUN_WITHIN, task.until), |state| {
                 let cycle = state.cycles.get(&watch)?;
@@ -363,14 +363,14 @@ impl Client {
             Target::Scan { region, shape, drifts } => {
                 let wanted = ScanParameters { region: *region, shape: *shape };
                 let now = self.shared.lock().view.scan_parameters;
-                // in sample coordinates the same region is another place of the tip a while later
+                // in sample coordinates the tip position of a region changes with time
                 let is_fixed = !drifts || region.is_none();
                 let is_rounded = now.is_some_and(|now| memory.rounded == Some((wanted, now)));
                 if is_fixed && (is_rounded || is_set(&wanted, now, SAME)) {
                     return Ok(());
                 }
                 self.set_frame(&wanted, until)?;
-                // a controller may round: then this is what our wish looks like when it is set
+                // a controller may round: this is the requested value after rounding
                 let now = self.shared.lock().view.scan_parameters;
                 memory.rounded = now.filter(|_| is_set(&wanted, now, 1e-2)).map(|now| (wanted, now));
                 Ok(())
@@ -396,8 +396,9 @@ impl Client {
         self.set_and_settle(ControlRequest::ReqSetScanParams, &object, |counts| counts.scan_parameters, until)
     }
 
-    /// Ask for a setting, and wait until it is published and the tip has stopped moving; not for long where nothing is
-    /// published, since nothing changed.
+    /// Change a setting, and wait until it is published and the tip has stopped moving.
+    ///
+    /// The wait is short, since a setting that changed nothing is not published.
     fn set_and_settle(
         &self,
         kind: ControlRequest,
@@ -416,7 +417,7 @@ impl Client {
 
     // --- commands, repeated until they are answered ---
 
-    /// Ask until it succeeds; where control is lost, and was asked for, it is waited for.
+    /// Repeat a request until it succeeds; after a loss of control this waits for control.
     fn ask(&self, kind: ControlRequest, what: &str, object: &[u8], until: Option<Instant>) -> Result<()> {
         let mut id = self.next_id();
         loop {
@@ -438,10 +439,10 @@ impl Client {
         }
     }
 
-    /// Ask once, with patience for a microscope that is silent: the same id has it executed once. What a watched cycle
-    /// shows to have begun is as good as an answer.
+    /// Send a request and repeat it with the same id while the microscope is silent, so that it is executed once.
     ///
-    /// REP_NO_RESPONSE is returned only if control was lost before there was an answer.
+    /// A watched cycle that has started counts as an answer.
+    /// REP_NO_RESPONSE is returned only if control was lost before an answer arrived.
     fn send(
         &self,
         kind: ControlRequest,
@@ -451,7 +452,7 @@ impl Client {
         watch: Option<u64>,
     ) -> Result<Response> {
         let give_up = earlier(PATIENCE, until);
-        self.shared.wait(give_up, |state| state.view.scope.map(drop))?; // one that has not said a word yet is starting
+        self.shared.wait(give_up, |state| state.view.scope.map(drop))?; // a microscope without a published state is starting
         let mut is_repeated = false;
         loop {
             let response = self.request_as(id, kind as u8, object, until)?;
@@ -459,7 +460,7 @@ impl Client {
                 return Err(Error::Ended);
             }
             if is_repeated && NOT_IN_CONTROL.contains(&response.response) {
-                // now; whether it was done before is still unknown
+                // now; the outcome of the earlier attempt is still unknown
                 self.shared.change(|state| state.hold.lost(&response.reason));
                 return Ok(Response { response: NO_RESPONSE, ..response });
             }
@@ -480,10 +481,10 @@ impl Client {
         }
     }
 
-    /// After a response that is no success: wait for what stands in the way, or return it as an error.
+    /// Wait until the cause of an unsuccessful response is gone, or return it as an error.
     fn get_over(&self, what: &str, response: Response, before: Counts, until: Option<Instant>) -> Result<()> {
         if is_silent(&response) {
-            return Ok(()); // control is lost, and waited for when it is asked again
+            return Ok(()); // control is lost; the next attempt waits for it
         }
         if NOT_IN_CONTROL.contains(&response.response) {
             self.shared.change(|state| state.hold.lost(&response.reason));
@@ -504,7 +505,7 @@ impl Client {
 
     // --- looks ---
 
-    /// Wait for what must come; an error that says `what` if it does not come until `until`.
+    /// Wait for a condition; return an error with `what` if it does not hold until `until`.
     fn waited<T>(&self, until: Option<Instant>, look: impl FnMut(&mut State) -> Option<T>, what: &str) -> Result<T> {
         let what = if what.is_empty() { "the scheduler does not answer" } else { what };
         self.shared.wait(until, look)?.ok_or_else(|| Error::TimedOut(what.into()))
@@ -541,12 +542,12 @@ impl Client {
     }
 }
 
-/// Return whether it is unknown what became of a request.
+/// Return whether the outcome of a request is unknown.
 fn is_silent(response: &Response) -> bool {
     response.response == NO_RESPONSE || !response.is_success() && matches!(response.detail, 1 | 2)
 }
 
-/// A restarted translator may have published a channel twice: the newest counts.
+/// A restarted translator may publish a channel twice: the newest counts.
 fn newest_of_each(packets: Vec<Arc<Packet>>) -> Vec<Arc<Packet>> {
     let mut found: Vec<Arc<Packet>> = Vec::new();
     let channel = |packet: &Packet| packet.scan().map(|scan| scan.channel.clone());
@@ -559,7 +560,7 @@ fn newest_of_each(packets: Vec<Arc<Packet>>) -> Vec<Arc<Packet>> {
     found
 }
 
-/// Return whether what is in force is what is wanted, within `tolerance` of the size.
+/// Return whether the parameters in force match the wanted ones within `tolerance` of the size.
 fn is_set(wanted: &ScanParameters, now: Option<ScanParameters>, tolerance: f64) -> bool {
     let Some(now) = now else { return false };
     let has_region = |region: Region| now.region.is_some_and(|now| region.is_near(&now, tolerance));

@@ -1,4 +1,4 @@
-//! What components speak of: regions, scans, spectra and states, in metres and radians.
+//! The model: regions, scans, spectra and states, in metres and radians.
 
 use std::ops::Deref;
 
@@ -8,24 +8,24 @@ use crate::error::{Error, Result};
 use crate::proto::{ControlMode, ScopeState};
 use crate::zmq::Frame;
 
-/// A rectangle turned about its centre. x grows to the right, y upwards.
+/// A rectangle rotated about its centre. x points right, y up.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Region {
     /// (x, y) in m.
     pub center_m: [f64; 2],
-    /// (width, height) in m before it is turned; both above zero.
+    /// (width, height) in m before the rotation; both above zero.
     pub size_m: [f64; 2],
     /// Counter-clockwise.
     pub angle_rad: f64,
 }
 
 impl Region {
-    /// Return a region that is not turned, by its centre (x, y) and size (width, height) in m.
+    /// Return an unrotated region from its centre (x, y) and size (width, height) in m.
     pub fn new(center_m: [f64; 2], size_m: [f64; 2]) -> Region {
         Region { center_m, size_m, angle_rad: 0.0 }
     }
 
-    /// Return the same region turned counter-clockwise about its centre.
+    /// Return the region rotated counter-clockwise about its centre.
     pub fn turned(self, angle_rad: f64) -> Region {
         Region { angle_rad, ..self }
     }
@@ -49,7 +49,7 @@ impl Region {
         )))
     }
 
-    /// Return whether two regions differ by less than `tolerance` of their size everywhere.
+    /// Return whether all corners of two regions differ by less than `tolerance` of their size.
     pub(crate) fn is_near(&self, other: &Region, tolerance: f64) -> bool {
         let distance = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
         let size_m = self.size_m[0].hypot(self.size_m[1]);
@@ -60,7 +60,7 @@ impl Region {
     }
 }
 
-/// Numbers in the buffer that ZeroMQ received, or, where they did not come in one piece, in one of their own.
+/// Numbers in the buffer that ZeroMQ received, or in a copy if they arrived in several pieces.
 pub struct Values(Kept);
 
 enum Kept {
@@ -71,7 +71,7 @@ enum Kept {
 impl Values {
     /// Take `count` numbers at `offset` of a received frame.
     ///
-    /// Where they are not aligned they are shifted by up to seven bytes within the buffer, over the bytes before them.
+    /// Unaligned numbers are shifted by up to seven bytes within the buffer, over the bytes before them.
     pub(crate) fn received(mut frame: Frame, offset: usize, count: usize) -> Values {
         const { assert!(cfg!(target_endian = "little"), "the numbers of the wire are little-endian") };
         let bytes = frame.bytes_mut();
@@ -91,7 +91,7 @@ impl Values {
         Values(Kept::Copied(numbers.collect()))
     }
 
-    /// Return whether the numbers are read in the buffer that ZeroMQ received.
+    /// Return whether the numbers are a view of the buffer that ZeroMQ received.
     pub fn is_view(&self) -> bool {
         matches!(self.0, Kept::Received { .. })
     }
@@ -117,24 +117,24 @@ impl std::fmt::Debug for Values {
     }
 }
 
-/// One channel of a scan, or some rows of one that still runs.
+/// One channel of a scan, or some rows of a running scan.
 #[derive(Debug)]
 pub struct Scan {
-    /// Where it was taken.
+    /// Region of the scan.
     pub region: Region,
     /// Such as "Height Retrace".
     pub channel: String,
-    /// Of the values; empty if none was told.
+    /// Unit of the values; empty if unknown.
     pub unit: String,
     /// [rows, columns].
     pub shape: [usize; 2],
-    /// [y][x], row after row, both coordinates ascending; empty where only the parameters came.
+    /// [y][x], row after row, both coordinates ascending; empty for parameters alone.
     pub values: Values,
-    /// When it was finished, in ns since 1970; of rows, when the scan began.
+    /// The end of the scan, in ns since 1970; for rows, its start.
     pub time_ns: Option<i64>,
-    /// Where the controller saved it; empty if it did not.
+    /// The controller's own file; empty if there is none.
     pub filename: String,
-    /// Of rows, the index in the whole scan of the first.
+    /// For rows, the index of the first one within the whole scan.
     pub first_row: usize,
 }
 
@@ -150,7 +150,7 @@ impl Scan {
 pub struct Spectrum {
     /// Such as "IV".
     pub kind: String,
-    /// (x, y) in m; None if it was not told.
+    /// (x, y) in m; None if unknown.
     pub position_m: Option<[f64; 2]>,
     /// Of the variables.
     pub names: Vec<String>,
@@ -160,29 +160,29 @@ pub struct Spectrum {
     pub shape: [usize; 2],
     /// All variables of the first point, then of the second.
     pub values: Values,
-    /// When it was finished, in ns since 1970.
+    /// The time of measurement, in ns since 1970.
     pub time_ns: Option<i64>,
     pub filename: String,
 }
 
-/// What the microscope does.
+/// The activity of the microscope.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ScopeStatus {
     pub state: ScopeState,
     pub paused: bool,
 }
 
-/// Who is in control, and what stands in the way.
+/// The holder of control, and the problems that withhold it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ControlStatus {
     pub mode: ControlMode,
-    /// The component in control; None for none.
+    /// The name of the component in control; None for none.
     pub holder: Option<String>,
-    /// Numbers of the problems that are flagged, ascending.
+    /// Numbers of the flagged problems, ascending.
     pub problems: Vec<u8>,
 }
 
-/// Where the next scan is taken, and in how many pixels, as far as it is given.
+/// Region and number of pixels of the next scan, as far as given.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScanParameters {
     pub region: Option<Region>,
@@ -190,7 +190,7 @@ pub struct ScanParameters {
     pub shape: Option<[usize; 2]>,
 }
 
-/// A parameter's value, as text, in its unit.
+/// The value of a parameter as text, in its unit.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Parameter {
     pub name: String,
@@ -198,7 +198,7 @@ pub struct Parameter {
     pub unit: Option<String>,
 }
 
-/// The z feedback; what is None is not told, or not to be changed.
+/// The z feedback. None: unknown, or in a request unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Feedback {
     pub on: Option<bool>,
@@ -221,24 +221,24 @@ pub enum Message {
     ScanParameters(ScanParameters),
     Feedback(Feedback),
     ProbePosition([f64; 2]),
-    /// Another message of the contract, or one that the experiment file names, in bytes.
+    /// Another message of the wire format or of the experiment file, in bytes.
     Other(Vec<u8>),
 }
 
-/// One published message, with its envelope and time.
+/// A published message with its envelope and time.
 #[derive(Debug)]
 pub struct Packet {
     /// Such as "Scan2d_2000.0_Height Retrace".
     pub envelope: String,
     /// The name of the message, such as "Scan2d".
     pub name: String,
-    /// When it was first published, in ns since 1970.
+    /// The time of its first publication, in ns since 1970.
     pub time_ns: Option<i64>,
     pub message: Message,
 }
 
 impl Packet {
-    /// Return the scan, if it is one.
+    /// Return the scan in this packet, if any.
     pub fn scan(&self) -> Option<&Scan> {
         match &self.message {
             Message::Scan(scan) => Some(scan),
@@ -246,7 +246,7 @@ impl Packet {
         }
     }
 
-    /// Return the spectrum, if it is one.
+    /// Return the spectrum in this packet, if any.
     pub fn spectrum(&self) -> Option<&Spectrum> {
         match &self.message {
             Message::Spectrum(spectrum) => Some(spectrum),
@@ -254,7 +254,7 @@ impl Packet {
         }
     }
 
-    /// Return the numbers of a scan, of rows or of a spectrum; none of all others.
+    /// Return the numbers of a scan, rows or a spectrum; none for other messages.
     pub fn values(&self) -> &[f64] {
         match &self.message {
             Message::Scan(scan) | Message::Lines(scan) => &scan.values,

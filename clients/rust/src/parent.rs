@@ -1,4 +1,4 @@
-//! The bond to the process that started us: standard input. It ends when the parent wants that, or is dead.
+//! Standard input, the bond to the parent process: its end means that the parent stops this process, or is gone.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,8 +22,8 @@ pub struct Pipe {
 impl Pipe {
     /// Take standard input, and leave an empty one in its place.
     ///
-    /// On Windows, what is asked of a pipe waits for a read of it to end, in whatever thread: a library that only looks
-    /// at its standard input would hang for as long as a thread reads that. Only the duplicate is ever read.
+    /// On Windows, an operation on a pipe waits for the end of a read in any thread: a library that only inspects
+    /// standard input would hang while a thread reads it. So only a duplicate is read.
     pub fn take() -> Result<Pipe> {
         let nothing = if cfg!(windows) { c"NUL" } else { c"/dev/null" };
         // SAFETY: plain calls of the C library with valid arguments
@@ -49,7 +49,7 @@ impl Pipe {
             }
             let known = self.read.len();
             self.read.resize(known + CHUNK, 0);
-            // SAFETY: as many bytes as were made room for
+            // SAFETY: the buffer has room for these bytes
             let count =
                 unsafe { libc::read(self.descriptor, self.read[known..].as_mut_ptr().cast::<c_void>(), CHUNK as _) };
             self.read.truncate(known + usize::try_from(count).unwrap_or(0));
@@ -62,7 +62,7 @@ impl Pipe {
 
 /// Ignore Ctrl-C, which reaches the whole terminal: the parent decides what it ends.
 pub fn leave_interrupts_to_parent() {
-    // SAFETY: signals that every system of ours has
+    // SAFETY: signals that exist on every supported system
     unsafe {
         libc::signal(libc::SIGINT, libc::SIG_IGN);
         #[cfg(windows)]
@@ -70,7 +70,7 @@ pub fn leave_interrupts_to_parent() {
     }
 }
 
-/// Hand lines to `shared`, and at the end of the pipe have the process end: by itself, else the hard way.
+/// Pass lines to `shared`; at the end of the pipe stop the process, by force if it does not end by itself.
 pub fn watch(mut pipe: Pipe, shared: Arc<Shared>) {
     thread::spawn(move || {
         while let Some(line) = pipe.line() {

@@ -1,4 +1,4 @@
-//! What the thread that owns the sockets and the threads of the program share, and the one way to wait for it.
+//! The state shared by the thread that owns the sockets and the program's threads, and the only way to wait for it.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -13,7 +13,7 @@ use crate::proto::{ControlMode, ScopeState};
 use crate::wire::Response;
 use crate::zmq::Socket;
 
-/// Bytes and packets that wait to be taken by `Client::next`; beyond that the oldest are dropped.
+/// Largest queue of `Client::next`, in bytes and packets; beyond it the oldest are dropped.
 const MOST_BYTES: usize = 256 << 20;
 const MOST_PACKETS: usize = 10_000;
 
@@ -67,17 +67,17 @@ impl View {
 
 /// The component's hold on control.
 ///
-/// Answers of the scheduler grant control; its published state takes it away, once that has named us: one from before
-/// the grant may still be under way.
+/// Answers of the scheduler grant control; its published state revokes it, once a state has named this component:
+/// a state from before the grant may still be in transit.
 #[derive(Default)]
 pub struct Hold {
-    /// Measurements that want control.
+    /// Number of measurements that want control.
     pub users: usize,
     /// The program wants control, to solve this problem; 0 for none.
     pub asked: Option<u8>,
     pub held: bool,
     pub was_named: bool,
-    /// How often control was given to us.
+    /// Number of grants of control.
     pub tenures: u64,
     pub why_lost: String,
 }
@@ -87,7 +87,7 @@ impl Hold {
         self.users > 0 || self.asked.is_some()
     }
 
-    /// Return the problem that control is wanted for; 0 for none.
+    /// Return the problem for which control is wanted; 0 for none.
     pub fn solving(&self) -> u8 {
         self.asked.unwrap_or(0)
     }
@@ -98,11 +98,11 @@ impl Hold {
     }
 }
 
-/// A request that is waited for.
+/// The request whose answer is awaited.
 #[derive(Default)]
 pub struct Pending {
     pub answer: Option<Response>,
-    /// It has gone out at least once.
+    /// Whether it was sent at least once.
     pub sent: bool,
 }
 
@@ -120,7 +120,7 @@ pub struct State {
     pub lines: VecDeque<String>,
     pub over: Option<Error>,
     pub closing: bool,
-    /// Control that an earlier life of the component died with is to be given back: nothing is resumed with it.
+    /// Whether to release the control held by an earlier life: no measurement is resumed with it.
     pub gives_back: bool,
     backlog: VecDeque<Arc<Packet>>,
     backlog_bytes: usize,
@@ -128,7 +128,7 @@ pub struct State {
 }
 
 impl State {
-    /// Take in a packet of a publisher; `ours`: of the scheduler.
+    /// Process a packet of a publisher; `ours`: the scheduler sent it.
     pub fn take(&mut self, packet: Packet, ours: bool, wanted: bool, name: &str) {
         let packet = Arc::new(packet);
         if ours {
@@ -159,13 +159,13 @@ impl State {
         }
     }
 
-    /// Return whether the scheduler still counts an earlier life of ours, which wanted control, as its holder.
+    /// Return whether the scheduler still counts an earlier life of this component as the holder of control.
     pub fn inherits_control(&self, name: &str) -> bool {
         let is_holder = self.view.control.as_ref().is_some_and(|control| control.holder.as_deref() == Some(name));
         is_holder && !self.hold.held && !self.hold.is_wanted()
     }
 
-    /// Return the oldest packet that waits whose envelope begins with `prefix`.
+    /// Return the oldest waiting packet whose envelope begins with `prefix`.
     pub fn next_packet(&mut self, prefix: &str) -> Option<Arc<Packet>> {
         let index = self.backlog.iter().position(|packet| packet.envelope.starts_with(prefix))?;
         let packet = self.backlog.remove(index)?;
@@ -173,12 +173,12 @@ impl State {
         Some(packet)
     }
 
-    /// Return how many packets were dropped since this was last asked.
+    /// Return the number of packets dropped since the last call.
     pub fn take_dropped(&mut self) -> u64 {
         std::mem::take(&mut self.dropped)
     }
 
-    /// Return what stands between the component and control, for a person; empty if nothing does.
+    /// Return the reason why control is withheld, for a person; empty without one.
     pub fn obstacle(&self, solving: u8, name: &str) -> String {
         let Some(control) = &self.view.control else { return String::new() };
         let flagged =
@@ -224,14 +224,14 @@ impl Shared {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Change the state, and have those who wait look at it again.
+    /// Change the state, and wake all waiting threads.
     pub fn change<T>(&self, change: impl FnOnce(&mut State) -> T) -> T {
         let result = change(&mut self.lock());
         self.changed.notify_all();
         result
     }
 
-    /// Have every call that waits, and all later ones, return `why`.
+    /// Return `why` from every waiting call and all later ones.
     pub fn finish(&self, why: Error) {
         self.change(|state| state.over = state.over.take().or(Some(why)));
     }
@@ -265,7 +265,7 @@ impl Shared {
     }
 }
 
-/// Return the moment when a timeout is over, or `until` if that comes first.
+/// Return the end of a timeout, or `until` if that comes first.
 pub fn earlier(timeout: Duration, until: Option<Instant>) -> Option<Instant> {
     let soon = Instant::now() + timeout;
     Some(until.map_or(soon, |until| until.min(soon)))

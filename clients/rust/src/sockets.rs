@@ -1,4 +1,4 @@
-//! The thread that owns the sockets: it sends what the program asks for, and takes in what comes.
+//! The thread that owns the sockets: it sends the program's requests, and processes received messages.
 
 use std::collections::HashMap;
 use std::sync::Arc;
@@ -18,15 +18,15 @@ const MOST_PACKET_BYTES: i64 = 256 << 20;
 const MOST_REQUEST_BYTES: i64 = 1 << 20;
 const MOST_ENVELOPES: usize = 10_000;
 const BATCH: usize = 16;
-/// What `Client` itself follows, whatever the component listens to.
+/// Prefixes that `Client` itself needs, in addition to the component's.
 const FOLLOWED: [&str; 7] =
     ["ScopeStateMsg", "ControlState", "ScanParameters2d", "ZCtrlParameters", "ProbePosition", "Scan2d", "Spec1d"];
 
-/// Return a socket with the options that all share.
+/// Return a socket with the options of all sockets.
 fn socket(context: &Context, kind: i32, most_bytes: i64) -> Result<Socket> {
     let socket = context.socket(kind)?;
     let beats: &[(i32, i32)] = if kind == zmq::DEALER {
-        // libzmq aborts over its heartbeats where a receive queue with a length was full: so it has none
+        // libzmq aborts over its heartbeats after a bounded receive queue was full: so the queue is unbounded
         &[(zmq::HEARTBEAT_IVL, 2000), (zmq::HEARTBEAT_TIMEOUT, 8000), (zmq::HEARTBEAT_TTL, 8000), (zmq::RCVHWM, 0)]
     } else {
         &[(zmq::RCVHWM, QUEUE)]
@@ -41,7 +41,7 @@ fn socket(context: &Context, kind: i32, most_bytes: i64) -> Result<Socket> {
         (zmq::RECONNECT_IVL, 20),
         (zmq::RECONNECT_IVL_MAX, 200),
         (zmq::HANDSHAKE_IVL, 5000),
-        #[cfg(not(windows))] // Wine does not know it, and libzmq then never connects
+        #[cfg(not(windows))] // Wine does not have it, and libzmq then never connects
         (zmq::TCP_MAXRT, 5000),
     ];
     for (option, value) in all.iter().chain(beats) {
@@ -82,7 +82,7 @@ fn is_local(address: &str) -> bool {
     matches!(scheme, "ipc" | "inproc") || scheme == "tcp" && (host == "localhost" || is_loopback)
 }
 
-/// Return the identity of the component's socket: with keys, one that nobody else can claim, the same in every life.
+/// Return the identity of the component's socket: the same in every life, and secret if there are keys.
 fn routing_id(launch: &Launch) -> Vec<u8> {
     let mut id = launch.name.clone().into_bytes();
     let Some(keys) = &launch.keys else { return id };
@@ -99,10 +99,10 @@ fn routing_id(launch: &Launch) -> Vec<u8> {
     id
 }
 
-/// Return random digits that tell two lives of a component apart.
+/// Return random digits that distinguish two lives of a component.
 pub fn new_life() -> String {
     let mut bytes = [0_u8; 4];
-    // SAFETY: as many bytes as said; libsodium may be initialised more than once
+    // SAFETY: the length is that of the buffer; libsodium may be initialised more than once
     unsafe {
         sodium::sodium_init();
         sodium::randombytes_buf(bytes.as_mut_ptr().cast(), bytes.len());
@@ -110,7 +110,7 @@ pub fn new_life() -> String {
     format!("{:08x}", u32::from_ne_bytes(bytes))
 }
 
-/// A pair of sockets by which threads wake the one that waits.
+/// A pair of sockets with which threads wake the waiting one.
 pub fn waker(context: &Context) -> Result<(Socket, Socket)> {
     let (waits, wakes) = (context.socket(zmq::PULL)?, context.socket(zmq::PUSH)?);
     waits.bind("inproc://wake")?;
@@ -119,7 +119,7 @@ pub fn waker(context: &Context) -> Result<(Socket, Socket)> {
     Ok((waits, wakes))
 }
 
-/// Open all sockets of the launch line, and begin to serve them.
+/// Open all sockets of the launch line, and start to serve them.
 pub fn start(context: &Context, waits: Socket, shared: &Arc<Shared>) -> Result<JoinHandle<()>> {
     let launch = &shared.launch;
     let control = launch.sockets.control.as_ref().map(|address| Control::new(context, shared, address)).transpose()?;
@@ -180,9 +180,9 @@ struct Control {
     monitor: Socket,
     address: String,
     connected: bool,
-    /// The scheduler has answered.
+    /// Whether the scheduler has answered.
     known: bool,
-    /// The id of the last request, if there was no answer since.
+    /// The id of the last request while it is unanswered.
     unanswered: Vec<u8>,
     greetings: u64,
 }
@@ -223,7 +223,7 @@ impl Control {
         }
     }
 
-    /// Give back, once, what an earlier life had: others wait for it.
+    /// Release once the control of an earlier life, for which other components wait.
     fn give_back_inherited(&mut self) {
         let name = &self.shared.launch.name;
         let mut state = self.shared.lock();
@@ -241,7 +241,7 @@ impl Control {
         self.ask(wire::request(crate::proto::ControlRequest::ReqReleaseCtrl as u8, b"", &id));
     }
 
-    /// Follow the scheduler's coming and going; say by a request's id of which run we are.
+    /// Follow the scheduler's connection; announce the run of this client by the id of a request.
     fn connection(&mut self, connected: bool) {
         self.connected = connected;
         self.unanswered.clear();
@@ -258,8 +258,8 @@ impl Control {
 
     /// Send a request; dropped while there is no connection.
     ///
-    /// One that is repeated without an answer in between makes the connection anew: a connection that stands but leads
-    /// nowhere would never lead anywhere again.
+    /// A request repeated without an answer in between replaces the connection: one that is established but without
+    /// answers would never recover.
     fn ask(&mut self, frames: Frames) {
         if !self.connected {
             return;
@@ -295,7 +295,7 @@ impl Control {
 
     fn take(&mut self, frames: &[Frame]) {
         if frames.len() < 2 || !frames[0].is_empty() {
-            return; // an empty frame alone: the scheduler has looked whether we are there
+            return; // an empty frame alone: the scheduler's probe whether this client is alive
         }
         match wire::response(&frames[1..]) {
             Ok(answer) => self.answer(answer),
@@ -319,7 +319,7 @@ impl Control {
 
 // --- packets ---
 
-/// A connection to one publisher: each packet once, and what was missed before anything newer.
+/// A connection to one publisher: receives each packet once, and missed packets before newer ones.
 struct Subscriber {
     socket: Socket,
     monitor: Socket,
@@ -327,7 +327,7 @@ struct Subscriber {
     is_ours: bool,
     name: String,
     prefixes: Vec<String>,
-    /// What the component itself listens to.
+    /// Prefixes of the component itself.
     wanted: Option<Vec<String>>,
     newest_ns: i64,
     newest_of: HashMap<String, i64>,
@@ -345,7 +345,7 @@ impl Subscriber {
             }
             _ => vec![String::new()],
         };
-        // unlike SUB, XSUB takes what is sent to it under any topic, and lets the marker through as it is
+        // unlike SUB, XSUB receives packets of any topic, and sends the marker unchanged
         let socket = socket(context, zmq::XSUB, MOST_PACKET_BYTES)?;
         let monitor = socket.monitor(zmq::CONNECTED)?;
         for prefix in &prefixes {
@@ -381,7 +381,7 @@ impl Subscriber {
         }
     }
 
-    /// Ask for what is newer than what we have, for ourselves alone.
+    /// Request the packets newer than the newest received one, for this subscriber alone.
     fn ask_for_missed(&mut self) {
         self.forget_marker();
         self.topic = format!("\0replay/{}/{}", self.name, self.nonce).into_bytes();
@@ -392,7 +392,7 @@ impl Subscriber {
         self.socket.send(&[[&b"\x01"[..], &self.marker].concat()]);
     }
 
-    /// Else the socket would ask for the same again when the connection is next made.
+    /// Unsubscribe: otherwise the socket would repeat the request at its next connection.
     fn forget_marker(&mut self) {
         if !self.marker.is_empty() {
             self.socket.send(&[[&b"\x00"[..], &self.marker].concat()]);

@@ -1,4 +1,4 @@
-//! Packets, requests and responses as the frames that travel. Only here do units and corners of the wire matter.
+//! Packets, requests and responses as frames. The only module that knows units and corners of the wire format.
 
 use prost::Message as _;
 use prost_types::Timestamp;
@@ -16,7 +16,7 @@ pub const RELAY: u8 = 102;
 pub const OTHER_RUN: u8 = 100;
 const LONGEST_ENVELOPE: usize = 1000;
 
-/// Where the numbers of a message lie, and the rest of it.
+/// The position of a message's numbers, and its other fields.
 struct Split {
     rest: Vec<u8>,
     chunks: Vec<(usize, usize)>,
@@ -39,7 +39,7 @@ fn broken() -> Error {
     Error::Wire("the message breaks off".into())
 }
 
-/// Take the field at `path` (numbers of nested fields) out of a message, so that its numbers are never a list.
+/// Extract the field at `path` (numbers of nested fields) from a message, so that its numbers never become a list.
 fn split(bytes: &[u8], start: usize, path: &[u64]) -> Result<Split> {
     let mut found = Split { rest: Vec::new(), chunks: Vec::new() };
     let mut at = 0;
@@ -79,7 +79,7 @@ fn parse<T: prost::Message + Default>(bytes: &[u8]) -> Result<T> {
     T::decode(bytes).map_err(|error| Error::Wire(error.to_string()))
 }
 
-/// Decode a message whose numbers stand at `path`.
+/// Decode a message with its numbers at `path`.
 fn parse_with_values<T: prost::Message + Default>(frame: Frame, path: &[u64]) -> Result<(T, Values)> {
     let Split { rest, chunks } = split(&frame, 0, path)?;
     if chunks.iter().any(|(_, length)| length % 8 != 0) {
@@ -277,14 +277,14 @@ pub fn packet(mut frames: Vec<Frame>) -> Result<Packet> {
 
 // --- requests ---
 
-/// The answer to a request, whatever it is.
+/// The answer to a request, also a refusal.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Response {
     /// The number of a `ControlResponse`.
     pub response: u8,
-    /// In bytes; mostly empty.
+    /// In bytes; empty for most responses.
     pub object: Vec<u8>,
-    /// For a person, why it is not a success.
+    /// The reason of a failure, for a person.
     pub reason: String,
     /// 1: not sent; 2: it may or may not have been carried out; 3: the experiment has ended; 0 for none.
     pub detail: u8,
@@ -301,7 +301,7 @@ pub fn request(number: u8, object: &[u8], id: &str) -> Vec<Vec<u8>> {
     vec![vec![number], object.to_vec(), id.as_bytes().to_vec()]
 }
 
-/// Return a response of one to five frames; what a newer peer appends is not looked at.
+/// Return a response of one to five frames; frames appended by a newer peer are ignored.
 pub fn response(frames: &[Frame]) -> Result<Response> {
     let [number] = frames.first().map_or(&[][..], |frame| frame)[..] else {
         return Err(Error::Wire("a response without its number".into()));

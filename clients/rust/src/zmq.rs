@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use crate::error::{Error, Result};
 
-/// Room for a `zmq_msg_t`, whose size and alignment libzmq promises.
+/// Memory for a `zmq_msg_t`, with the size and alignment that libzmq guarantees.
 #[repr(C, align(8))]
 struct RawMessage([u8; 64]);
 
@@ -228,7 +228,7 @@ pub fn poll(sockets: &[&Socket], timeout: Option<Duration>) {
     let mut items: Vec<PollItem> =
         sockets.iter().map(|socket| PollItem { socket: socket.raw, descriptor: 0, events: POLLIN, ready: 0 }).collect();
     let milliseconds = timeout.map_or(-1, |time| c_long::try_from(time.as_millis()).unwrap_or(c_long::MAX));
-    // SAFETY: as many items as said; a signal that interrupts it is as good as a message
+    // SAFETY: as many items as said; an interruption by a signal counts as a message
     unsafe { zmq_poll(items.as_mut_ptr(), items.len() as c_int, milliseconds) };
 }
 
@@ -238,9 +238,9 @@ impl std::fmt::Debug for Frame {
     }
 }
 
-/// One frame, in the buffer that libzmq received it in.
+/// One frame, in the buffer into which libzmq received it.
 pub struct Frame(Box<RawMessage>);
-// SAFETY: a message belongs to nobody else, and its data are only written through `&mut`
+// SAFETY: a message has one owner, and its data are only written through `&mut`
 unsafe impl Send for Frame {}
 unsafe impl Sync for Frame {}
 
@@ -254,7 +254,7 @@ impl Frame {
         }
     }
 
-    /// Return bytes that were not received, such as those of a file, as a frame.
+    /// Return bytes from elsewhere, such as a file, as a frame.
     pub fn copy_of(bytes: &[u8]) -> Frame {
         let mut frame = Frame(Box::new(RawMessage([0; 64])));
         // SAFETY: initialised with as many bytes as are written

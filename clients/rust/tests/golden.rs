@@ -48,7 +48,7 @@ fn packets_are_read_in_metres_with_their_values() {
     }
 }
 
-/// Every packet cut short at every byte, and with every byte changed: none may do more than return an error.
+/// Packets truncated at every byte, and with every byte changed: each returns at most an error.
 #[test]
 fn malformed_packets_are_refused_or_read_but_never_fatal() {
     for entry in golden()["published"].as_array().unwrap() {

@@ -1,4 +1,4 @@
-//! Values as they may come: at every alignment, in several pieces, one by one, or not fitting what was told of them.
+//! Received values: at every alignment, in several pieces, one by one, or in a number that does not match the header.
 
 use afspm::{decode_packet, proto, Packet, Result};
 use prost::Message;

@@ -3,7 +3,7 @@ import { ConfigError, ExperimentEnded, StopRequested } from "./errors.js";
 import { Experiment } from "./experiment.js";
 import { parseLaunch } from "./launch.js";
 
-/** Exit codes, by which a process tells its supervisor why it ends. Every other is a crash: it is started again. */
+/** Exit codes: the reason why a process ends, for its supervisor. Every other code is a crash that a restart follows. */
 export enum ExitCode {
   DONE = 0,
   CRASHED = 1,
@@ -15,14 +15,14 @@ export enum ExitCode {
   STOPPED = 81,
 }
 
-const AFTER_THE_END_MS = 1000; // to handle what came before it
-const AFTER_A_STOP_MS = 200; // the parent that stops us kills us soon
+const AFTER_THE_END_MS = 1000; // to handle packets received before it
+const AFTER_A_STOP_MS = 200; // the parent kills a stopped process soon after
 
 /**
  * Run a component that `afspm run` has started, and end the process when `main` returns, the experiment ends, or
  * standard input does.
  *
- * @param main what the component does; when its promise is fulfilled, the component is done.
+ * @param main the component's work; the component is done when its promise is fulfilled.
  * @param longestStepS for how many seconds the event loop may be busy before the process counts as frozen.
  */
 export function runComponent(main: (experiment: Experiment) => Promise<void>, longestStepS?: number): void {

@@ -14,7 +14,7 @@ export function deadlineIn(seconds: number | undefined): Deadline {
   return seconds === undefined ? Infinity : performance.now() + seconds * 1000;
 }
 
-/** Return the moment when a timeout is over, or `deadline` if that comes first. */
+/** Return the end of a timeout, or `deadline` if that comes first. */
 export function earlier(seconds: number, deadline: Deadline): Deadline {
   return Math.min(deadlineIn(seconds), deadline);
 }
@@ -48,7 +48,7 @@ export class Conditions {
     for (const one of [...this.waiting]) if (one.condition()) one.settle(true);
   }
 
-  /** There is nothing more to wait for. */
+  /** End all waiting, with a reason. */
   fail(error: Error): void {
     this.over ??= error;
     for (const one of [...this.waiting]) one.fail(this.over);

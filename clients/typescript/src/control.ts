@@ -1,4 +1,4 @@
-/** Having control: asking for it, waiting for it, noticing that it is gone, giving it back. */
+/** Control: requesting it, waiting for it, noticing its loss, releasing it. */
 
 import { type Deadline, deadlineIn, earlier } from "./conditions.js";
 import { ControlLost, InvalidValue, NoResponse, Refused } from "./errors.js";
@@ -7,18 +7,18 @@ import { ControlRequest, ControlResponse } from "./generated/control_pb.js";
 import type { Link, Published } from "./link.js";
 import { ControlMode } from "./model.js";
 
-const ASK_AGAIN_S = 10; // should a published control state ever not reach us
+const ASK_AGAIN_S = 10; // in case a published control state is not received
 const MAY_COME: readonly number[] = [
   ControlResponse.REP_ALREADY_UNDER_CONTROL, ControlResponse.REP_WRONG_CONTROL_MODE, ControlResponse.REP_WRONG_EXP_PROBLEM,
 ];
 
 /**
- * This component's hold on control. Answers of the scheduler grant control; its published state takes it away, once
- * that has named us: a state from before the grant may still be under way.
+ * This component's hold on control. Answers of the scheduler grant control; its published state revokes it, once a
+ * state has named this component: a state from before the grant may still be in transit.
  */
 export class ControlHold {
   held = false;
-  /** Why we are no longer in control, for a person. */
+  /** The reason of the loss of control, for a person. */
   whyLost = "";
   private wasNamed = false;
   private depth = 0;
@@ -29,12 +29,12 @@ export class ControlHold {
     link.listeners.add((published, ours) => ours && this.take(published));
   }
 
-  /** Whether control is wanted and not there. */
+  /** Whether control is wanted and not held. */
   get wasLost(): boolean {
     return this.depth > 0 && !this.held;
   }
 
-  /** Have control while `body` runs; within another such call it is that one's. */
+  /** Hold control while `body` runs; a nested call shares the control of the outer one. */
   async hold<T>(body: () => Promise<T>, solving = 0, deadline: Deadline = Infinity): Promise<T> {
     await this.acquire(solving, deadline);
     try {
@@ -57,7 +57,7 @@ export class ControlHold {
     }
   }
 
-  /** Have control until `giveUp` is called: a second call only sees that it is there. */
+  /** Hold control until `giveUp` is called; a second call only checks that it is held. */
   async keep(solving: number, deadline: Deadline): Promise<void> {
     if (!this.isKept) await this.acquire(solving, deadline);
     else if (this.solving === solving) await this.regain(deadline);
@@ -65,7 +65,7 @@ export class ControlHold {
     this.isKept = true;
   }
 
-  /** Have control for another problem than now: the scheduler says whether that may be. */
+  /** Hold control for another problem than now, if the scheduler allows it. */
   private async change(solving: number, deadline: Deadline): Promise<void> {
     const response = await this.link.requests.request(ControlRequest.REQ_REQUEST_CTRL, Uint8Array.of(solving), undefined, deadline);
     if (response.code !== ControlResponse.REP_SUCCESS) throw new Refused("control", response.code, response.reason, response.detail);
@@ -83,7 +83,7 @@ export class ControlHold {
     if (this.depth === 0) await this.release();
   }
 
-  /** Be in control: at once if we are, else ask, wait for the control state to change, and ask again. */
+  /** Return once in control: request it, wait for the control state to change, and request again. */
   async regain(deadline: Deadline): Promise<void> {
     const { link } = this;
     let reported = "";
@@ -92,7 +92,7 @@ export class ControlHold {
       const count = link.count("ControlState");
       const { connections } = link.requests;
       const response = await this.ask(deadline).catch((error: unknown) => {
-        if (refusal && error instanceof NoResponse && performance.now() >= deadline) return refusal; // the last that was heard
+        if (refusal && error instanceof NoResponse && performance.now() >= deadline) return refusal; // the newest published state
         throw error;
       });
       if (!response) break;
@@ -106,18 +106,18 @@ export class ControlHold {
     }
   }
 
-  /** Give back control that an earlier life of this component had and nobody wants now. */
+  /** Release control that an earlier life of this component held and that is not wanted now. */
   releaseInherited(): void {
     if (!this.depth && !this.held && this.link.controlState?.holder === this.link.launch.name) this.link.requests.sendOnly(ControlRequest.REQ_RELEASE_CTRL);
   }
 
-  /** The scheduler says that we are not in control. */
+  /** Note the scheduler's answer that this component is not in control. */
   lost(why: string): void {
     this.held = false;
     this.whyLost = why;
   }
 
-  /** Give control back, if we have it. */
+  /** Release control if it is held. */
   async release(): Promise<void> {
     if (!this.held) return;
     this.held = false;
@@ -125,7 +125,7 @@ export class ControlHold {
     else await this.link.requests.request(ControlRequest.REQ_RELEASE_CTRL, undefined, undefined, deadlineIn(this.link.launch.request_timeout_s)).catch(() => undefined);
   }
 
-  /** Ask once. Returns the refusal if it has to be waited for; undefined: control is ours. */
+  /** Request control once. Return a refusal that may pass with time; undefined: control is granted. */
   private async ask(deadline: Deadline): Promise<Response | undefined> {
     const { link, solving } = this;
     const response = await link.requests.request(ControlRequest.REQ_REQUEST_CTRL, Uint8Array.of(solving), undefined, deadline);
@@ -145,7 +145,7 @@ export class ControlHold {
     return this.solving !== 0 && !this.link.controlState?.problems.includes(this.solving);
   }
 
-  /** Return what stands between us and control, for a person; empty if nothing does. */
+  /** Return the reason why control is withheld, for a person; empty without one. */
   private obstacle(): string {
     const state = this.link.controlState;
     if (!state) return "";

@@ -1,4 +1,4 @@
-/** Asks the scheduler: each request has an id, is repeated with it until it is answered, and is executed once. */
+/** Sends requests to the scheduler: each has an id, is repeated with it until it is answered, and is executed once. */
 
 import { randomBytes } from "node:crypto";
 import { Dealer } from "zeromq";
@@ -11,7 +11,7 @@ import { SOCKET_OPTIONS } from "./subscription.js";
 const CLOCK_REQUEST = 101;
 const OTHER_RUN = 100;
 const LONGEST_RESPONSE = 1024 * 1024;
-/** Longer than the scheduler waits for the microscope: what it says then is an answer. */
+/** Longer than the scheduler waits for the microscope, so that its NO_RESPONSE arrives before the timeout. */
 const LONGER_THAN_THE_SCHEDULER = 1.2;
 
 /** A DEALER socket with the identity of this component; see "Requests and responses" of the wire format. */
@@ -49,20 +49,20 @@ export class ControlClient {
     void this.receive();
   }
 
-  /** Return an id for a request, not used before in any life of this component. */
+  /** Return an id for a request, unique over all lives of this component. */
   nextId(): string {
     return `${this.launch.name}/${this.session}/${++this.requests}`;
   }
 
-  /** Send a request whose answer is not waited for. */
+  /** Send a request without waiting for its answer. */
   sendOnly(kind: number, object: Uint8Array = this.empty): void {
     this.send(encodeRequest(kind, object, this.nextId()));
   }
 
   /**
-   * Ask, and wait for the answer, whatever it is.
+   * Send a request and return its answer, also a refusal.
    *
-   * Throws NoResponse, ExperimentEnded, ConfigError (it is the scheduler of another run), StopRequested.
+   * Throws NoResponse, ExperimentEnded, ConfigError (the scheduler belongs to another run), StopRequested.
    */
   async request(kind: number, object: Uint8Array = this.empty, id = this.nextId(), deadline: Deadline = Infinity): Promise<Response> {
     const frames = encodeRequest(kind, object, id);
@@ -84,7 +84,7 @@ export class ControlClient {
         const response = answer();
         if (response) return this.checked(response);
         if (performance.now() >= deadline) break;
-        if (connections !== this.connections || !this.connected) continue; // a restart of the scheduler is no silence of it
+        if (connections !== this.connections || !this.connected) continue; // a restart of the scheduler does not count as silence
         tries += 1;
         this.reconnect();
       }
@@ -94,7 +94,7 @@ export class ControlClient {
     throw new NoResponse(`request ${kind}`, "it was not answered; it may or may not have been carried out");
   }
 
-  /** Send what waits, and close. */
+  /** Send the waiting requests, and close. */
   async close(): Promise<void> {
     await this.sending;
     this.socket.close();
@@ -113,7 +113,7 @@ export class ControlClient {
     this.sending = this.sending.then(() => this.socket.send([this.empty, ...frames])).catch(() => undefined);
   }
 
-  /** A connection that stands but leads nowhere would never lead anywhere again: make another. */
+  /** Replace a connection that is established but without answers: it would never recover. */
   private reconnect(): void {
     this.onDisconnected();
     this.socket.disconnect(this.address);
@@ -123,7 +123,7 @@ export class ControlClient {
   private onConnected(): void {
     this.connected = true;
     this.connections += 1;
-    this.sendOnly(CLOCK_REQUEST); // says by its id who asks, and which run is ours
+    this.sendOnly(CLOCK_REQUEST); // its id contains the client's name and run
     this.conditions.notify();
   }
 
@@ -134,11 +134,11 @@ export class ControlClient {
 
   private async receive(): Promise<void> {
     for await (const [delimiter, ...frames] of this.socket) {
-      if (delimiter?.length !== 0 || !frames.length) continue; // empty: the scheduler looks whether we are there
+      if (delimiter?.length !== 0 || !frames.length) continue; // empty: the scheduler probes whether this client is alive
       try {
         this.take(decodeResponse(frames));
       } catch {
-        continue; // not an answer; the request is asked again
+        continue; // not an answer; the request is repeated
       }
     }
   }
@@ -149,6 +149,6 @@ export class ControlClient {
     } else if (this.answers.has(response.id)) {
       this.answers.set(response.id, response);
       this.conditions.notify();
-    } // else it is late: it was given up on
+    } // otherwise a late answer to a request that was given up
   }
 }

@@ -1,19 +1,19 @@
-/** One scan or spectrum, followed through what the scheduler publishes. Pure: packets in, an outcome out. */
+/** One scan or spectrum, followed by published packets. Pure: takes packets, returns an outcome. */
 
 import { ScopeState } from "./generated/control_pb.js";
 
 export type Outcome =
   | "completed"
-  /** The microscope says that it was stopped. */
+  /** The microscope published an interruption. */
   | "interrupted"
-  /** The microscope is free and there is nothing: it was started anew in the middle, say. */
+  /** The microscope is free without a result, for example after a restart of the translator. */
   | "vanished"
-  /** The results can't be those asked for: a person at the panel has moved the frame, say. */
+  /** The results do not match the request, for example after a person moved the frame. */
   | "another";
 
 /**
- * The state `busy`, then results, then FREE. While a connection was lost the cache may have kept the results and not
- * `busy`: then they are taken for ours, too.
+ * The state `busy`, then results, then FREE. After a lost connection the cache may hold the results but not
+ * `busy`: such results count, too.
  */
 export class Cycle<T> {
   begun = false;
@@ -22,12 +22,12 @@ export class Cycle<T> {
   private other = false;
 
   /**
-   * @param sinceNs what is not newer belongs to something earlier.
-   * @param resumed it was asked for in an earlier life of ours, or control was lost: another may have measured since.
+   * @param sinceNs packets up to this time belong to an earlier measurement.
+   * @param resumed it was requested in an earlier life, or control was lost: another component may have measured since.
    */
   constructor(private readonly busy: ScopeState, private readonly sinceNs: bigint, private resumed = false) {}
 
-  /** Another component may measure from now on. */
+  /** Note that another component may measure from now on. */
   controlWasLost(): void {
     this.resumed = true;
   }
@@ -35,7 +35,7 @@ export class Cycle<T> {
   onState(state: ScopeState, timeNs: bigint | undefined): void {
     if (this.isOver(timeNs)) return;
     if (state === this.busy) {
-      this.results.length = 0; // what came before this began belongs to another
+      this.results.length = 0; // results from before the start belong to another measurement
       this.other = false;
       this.begun = true;
     } else if (this.begun && state === ScopeState.SS_INTERRUPTED) {

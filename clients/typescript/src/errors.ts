@@ -10,7 +10,7 @@ export class AfspmError extends Error {
 /** The launch line, a key or an address can't work: a restart would fail the same way. */
 export class ConfigError extends AfspmError {}
 
-/** Bytes from a peer that are not what the wire format says. */
+/** Bytes from a peer that violate the wire format. */
 export class WireError extends AfspmError {}
 
 /** A value that has no meaning here: NaN, an empty region, a unit of the wrong dimension. */
@@ -19,14 +19,14 @@ export class InvalidValue extends AfspmError {}
 /** What a program must know of a response beside its code. */
 export enum ResponseDetail {
   NONE = 0,
-  /** The request was not sent and may be asked again. */
+  /** The request was not sent and may be repeated. */
   NOT_SENT = 1,
   /** The request may or may not have been carried out. */
   OUTCOME_UNKNOWN = 2,
   EXPERIMENT_ENDED = 3,
 }
 
-/** The base of what may come of a request. */
+/** Base of the errors of a request. */
 export class RequestError extends AfspmError {
   constructor(
     what: string,
@@ -45,26 +45,26 @@ export class RequestError extends AfspmError {
   }
 }
 
-/** The scheduler, a limit or the microscope said no. */
+/** A refusal by the scheduler, a limit or the microscope. */
 export class Refused extends RequestError {}
 
-/** Control was not given in time, or the problem to be solved is not flagged. */
+/** Control was not granted in time, or the problem to solve is not flagged. */
 export class ControlLost extends RequestError {}
 
-/** Nobody answered, or not in time. */
+/** No answer arrived in time. */
 export class NoResponse extends RequestError {
   constructor(what: string, reason: string, detail = ResponseDetail.OUTCOME_UNKNOWN) {
     super(what, ControlResponse.REP_NO_RESPONSE, reason, detail);
   }
 }
 
-/** The microscope fails again and again at the same measurement: a person should look. */
+/** The same measurement failed repeatedly without a known reason: a person has to look. */
 export class MeasurementFailed extends AfspmError {}
 
-/** There is nothing more to ask. */
+/** The experiment has ended: the scheduler takes no more requests. */
 export class ExperimentEnded extends AfspmError {}
 
-/** Standard input has ended: the supervisor wants this process to end, or is dead. */
+/** Standard input has ended: the supervisor stops this process, or is gone. */
 export class StopRequested extends AfspmError {}
 
 export function responseName(code: number): string {

@@ -35,11 +35,11 @@ export interface Timeout {
 /** All channels of a scan. */
 export interface ScanSet {
   readonly scans: readonly Scan[];
-  /** What interrupted it before it was taken as it is here. */
+  /** The reasons of interruptions before this measurement was complete. */
   readonly interruptions: readonly string[];
 }
 
-/** A spectrum, and what interrupted it before it was taken. */
+/** A spectrum, and the reasons of earlier interruptions. */
 export interface MeasuredSpectrum {
   readonly spectrum: Spectrum;
   readonly interruptions: readonly string[];
@@ -69,10 +69,10 @@ export interface ExperimentEvents {
 }
 
 /**
- * A running experiment, as one component takes part in it.
+ * A running experiment, from the side of one component.
  *
- * Lengths are in metres, angles in radians, times in seconds; where a parameter has another unit, it is named. Commands
- * ask for control by themselves and give it back; where it is refused or taken away, they wait until it is back. Every
+ * Lengths are in metres, angles in radians, times in seconds; other units of parameters are named. Commands
+ * request control by themselves and release it; while it is refused or revoked, they wait for it. Every
  * call may throw `Refused`, `NoResponse`, `ControlLost`, `ExperimentEnded` and `StopRequested`.
  */
 export class Experiment extends EventEmitter<ExperimentEvents> {
@@ -102,10 +102,10 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
   }
 
   /**
-   * Join an experiment that is running.
+   * Join a running experiment.
    *
-   * @param where the folder of the run, or the folder of all runs: the newest is meant.
-   * @param name what others see as the holder of control. Two that join need different names.
+   * @param where the folder of a run, or of all runs: then the newest one.
+   * @param name the name shown as the holder of control. Two that join need different names.
    */
   static async join(where: string, name: string): Promise<Experiment> {
     const experiment = new Experiment(await launchOfGuest(where, name));
@@ -118,7 +118,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     return experiment;
   }
 
-  /** Wait until the scheduler is there, and all that it has published before has come. */
+  /** Wait until the scheduler is connected and all packets of its cache have arrived. */
   async ready({ timeoutS }: Timeout = {}): Promise<void> {
     const deadline = deadlineIn(timeoutS);
     if (this.launch.sockets.control && !(await this.link.wait(() => this.link.requests.connected, deadline))) {
@@ -129,18 +129,18 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
 
   // --- looking ---
 
-  /** What the microscope does. */
+  /** The activity of the microscope. */
   get state(): ScopeState { return this.link.state; }
   /** Mode, holder of control and problems. */
   get controlState(): ControlState { return this.link.controlState ?? { mode: ControlMode.CM_UNDEFINED, holder: "", problems: [] }; }
-  /** Whether control is ours now. */
+  /** Whether this component is in control. */
   get inControl(): boolean { return this.hold.held; }
-  /** Where the next scan will be taken; undefined if the microscope has not said. */
+  /** Region and shape of the next scan; undefined before the first packet. */
   get scanParameters(): ScanParameters | undefined { return this.link.scanParameters; }
   get feedback(): ZCtrlParameters | undefined { return this.link.feedback; }
   get probePositionM(): XY | undefined { return this.link.probePositionM; }
 
-  /** Wait until a condition holds, tried whenever something was published; false when the time is up. */
+  /** Wait until a condition holds, tested after each published packet; return false at the timeout. */
   waitUntil(condition: () => boolean, { timeoutS }: Timeout = {}): Promise<boolean> {
     return this.link.wait(condition, deadlineIn(timeoutS));
   }
@@ -153,10 +153,10 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
   // --- measuring ---
 
   /**
-   * Take a scan. One that is interrupted (a problem, MANUAL, a restart of anything) is taken again when control is back.
+   * Take a scan. A scan interrupted by a problem, MANUAL or a restart is repeated once control is granted again.
    *
-   * @param region where; undefined: what is set.
-   * @param options.shape [rows, columns]; undefined: what is set.
+   * @param region undefined: as set.
+   * @param options.shape [rows, columns]; undefined: as set.
    * @param options.key makes it happen once in this run: a component that is killed and started again gets the scan of
    * its earlier life. Each measurement has a key of its own.
    */
@@ -169,8 +169,8 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
   /**
    * Take a spectrum.
    *
-   * @param atM where the probe is moved to, in metres; undefined: where it stands.
-   * @param options.kind such as "IV"; undefined: what is set.
+   * @param atM position in metres; undefined: the present one.
+   * @param options.kind such as "IV"; undefined: as set.
    */
   async spectrum(atM?: XY, options: Timeout & { readonly kind?: string; readonly key?: string } = {}): Promise<MeasuredSpectrum> {
     const target = new SpectrumTarget(atM, options.kind, this.launch.sample_coordinates);
@@ -180,7 +180,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
 
   // --- setting and getting ---
 
-  /** Set a parameter to a number in `unit` (SI without one) or a word; return what is then in force, in the same unit. */
+  /** Set a parameter to a number in `unit` (SI without one) or a word; return the value in force, in the same unit. */
   async set(parameter: string, value: Value, unit?: string, timeout: Timeout = {}): Promise<Value> {
     if (typeof value === "number" && !Number.isFinite(value)) throw new InvalidValue(`${parameter} can't be set to ${value}`);
     const units = unit ?? (typeof value === "number" ? PARAMETER_UNITS.get(parameter) : undefined);
@@ -189,7 +189,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     return response.payload.length ? valueIn(response.payload, unit) : value;
   }
 
-  /** Return a parameter's value in `unit`; without one in SI, or as it came if it is not a base parameter. */
+  /** Return the value of a parameter in `unit`; without one in SI, or in the microscope's unit for other than base parameters. */
   async get(parameter: string, unit?: string): Promise<Value> {
     const message = toBinary(ParameterMsgSchema, create(ParameterMsgSchema, { parameter }));
     const id = this.link.requests.nextId();
@@ -197,7 +197,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     return valueIn(accepted(`parameter ${parameter}`, response).payload, unit);
   }
 
-  /** Set what is given of the feedback; the rest stays as it is. */
+  /** Set the given parts of the feedback. */
   async setFeedback({ on, proportionalGain, integralGain, setpoint }: Feedback, timeout: Timeout = {}): Promise<void> {
     const message = create(ZCtrlParametersSchema, {
       ...(on !== undefined && { feedbackOn: on }), ...(proportionalGain !== undefined && { proportionalGain }),
@@ -206,18 +206,18 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     await this.command(ControlRequest.REQ_SET_ZCTRL_PARAMS, toBinary(ZCtrlParametersSchema, message), timeout);
   }
 
-  /** Move the probe to (x, y) in metres; returns when it stands there. */
+  /** Move the probe to (x, y) in metres; return on arrival. */
   async moveProbe(xyM: XY, { timeoutS }: Timeout = {}): Promise<void> {
     const deadline = deadlineIn(timeoutS);
     await this.hold.hold(() => this.commands.set(ControlRequest.REQ_SET_PROBE_POS, encodePlace(xyM), "ProbePosition", deadline), 0, deadline);
   }
 
-  /** Have the microscope do something, such as "x-pulse". */
+  /** Perform an action of the microscope, such as "x-pulse". */
   async action(name: string, timeout: Timeout = {}): Promise<void> {
     await this.command(ControlRequest.REQ_ACTION, encodeAction(name), timeout);
   }
 
-  /** Whether the microscope knows an action. */
+  /** Whether the microscope has an action. */
   async supports(action: string): Promise<boolean> {
     const response = await this.commands.send(ControlRequest.REQ_ACTION_SUPPORT, encodeAction(action), this.link.requests.nextId(), deadlineIn(undefined));
     return response.code === ControlResponse.REP_SUCCESS;
@@ -226,8 +226,8 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
   // --- control and the experiment ---
 
   /**
-   * Have control while `body` runs. Between two calls in it nobody else has it, unless it is lost: then the next call
-   * waits until it is back.
+   * Hold control while `body` runs: no other component acts between two calls in it. After a loss of control the next call
+   * waits for it.
    *
    * @param options.solving the problem to put right, by name or number: control is only given while that is flagged.
    */
@@ -241,7 +241,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     await this.order(ControlRequest.REQ_ADD_EXP_PRBLM, this.problems.number(problem));
   }
 
-  /** Remove the flag of a problem; that it was not flagged is no error. */
+  /** Clear a problem; no error if it is not flagged. */
   async clear(problem: string | number): Promise<void> {
     await this.order(ControlRequest.REQ_RMV_EXP_PRBLM, this.problems.number(problem));
   }
@@ -250,7 +250,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     return this.controlState.problems.includes(this.problems.number(problem));
   }
 
-  /** Set MANUAL (nobody has control) or AUTOMATED. */
+  /** Set MANUAL (no component has control) or AUTOMATED. */
   async setMode(mode: ControlMode): Promise<void> {
     await this.order(ControlRequest.REQ_SET_CONTROL_MODE, mode);
   }
@@ -260,7 +260,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     accepted("ending the experiment", await this.link.requests.request(ControlRequest.REQ_END_EXPERIMENT));
   }
 
-  /** Return what time it is in the experiment, ns since the Unix epoch, and how fast that goes. */
+  /** Return the experiment time, ns since the Unix epoch, and its speed. */
   async time(): Promise<{ readonly nowNs: bigint; readonly speed: number }> {
     const { payload } = accepted("the time", await this.link.requests.request(CLOCK_REQUEST));
     const text = Buffer.from(payload).toString();
@@ -268,7 +268,7 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     return { nowNs: BigInt(/"now_ns": *(\d+)/.exec(text)?.[1] ?? "0"), speed }; // JSON.parse would round it
   }
 
-  /** Let so many seconds of experiment time pass. */
+  /** Wait for a number of seconds of experiment time. */
   async sleep(seconds: number): Promise<void> {
     const start = (await this.time()).nowNs;
     for (;;) {
@@ -287,20 +287,20 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     await this.relay("Note", toBinary(NoteSchema, note));
   }
 
-  /** Publish how far this component is, for those who look on. */
+  /** Publish the progress of this component, for people. */
   async progress(done: number, of: number): Promise<void> {
     const now = (await this.time()).nowNs;
     const progress = create(ProgressSchema, { timestamp: timestamp(now), name: this.launch.name, done: BigInt(done), of: BigInt(of) });
     await this.relay("Progress", toBinary(ProgressSchema, progress));
   }
 
-  /** Publish a message of this component's own. The envelope is its name, or begins with that and an underscore. */
+  /** Publish a message defined by this component. The envelope is the message's name, or begins with it and an underscore. */
   async publish(envelope: string, message: Uint8Array): Promise<void> {
     if (!this.publisher) throw new ConfigError(`${this.launch.name} was given no address to publish on: say what it \`publishes\``);
     await this.publisher.publish((timeNs) => encodePacket({ envelope, payload: message, timeNs }), (await this.time()).nowNs);
   }
 
-  /** Send one request as it is, repeated with its id until it is answered; for what has no method of its own. */
+  /** Send a request for which there is no method, repeated with its id until it is answered. */
   request(kind: number, object: Uint8Array = new Uint8Array(), { timeoutS }: Timeout = {}): Promise<Response> {
     return this.link.requests.request(kind, object, this.link.requests.nextId(), deadlineIn(timeoutS));
   }
@@ -319,12 +319,12 @@ export class Experiment extends EventEmitter<ExperimentEvents> {
     this.link.log(level, text);
   }
 
-  /** Take no part any more, for the reason given: what waits is rejected with it. */
+  /** Leave the experiment for a reason, with which all waiting calls are rejected. */
   stop(reason: Error): void {
     this.link.conditions.fail(reason);
   }
 
-  /** Leave the experiment; control that is held is given back. */
+  /** Leave the experiment, and release control. */
   async close(): Promise<void> {
     if (this.launch.sockets.control) await this.hold.release();
     await Promise.all([this.heartbeat?.close(), this.link.close(), this.publisher?.close()]);

@@ -22,7 +22,7 @@ export interface Response {
   readonly code: number;
   /** An object in bytes, such as the `ParameterMsg` in force; mostly empty. */
   readonly payload: Uint8Array;
-  /** Why it is no success, for a person. */
+  /** The reason of a failure, for a person. */
   readonly reason: string;
   /** The id of the request that it answers; empty if that had none. */
   readonly id: string;
@@ -43,7 +43,7 @@ export function encodeResponse(response: Response): Uint8Array[] {
   return frames;
 }
 
-/** Decode one to five frames; those that a newer peer appends are ignored. */
+/** Decode one to five frames; frames appended by a newer peer are ignored. */
 export function decodeResponse(frames: readonly Uint8Array[]): Response {
   const [code, payload, reason, id, detail] = frames;
   if (code?.length !== 1) throw new WireError(`a response of ${frames.length} frames, the first of ${code?.length ?? 0} bytes`);

@@ -6,7 +6,7 @@ import { curveOptions, type Launch } from "./launch.js";
 const TURN_MS = 100;
 const CLOSED_WITHIN_MS = 1000;
 
-/** What the thread is told when it starts. */
+/** The data with which the thread starts. */
 export interface HeartbeatData {
   readonly address: string;
   readonly curve: ReturnType<typeof curveOptions>;
@@ -17,7 +17,7 @@ export interface HeartbeatData {
   readonly turned: BigInt64Array;
 }
 
-/** Beats until it is closed. */
+/** Sends beats until it is closed. */
 export class Heartbeat {
   private readonly worker: Worker;
   private readonly timer: NodeJS.Timeout;
@@ -35,7 +35,7 @@ export class Heartbeat {
     this.worker.unref();
   }
 
-  /** Say that this process closes on purpose. */
+  /** Send the closing beat: the process ends on purpose. */
   async close(): Promise<void> {
     clearInterval(this.timer);
     const closed = new Promise((resolve) => this.worker.once("exit", resolve));

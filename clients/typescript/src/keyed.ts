@@ -6,17 +6,17 @@ import { createHash } from "node:crypto";
 import { InvalidValue } from "./errors.js";
 import type { Packet } from "./frames.js";
 
-/** What was asked for and not finished yet. */
+/** A measurement that was requested and is not finished. */
 export interface Intent {
   readonly key: string;
   readonly facts: string;
   readonly attempt: number;
-  /** What was published until then is older. */
+  /** Packets up to this time belong to earlier measurements. */
   readonly sinceNs: string;
   readonly interruptions: readonly string[];
 }
 
-/** What is kept of a measurement: its packets, and what interrupted it. */
+/** A stored measurement: its packets, and the reasons of interruptions. */
 export interface Kept {
   readonly packets: readonly Packet[];
   readonly interruptions: readonly string[];
@@ -33,7 +33,7 @@ export class KeyedResults {
   private readonly folder: string | undefined;
   private intent: Intent | undefined;
 
-  /** @param stateDir of the run; empty: nothing is kept over a restart. */
+  /** @param stateDir of the run; empty: no measurement survives a restart. */
   constructor(stateDir: string, name: string) {
     this.folder = stateDir ? join(stateDir, `${name}.keyed`) : undefined;
     const text = this.folder && readOrNothing(join(this.folder, "pending.json"));
@@ -50,7 +50,7 @@ export class KeyedResults {
     if (this.folder) write(join(this.folder, "pending.json"), [Buffer.from(JSON.stringify(intent))]);
   }
 
-  /** Return what an earlier life, or an earlier call, measured. Throws InvalidValue: the key was used for another. */
+  /** Return the result of an earlier life or call. Throws InvalidValue: the key was used for another measurement. */
   find(key: string, facts: string): Kept | undefined {
     const bytes = this.folder && readOrNothing(this.path(key));
     if (!bytes) return undefined;
@@ -94,7 +94,7 @@ function readOrNothing(path: string): Buffer | undefined {
   }
 }
 
-/** Write a file as a whole, or not at all, and see it on the disk. */
+/** Write a file atomically, and flush it to the disk. */
 function write(path: string, parts: readonly Uint8Array[]): void {
   mkdirSync(dirname(path), { recursive: true });
   const file = openSync(`${path}.new`, "w");

@@ -1,18 +1,18 @@
-/** The launch line: one line of JSON from which a program learns its part in an experiment. */
+/** The launch line: one line of JSON that describes a program's part in an experiment. */
 
 import { createHmac } from "node:crypto";
 import { readFile, readlink } from "node:fs/promises";
 import { basename, join } from "node:path";
 import { ConfigError } from "./errors.js";
 
-/** The CURVE pair of this process, and whose key to expect at which address; keys as Z85 text. */
+/** The CURVE key pair of this process, and the owner of the key at each address; keys as Z85 text. */
 export interface Keys {
   readonly name: string;
   readonly public: string;
   readonly secret: string;
   /** The names of their owners, by public key. */
   readonly peers: Readonly<Record<string, string>>;
-  /** The names of who binds them, by address. */
+  /** The names of their binders, by address. */
   readonly servers: Readonly<Record<string, string>>;
   /** Whether every socket is encrypted. */
   readonly everywhere: boolean;
@@ -33,7 +33,7 @@ export interface Launch {
   /** Problems that the experiment file names, with their numbers. */
   readonly problems: Readonly<Record<string, number>>;
   readonly run_dir: string;
-  /** Where to keep what must survive a restart; empty: nothing is kept. */
+  /** The folder for data that survive a restart; empty: none survive. */
   readonly state_dir: string;
   /** Seconds between heartbeats. */
   readonly beat_period_s: number;
@@ -41,7 +41,7 @@ export interface Launch {
   readonly request_timeout_s: number;
   readonly request_retries: number;
   readonly keys: Keys | null;
-  /** The identity of the run; empty: it is not known. */
+  /** The identity of the run; empty: unknown. */
   readonly run: string;
   readonly simulated: boolean;
   readonly sample_coordinates: boolean;
@@ -67,8 +67,8 @@ export function parseLaunch(line: string): Launch {
 /**
  * Return the launch line of a guest that joins a running experiment.
  *
- * @param where the folder of the run, or the folder of all runs: the newest is meant.
- * @param name what others see as the holder of control.
+ * @param where the folder of a run, or of all runs: then the newest one.
+ * @param name the name shown as the holder of control.
  */
 export async function launchOfGuest(where: string, name: string): Promise<Launch> {
   const folder = await runIn(where);
@@ -87,12 +87,12 @@ async function runIn(where: string): Promise<string> {
   return join(where, basename(newest.trim()));
 }
 
-/** Return the identity of a socket that asks in a name: the same in every life and, where there are keys, secret. */
+/** Return the identity of a component's request socket: the same in every life, and secret if there are keys. */
 export function routingId(name: string, keys: Keys | null): string {
   return keys?.secret ? `${name}\0${createHmac("sha256", keys.secret).update(name).digest("hex").slice(0, 16)}` : name;
 }
 
-/** Return the socket options for a connection to `address`; none where it is plain. Throws ConfigError. */
+/** Return the socket options for a connection to `address`; none for a plain connection. Throws ConfigError. */
 export function curveOptions(keys: Keys | null, address: string): { curvePublicKey?: string; curveSecretKey?: string; curveServerKey?: string } {
   if (!keys?.secret) return {};
   const owner = keys.servers[address];

@@ -34,7 +34,7 @@ export function messageOf(envelope: string): string {
   return envelope.split("_", 1)[0]!;
 }
 
-/** Decode a packet; the name is empty where it is none of those known here. Throws WireError, InvalidValue. */
+/** Decode a packet; the name is empty for an unknown message. Throws WireError, InvalidValue. */
 export function decode(packet: Packet): Published {
   const { payload } = packet;
   const name = messageOf(packet.envelope);
@@ -65,7 +65,7 @@ export class Link {
   constructor(readonly launch: Launch) {
     const { sockets, name, envelopes, keys } = launch;
     if (sockets.control) this.control = new ControlClient(launch, sockets.control, this.conditions);
-    const followed = sockets.control ? [...STATES, "Scan2d", "Spec1d"] : []; // what commands and measurements follow
+    const followed = sockets.control ? [...STATES, "Scan2d", "Spec1d"] : []; // needed by commands and measurements
     const wanted = envelopes && [...envelopes, ...followed.filter((one) => !envelopes.some((prefix) => one.startsWith(prefix)))];
     this.subscriptions = sockets.subscribe.map((address, index) => new Subscription(name, address, wanted, keys, {
       onPacket: (packet) => this.take(packet, index === 0),
@@ -75,7 +75,7 @@ export class Link {
     }));
   }
 
-  /** Who asks the scheduler. Throws ConfigError: this component was given none. */
+  /** The sender of requests. Throws ConfigError: this component has no address of the scheduler. */
   get requests(): ControlClient {
     if (!this.control) throw new ConfigError(`${this.launch.name} was given no scheduler to ask`);
     return this.control;
@@ -88,12 +88,12 @@ export class Link {
   get feedback(): ZCtrlParameters | undefined { return this.newest.get("ZCtrlParameters") as ZCtrlParameters | undefined; }
   get probePositionM(): XY | undefined { return this.newest.get("ProbePosition") as XY | undefined; }
 
-  /** Whether the experiment file says that this component listens to an envelope. */
+  /** Whether the experiment file lists an envelope for this component. */
   isListenedTo(envelope: string): boolean {
     return this.launch.envelopes?.some((prefix) => envelope.startsWith(prefix)) ?? true;
   }
 
-  /** Return how often a message has been published. */
+  /** Return the number of received packets of a message. */
   count(name: string): number {
     return this.counts.get(name) ?? 0;
   }
@@ -102,7 +102,7 @@ export class Link {
     return this.conditions.wait(condition, deadline);
   }
 
-  /** Wait while the scheduler is away for as long as that lasts, else for `withinS` at most. */
+  /** Wait without limit while the scheduler is away, otherwise for at most `withinS`. */
   async waitConnected(done: () => boolean, withinS: number, deadline: Deadline): Promise<boolean> {
     while (!done()) {
       if (!(await this.wait(() => this.requests.connected || done(), deadline))) return false;
@@ -113,7 +113,7 @@ export class Link {
     return true;
   }
 
-  /** Wait until all that the scheduler has cached is here. */
+  /** Wait until all packets of the scheduler's cache have arrived. */
   async waitCaughtUp(deadline: Deadline = Infinity): Promise<void> {
     const [scheduler] = this.launch.sockets.subscribe;
     if (scheduler === undefined) return;

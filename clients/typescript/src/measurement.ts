@@ -1,4 +1,4 @@
-/** Taking one scan or spectrum, whatever gets in between, exactly once. */
+/** Takes one scan or spectrum, exactly once, over interruptions and restarts. */
 
 import { create, toBinary } from "@bufbuild/protobuf";
 import { type Commands, encodeAction } from "./commands.js";
@@ -12,16 +12,16 @@ import type { Link, Listener } from "./link.js";
 import { encodePlace, encodeScanParameters, type Scan, type ScanParameters, type Spectrum } from "./model.js";
 import { ScanTarget, SpectrumTarget, type Target } from "./targets.js";
 
-const BEGUN_WITHIN_S = 5; // from the success of the action to the state that says so
-const MOST_FAILURES = 5; // in a row, that nothing explains: then a person should look
+const BEGUN_WITHIN_S = 5; // from the success of the action to its published state
+const MOST_FAILURES = 5; // in a row without a known reason, before a person has to look
 
-/** What was measured, and what interrupted it, for a person. */
+/** A result, and the reasons of interruptions, for a person. */
 export interface Measured<T> {
   readonly things: readonly T[];
   readonly interruptions: readonly string[];
 }
 
-/** A cycle that takes in what the scheduler publishes, until it is closed. */
+/** A cycle that receives the scheduler's packets until it is closed. */
 class Watch<T extends Scan | Spectrum> {
   private readonly listener: Listener;
 
@@ -74,7 +74,7 @@ export class Measurements {
   constructor(private readonly link: Link, private readonly control: ControlHold, private readonly commands: Commands) {
     this.results = new KeyedResults(link.launch.state_dir, link.launch.name);
     const intent = this.results.pending;
-    if (intent) { // watch, from the first packet on, for what an earlier life asked for and did not get
+    if (intent) { // follow from the first packet on the measurement that an earlier life requested
       const [what, place, detail] = JSON.parse(intent.facts) as [string, never, never];
       const moves = link.launch.sample_coordinates;
       const since = BigInt(intent.sinceNs);
@@ -83,7 +83,7 @@ export class Measurements {
     }
   }
 
-  /** Measure until there is a complete result; with a key, once in all lives of the component. */
+  /** Measure until the result is complete; with a key, once in all lives of the component. */
   async take<T extends Scan | Spectrum>(target: Target<T>, key: string | undefined, deadline: Deadline): Promise<Measured<T>> {
     if (key !== undefined) {
       checkKey(key);
@@ -95,7 +95,7 @@ export class Measurements {
     const { name } = this.link.launch;
     const task = new Task(target, key, key === undefined ? this.link.requests.nextId() : `${name}/key/${key}`, deadline);
     try {
-      await this.link.waitCaughtUp(deadline); // what is cached must not be taken for ours
+      await this.link.waitCaughtUp(deadline); // cached results must not count as new ones
       await this.takeUp(task);
       const things = await this.finish(task);
       this.channels.set(target.what, new Set(things.map(target.nameOf)));
@@ -103,7 +103,7 @@ export class Measurements {
       return { things, interruptions: task.interruptions };
     } catch (error) {
       if (key !== undefined && task.watch && !task.watch.isOver) {
-        this.unfinished = task.watch as unknown as Watch<Scan>; // what becomes of it is taken up by its key
+        this.unfinished = task.watch as unknown as Watch<Scan>; // its key leads to the result later
         task.watch = undefined;
       }
       throw error;
@@ -117,12 +117,12 @@ export class Measurements {
     return new Watch(this.link, target, new Cycle<T>(target.busy, sinceNs, resumed));
   }
 
-  /** Continue what an earlier life, or an earlier call, was at, if it was this. */
+  /** Continue this measurement if an earlier life or call had started it. */
   private async takeUp<T extends Scan | Spectrum>(task: Task<T>): Promise<void> {
     const intent = this.results.pending;
     const watch = this.unfinished as Watch<T> | undefined;
     if (task.key === undefined && watch) {
-      if (watch.cycle.begun) await this.link.wait(() => watch.isOver, task.deadline); // what comes now is not of this
+      if (watch.cycle.begun) await this.link.wait(() => watch.isOver, task.deadline); // later results belong to another measurement
       watch.close();
       if (!watch.isOver) this.unfinished = undefined;
       return;
@@ -132,7 +132,7 @@ export class Measurements {
       watch?.close();
       return;
     }
-    task.attempt = intent.attempt; // ids of attempts before are answered, not executed
+    task.attempt = intent.attempt; // ids of earlier attempts are answered, not executed
     task.interruptions = [...intent.interruptions];
     task.watch = watch;
   }
@@ -147,7 +147,7 @@ export class Measurements {
     return [...new Map(cycle.results.map((thing) => [target.nameOf(thing), thing])).values()];
   }
 
-  /** Attempt after attempt, until one is complete. */
+  /** Repeat attempts until one is complete. */
   private async measure<T extends Scan | Spectrum>(task: Task<T>): Promise<Cycle<T>> {
     if (task.watch?.isOver && task.watch.cycle.outcome !== "completed") task.dropWatch();
     for (;;) {
@@ -159,14 +159,14 @@ export class Measurements {
   }
 
   /**
-   * Prepare and begin once, and follow to the end. What was left without an answer when control was lost, or asked for
-   * in an earlier life, is asked for with the same id, so that it is not executed twice.
+   * Prepare and start once, and follow to the end. A request left unanswered when control was lost, or sent in an earlier
+   * life, is repeated with the same id, so that it is not executed twice.
    */
   private async attempt<T extends Scan | Spectrum>(task: Task<T>): Promise<void> {
     const { link, commands } = this;
     const { target, deadline } = task;
     await this.control.regain(deadline);
-    if (task.watch?.isOver) return; // it had begun, and ended while control was waited for
+    if (task.watch?.isOver) return; // it had started, and ended during the wait for control
     const isNew = !task.watch;
     if (isNew) {
       task.attempt += 1;
@@ -184,33 +184,33 @@ export class Measurements {
       return;
     }
     const isLost = response.code === ControlResponse.REP_NOT_IN_CONTROL || response.code === ControlResponse.REP_WRONG_CONTROL_MODE;
-    if (response.code === ControlResponse.REP_NO_RESPONSE || (!isNew && isLost)) watch.cycle.controlWasLost(); // it may have begun
+    if (response.code === ControlResponse.REP_NO_RESPONSE || (!isNew && isLost)) watch.cycle.controlWasLost(); // it may have started
     else task.dropWatch();
     try {
       await commands.getOver(ControlRequest.REQ_ACTION, response, states, deadline);
     } catch (error) {
-      if (isNew || !(error instanceof Refused)) throw error; // what was refused to an earlier life is asked for with another id
+      if (isNew || !(error instanceof Refused)) throw error; // a request refused to an earlier life needs another id
     }
   }
 
-  /** From the success of the action to the end of it. */
+  /** Follow a measurement from the success of its action to its end. */
   private async follow<T extends Scan | Spectrum>(task: Task<T>, watch: Watch<T>): Promise<void> {
     const isBegun = await this.link.waitConnected(() => watch.cycle.begun || watch.isOver, BEGUN_WITHIN_S, task.deadline);
     if (!isBegun) watch.cycle.outcome = "vanished";
     else if (!(await this.link.wait(() => watch.isOver, task.deadline))) throw new NoResponse(`the ${task.target.what}`, "it was not finished in time, and goes on");
   }
 
-  /** Whether the result is complete; else note why not, before the next attempt. */
+  /** Whether the result is complete; otherwise note the reason for the next attempt. */
   private isDone<T extends Scan | Spectrum>(task: Task<T>, cycle: Cycle<T>): boolean {
     const { target } = task;
     const names = new Set(cycle.results.map(target.nameOf));
     const missing = [...(this.channels.get(target.what) ?? [])].filter((name) => !names.has(name));
     if (cycle.outcome === "completed" && !missing.length) return true;
-    if (cycle.outcome === "completed") this.channels.delete(target.what); // the same again: then these are not recorded any more
+    if (cycle.outcome === "completed") this.channels.delete(target.what); // missing again: these channels are no longer recorded
     const why = cycle.outcome === "completed" ? `without ${missing.join(", ")}, which it had before` : this.whyFailed(cycle);
     task.interruptions.push(why);
     this.link.log("WARNING", `${target.what} interrupted: ${why}; retrying`);
-    task.failures = this.control.held ? task.failures + 1 : 0; // losing control explains itself and is waited for
+    task.failures = this.control.held ? task.failures + 1 : 0; // a loss of control is a known reason
     if (task.failures >= MOST_FAILURES) throw new MeasurementFailed(`the ${target.what} failed ${task.failures} times: ${why}`);
     return false;
   }
@@ -222,7 +222,7 @@ export class Measurements {
     return "the microscope is free again without a result; was it restarted?";
   }
 
-  /** Set what a target needs, unless it is set. */
+  /** Set the parameters of a target that differ from those in force. */
   private async prepare(target: Target<Scan | Spectrum> | Target<Scan> | Target<Spectrum>, deadline: Deadline): Promise<void> {
     const { link, commands } = this;
     if (target instanceof SpectrumTarget) {
@@ -236,10 +236,10 @@ export class Measurements {
     } else if (target instanceof ScanTarget && (target.region || target.shape)) {
       const now = link.scanParameters;
       const isRounded = this.rounded?.facts === target.facts && JSON.stringify(this.rounded.now) === JSON.stringify(now);
-      // in sample coordinates the same region is another place of the tip a while later
+      // in sample coordinates the tip position of a region changes with time
       if (!(target.moves && target.region) && (target.isSet(now) || isRounded)) return;
       await commands.set(ControlRequest.REQ_SET_SCAN_PARAMS, encodeScanParameters(target.region, target.shape), "ScanParameters2d", deadline);
-      // a controller may round: then this is what our wish looks like when it is set
+      // a controller may round: this is the requested value after rounding
       this.rounded = target.isSet(link.scanParameters, true) ? { facts: target.facts, now: link.scanParameters } : undefined;
     }
   }

@@ -1,4 +1,4 @@
-/** What is measured and what is in force, in SI units. Only here do units and corners of the wire matter. */
+/** Measurements and states, in SI units. The only module that knows units and corners of the wire format. */
 
 import { create, fromBinary, toBinary } from "@bufbuild/protobuf";
 import { InvalidValue, WireError } from "./errors.js";
@@ -25,13 +25,13 @@ export type Shape = readonly [rows: number, columns: number];
 /** A rectangle turned about its centre. */
 export interface Region {
   readonly centerM: XY;
-  /** Width and height in metres, before it is turned. */
+  /** Width and height in metres, before the rotation. */
   readonly sizeM: XY;
   /** Counter-clockwise, in radians; 0 by default. */
   readonly angleRad?: number;
 }
 
-/** Where and in how many pixels the next scan will be taken. */
+/** Region and number of pixels of the next scan. */
 export interface ScanParameters {
   readonly region: Region | undefined;
   readonly shape: Shape | undefined;
@@ -40,7 +40,7 @@ export interface ScanParameters {
 /** One channel of a scan. */
 export class Scan {
   private constructor(
-    /** Where it was taken. */
+    /** Region of the scan. */
     readonly region: Region,
     /** Rows and columns. */
     readonly shape: Shape,
@@ -52,7 +52,7 @@ export class Scan {
     readonly values: Float64Array,
     /** When it was finished, ns since the Unix epoch. */
     readonly timeNs: bigint | undefined,
-    /** Where the controller saved it; empty if it did not. */
+    /** The controller's own file; empty if there is none. */
     readonly filename: string,
     /** As it came. */
     readonly packet: Packet,
@@ -89,10 +89,10 @@ export class Scan {
   }
 }
 
-/** Neighbouring rows of one channel of a scan that is still running. */
+/** Neighbouring rows of one channel of a running scan. */
 export class ScanLines {
   private constructor(
-    /** Of the whole scan, as asked for. */
+    /** Of the whole scan, as requested. */
     readonly parameters: ScanParameters,
     /** Rows that came, and columns. */
     readonly shape: Shape,
@@ -121,7 +121,7 @@ export class ScanLines {
 /** Several variables measured together, point by point. */
 export class Spectrum {
   private constructor(
-    /** Of the probe, in metres; undefined if it is not known. */
+    /** Of the probe, in metres; undefined if unknown. */
     readonly positionM: XY | undefined,
     /** Such as "IV" or "force". */
     readonly kind: string,

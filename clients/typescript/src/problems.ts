@@ -1,7 +1,7 @@
 import { InvalidValue } from "./errors.js";
 import { ExperimentProblem } from "./generated/control_pb.js";
 
-/** The problems that an experiment knows: those of the wire, and those that its file adds. */
+/** The problems of an experiment: those of the wire format, and those added by its file. */
 export class ProblemNames {
   private readonly numbers = new Map<string, number>();
 
@@ -17,13 +17,13 @@ export class ProblemNames {
     return number;
   }
 
-  /** Return the name of a problem; one that has no name is told by its number. */
+  /** Return the name of a problem, or its number if it has none. */
   name(number: number): string {
     return [...this.numbers].find(([, one]) => one === number)?.[0] ?? `problem ${number}`;
   }
 }
 
-/** "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" as "tip-shape-changed". */
+/** Return Return "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" as "tip-shape-changed". */
 function plain(name: string): string {
   return name.trim().toLowerCase().replace(/[_ ]/g, "-").replace(/^ep-/, "");
 }

@@ -14,7 +14,7 @@ export class Publisher {
     const isEncrypted = keys?.everywhere ?? false;
     this.socket = new PubSocket({ ...SOCKET_OPTIONS, ...(isEncrypted && { curveServer: true, curveSecretKey: keys!.secret, zapDomain: "afspm" }) });
     this.bound = (isEncrypted ? this.letInPeers(keys!) : Promise.resolve()).then(() => this.socket.bind(address));
-    this.bound.catch(() => undefined); // told to who publishes
+    this.bound.catch(() => undefined); // a publication is rejected with it
   }
 
   async publish(frames: (timeNs: bigint) => Uint8Array[], nowNs: bigint): Promise<void> {
@@ -32,7 +32,7 @@ export class Publisher {
     this.guard?.close();
   }
 
-  /** Answer ZeroMQ's question whether a key may come in (RFC 27): those of the launch line may. */
+  /** Answer ZeroMQ's authentication requests (RFC 27): accept the keys of the launch line. */
   private async letInPeers(keys: Keys): Promise<void> {
     const guard = (this.guard = new Router({ linger: 0 }));
     await guard.bind("inproc://zeromq.zap.01");

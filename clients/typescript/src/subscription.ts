@@ -1,4 +1,4 @@
-/** Receives what one publisher publishes: each packet once, and what was missed before anything newer. */
+/** Receives the packets of one publisher: each once, and missed packets before newer ones. */
 
 import { XSubscriber } from "zeromq";
 import { decodePacket, KILL, type Packet } from "./frames.js";
@@ -9,7 +9,7 @@ const MOST_ENVELOPES = 10_000;
 const SUBSCRIBE = 1;
 const UNSUBSCRIBE = 0;
 
-/** The options that all our sockets share: a lost peer is found within seconds, and looked for again at once. */
+/** The options of all sockets: a lost peer is noticed within seconds, and reconnected at once. */
 export const SOCKET_OPTIONS = {
   linger: 200,
   tcpKeepalive: 1,
@@ -27,7 +27,7 @@ export interface SubscriptionHandlers {
   onDropped(why: string): void;
 }
 
-/** A connection to one publisher. Unlike SUB, XSUB lets the marker of a replay through as it is. */
+/** A connection to one publisher. Unlike SUB, XSUB sends the marker of a replay unchanged. */
 export class Subscription {
   private readonly socket: XSubscriber;
   private readonly prefixes: readonly string[];
@@ -38,7 +38,7 @@ export class Subscription {
   private marker: Buffer | undefined;
   private sending: Promise<unknown> = Promise.resolve();
 
-  /** @param prefixes of the envelopes wanted; null: all. The signal KILL always comes. */
+  /** @param prefixes of the wanted envelopes; null: all. The signal KILL is always included. */
   constructor(
     private readonly name: string,
     private readonly address: string,
@@ -59,7 +59,7 @@ export class Subscription {
     this.socket.close();
   }
 
-  /** A connection was made, the first or another: ask for what is newer than the newest that has come. */
+  /** After each connection, request packets newer than the newest received one. */
   private askForMissed(): void {
     this.forgetMarker();
     this.topic = Buffer.from(`\0replay/${this.name}/${this.connections++}`);
@@ -67,7 +67,7 @@ export class Subscription {
     this.send(SUBSCRIBE, this.marker);
   }
 
-  /** Else the socket would ask for the same again when the connection is next made. */
+  /** Unsubscribe: otherwise the socket would repeat the request at its next connection. */
   private forgetMarker(): void {
     if (this.marker) this.send(UNSUBSCRIBE, this.marker);
     this.marker = undefined;
@@ -75,7 +75,7 @@ export class Subscription {
 
   private send(kind: number, topic: Buffer): void {
     const frame = Buffer.concat([Buffer.of(kind), topic]);
-    this.sending = this.sending.then(() => this.socket.send(frame)).catch(() => undefined); // closed: nobody asks any more
+    this.sending = this.sending.then(() => this.socket.send(frame)).catch(() => undefined); // closed: no more subscriptions are needed
   }
 
   private async receive(): Promise<void> {
@@ -88,7 +88,7 @@ export class Subscription {
   private interpret(frames: Buffer[]): Packet | undefined {
     let contents = frames;
     if (frames[0]?.[0] === 0) {
-      if (!this.marker || !this.topic?.equals(frames[0])) return undefined; // of an earlier connection, or another's
+      if (!this.marker || !this.topic?.equals(frames[0])) return undefined; // of an earlier connection or another subscriber
       contents = frames.slice(1);
       if (!contents.length) {
         this.forgetMarker();

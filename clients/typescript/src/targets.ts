@@ -1,27 +1,27 @@
-/** A scan or a spectrum as it should be taken, and whether a published result is one. Pure. */
+/** A requested scan or spectrum, and the test whether a published result matches it. Pure. */
 
 import type { Packet } from "./frames.js";
 import { ScopeState } from "./generated/control_pb.js";
 import type { Published } from "./link.js";
 import { type Region, Scan, type ScanParameters, type Shape, Spectrum, type XY } from "./model.js";
 
-const SAME = 1e-6; // of the size: closer than any controller positions
+const SAME = 1e-6; // of the size: finer than any controller positions
 const FITS = 1e-2; // of the size: a controller's rounding, not another region
-const SPOT_M = 20e-9; // a scanner with sensors reports where the tip was, some nanometres from where it was sent
-const MOVED = 0.5; // of the size: where drift is corrected, a scan lies where it turned out to have been taken
-const SHEARED = 0.1; // of the size: and is as large, and as turned, as it turned out to be
+const SPOT_M = 20e-9; // a scanner with sensors reports the measured position, some nanometres from the requested one
+const MOVED = 0.5; // of the size: with drift correction a scan is published at its registered position
+const SHEARED = 0.1; // of the size: and with its registered size and angle
 
-/** What is to be measured; undefined leaves what is set. */
+/** A requested measurement; undefined: as set. */
 export interface Target<T extends Scan | Spectrum> {
   readonly what: string;
   readonly start: string;
   readonly busy: ScopeState;
-  /** What it consists of, by which a later life of the component recognises it. */
+  /** The parts by which a later life of the component recognises it. */
   readonly facts: string;
   /** Return the result in a packet; undefined: there is none. */
   of(published: Published): T | undefined;
   fits(result: T): boolean;
-  /** Return what is there once in a result: the channel of a scan. */
+  /** Return the name of a part of a result: the channel of a scan. */
   nameOf(result: T): string;
   decode(packet: Packet): T;
 }
@@ -32,7 +32,7 @@ export class ScanTarget implements Target<Scan> {
   readonly busy = ScopeState.SS_SCANNING;
   readonly facts: string;
 
-  /** @param moves places are those of the sample, and a scan lies where it turned out to have been taken. */
+  /** @param moves positions are in sample coordinates, and a scan is published at its registered position. */
   constructor(readonly region: Region | undefined, readonly shape: Shape | undefined, readonly moves: boolean) {
     this.facts = JSON.stringify([this.what, region ?? null, shape ?? null]);
   }
@@ -49,7 +49,7 @@ export class ScanTarget implements Target<Scan> {
     return isClose && isNear({ ...this.region, centerM: scan.region.centerM }, scan.region, SHEARED);
   }
 
-  /** Whether what is in force is what is wanted, but for a controller's rounding (`isRounded`). */
+  /** Whether the parameters in force match the wanted ones, up to a controller's rounding (`isRounded`). */
   isSet(now: ScanParameters | undefined, isRounded = false): boolean {
     if (!now || (this.shape && !(now.shape && isSameShape(this.shape, now.shape)))) return false;
     return !this.region || (now.region !== undefined && isNear(this.region, now.region, isRounded ? FITS : SAME));
@@ -67,7 +67,7 @@ export class SpectrumTarget implements Target<Spectrum> {
   }
 
   of = (published: Published) => (published.name === "Spec1d" ? published.value : undefined);
-  nameOf = () => ""; // there is one in a result, and the next may be of another kind
+  nameOf = () => ""; // a result has one spectrum, and the next may be of another kind
   decode = (packet: Packet) => Spectrum.decode(packet);
 
   fits(spectrum: Spectrum): boolean {
@@ -80,7 +80,7 @@ function isSameShape(a: Shape, b: Shape): boolean {
   return a[0] === b[0] && a[1] === b[1];
 }
 
-/** Whether two regions differ by less than `tolerance` of their size everywhere. */
+/** Whether all corners of two regions differ by less than `tolerance` of their size. */
 function isNear(a: Region, b: Region, tolerance: number): boolean {
   const sizeM = Math.hypot(...a.sizeM);
   const turn = (a.angleRad ?? 0) - (b.angleRad ?? 0);

@@ -1,4 +1,4 @@
-/** Units at the edges: everything inside is in SI (metres, seconds, volts, amperes, radians …). */
+/** Conversion of units at the edges: all values inside are in SI (metres, seconds, volts, amperes, radians …). */
 
 import { InvalidValue } from "./errors.js";
 

@@ -1,6 +1,6 @@
 /**
  * Takes the numbers of a message out of its bytes: a packed `repeated double` is tag, length, then little-endian
- * float64 values, so that what lies between becomes a Float64Array as it is, and only the small rest is parsed.
+ * float64 values, which become a Float64Array without a copy; only the small rest is parsed.
  */
 
 import { WireError } from "./errors.js";

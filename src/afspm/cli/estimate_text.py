@@ -8,6 +8,9 @@ from datetime import datetime, timedelta
 from afspm.basics.formatting import counted, duration_text, quantity
 from afspm.model.planned_work import PlannedWork, planned_end_s
 
+COMPUTING_S = 0.1
+"""Real time between two scans that have no period: measured 0.04 to 0.14 s on an idle computer of two cores."""
+
 
 def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: datetime) -> Iterator[str]:
     """Yield a line for each component, then one for the end.
@@ -25,9 +28,10 @@ def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: d
     bound = "at the latest about" if any(work.at_most for work in planned) else "about"
     end = now + timedelta(seconds=end_s / speed)
     real = f", {duration_text(end_s / speed)} real" if speed != 1.0 else ""
+    computing = "" if speed <= 1.0 else f"; at {speed:g} x also without computing, about {COMPUTING_S:g} s real a scan"
     yield (
         f"started now it would end {bound} {end.astimezone():%Y-%m-%d %H:%M} ({duration_text(end_s)}{real}),"
-        " without repairs, rescans and waiting for control"
+        f" without repairs, rescans and waiting for control{computing}"
     )
 
 

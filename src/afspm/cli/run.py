@@ -23,6 +23,7 @@ _QUESTIONS: Final = {
     "person": "Your name",
     "orcid": "Your ORCID iD",
     "project": "Project",
+    "probe": "Probe, as `afspm probes` lists it",
     "technique": "Technique (STM, STS or AFM)",
 }
 _TIP_REPAIR_NIGHT = "A simulated night of eight hours: the tip changes three times, and is repaired. Two minutes."
@@ -64,7 +65,7 @@ def run(
         ),
     ] = None,
     ask: Annotated[
-        bool, opt("Ask for sample, person and project first, for the files of the run ([metadata]).", "--ask")
+        bool, opt("Ask for sample, person, project and probe first, for the files of the run ([metadata]).", "--ask")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, list the processes to start, and start none.")

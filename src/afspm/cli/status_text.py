@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.formatting import area_text, day_and_time, duration_text, time_of_day
-from afspm.model import LogLine, ProcessCondition, ProcessState, Region, ScopeState
+from afspm.model import LogLine, ProcessCondition, ProcessState, Progress, Region, ScopeState
+from afspm.record.expected_end import Plans, expected_end_ns
 from afspm.record.overview import OLD_S, OVER, ROUTINE, Overview
 from afspm.record.timeline import Span
 
@@ -31,6 +32,7 @@ class RunDescription:
     Attributes:
         replay_of: folder of the run that is replayed; empty: it is no replay.
         began_ns: experiment time at its start; None if unknown.
+        plans: planned work of each component; None: no estimate.
         speed: experiment seconds in a real second.
         fancy: whether the terminal can show block characters.
     """
@@ -42,6 +44,7 @@ class RunDescription:
     began_ns: int | None = None
     speed: float = 1.0
     fancy: bool = True
+    plans: Plans = field(default_factory=dict)
 
 
 def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
@@ -78,7 +81,7 @@ class StatusText:
         if silent_s > OLD_S:
             told = f"no news for {duration_text(silent_s)}: the scheduler is restarting, or can't be reached"
             lines.append(Text(told, "bold yellow"))
-        lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._drift()]
+        lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._end(), *self._drift()]
         lines += self._processes()
         lines += self._refusals()
         lines += self._notes()
@@ -159,14 +162,23 @@ class StatusText:
         return f"{duration_text(left_ns / NS_PER_S)} left{real}"
 
     def _progress(self) -> Iterator[Text]:
-        for told in self._seen.progress_reports.values():
-            if told.of <= 0:
+        for report in self._seen.progress_reports.values():
+            if report.of <= 0:
                 continue
-            left_ns = told.remaining_ns(self._now_ns)
+            left_ns = report.remaining_ns(self._now_ns)
             left = "longer than expected" if left_ns == 0 else self._left(left_ns)
             left += f", ends {day_and_time(self._now_ns + left_ns, seconds=False)}" if left_ns else ""
-            said = f"{told.name}: {told.done} of {told.of}  {self._bar(told.done / told.of)} "
-            yield _label("progress").append(said + ("done" if told.done >= told.of else left))
+            count = f"{report.name}: {report.done} of {report.of}  {self._bar(report.done / report.of)} "
+            yield _label("progress").append(count + ("done" if report.done >= report.of else left))
+
+    def _end(self) -> Iterator[Text]:
+        if (end_ns := self._end_ns()) is not None:
+            left = self._left(end_ns - self._now_ns) if end_ns > self._now_ns else "later than expected"
+            yield _label("end").append(f"about {day_and_time(end_ns, seconds=False)}, {left}")
+
+    def _end_ns(self) -> int | None:
+        run = self._run
+        return expected_end_ns(run.plans, self._seen.progress_reports, run.began_ns, self._now_ns)
 
     def _drift(self) -> Iterator[Text]:
         if registered := self._seen.registration:
@@ -216,7 +228,7 @@ class StatusText:
     def as_json(self) -> dict[str, object]:
         """Return the status for programs. Times are ISO 8601 in UTC, durations are in experiment seconds."""
         seen, run = self._seen, self._run
-        control, running = seen.control, seen.scan_progress(self._now_ns)
+        control, running, end_ns = seen.control, seen.scan_progress(self._now_ns), self._end_ns()
         return {
             "experiment": run.name,
             "folder": run.folder,
@@ -237,10 +249,8 @@ class StatusText:
             ],
             "state": seen.status.state.name if seen.status else None,
             "scan": None if running is None else {"part": round(running[0], 4), "remaining_s": _seconds(running[1])},
-            "progress": {
-                name: {"done": told.done, "of": told.of, "remaining_s": _seconds(told.remaining_ns(self._now_ns))}
-                for name, told in seen.progress_reports.items()
-            },
+            "progress": {name: self._progress_json(report) for name, report in seen.progress_reports.items()},
+            "end": None if end_ns is None else {"time": _iso(end_ns), "remaining_s": _seconds(end_ns - self._now_ns)},
             "processes": [self._process_json(state) for state in seen.processes.values()],
             "refusals": [
                 {"time": _iso(one.time_ns), "who": one.who, "what": one.what, "reason": one.reason}
@@ -255,6 +265,11 @@ class StatusText:
                 for line in seen.log
             ],
         }
+
+    def _progress_json(self, report: Progress) -> dict[str, object]:
+        left_ns = report.remaining_ns(self._now_ns)
+        end = None if left_ns is None else _iso(self._now_ns + left_ns)
+        return {"done": report.done, "of": report.of, "remaining_s": _seconds(left_ns), "end": end}
 
     def _process_json(self, state: ProcessState) -> dict[str, object]:
         return {

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from afspm.basics.clock import ExperimentClock
 from afspm.basics.errors import ConfigError
+from afspm.basics.formatting import quantity
 from afspm.basics.launch import Launch
 from afspm.experiment import document as documents
 from afspm.experiment import forms, process_starts
@@ -19,7 +20,7 @@ from afspm.experiment.implied_parts import RECORDS
 from afspm.experiment.process_starts import ProcessStart
 from afspm.experiment.toml_lines import Table
 from afspm.experiment.toml_writer import to_toml
-from afspm.model import Role
+from afspm.model import Role, names
 
 if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment
@@ -170,12 +171,21 @@ class Experiment:
     def planned_work(self) -> dict[str, PlannedWork | None]:
         """Return the planned work of each component that acts on its own; None: no estimate."""
         plans = self.resolved.plans
-        speed_m_s = next((plan.scan_speed_m_s for plan in plans.values() if plan.scan_speed_m_s), None)
+        microscope = next((plan for plan in plans.values() if plan.scan_speed_m_s), None)
+        speed_m_s = None if microscope is None else microscope.scan_speed_m_s
         acting = [
             name for name, process in self.resolved.processes.items() if process.acts and process.role is Role.COMPONENT
         ]
         works = {name: plans[name].work if name in plans else None for name in acting}
-        return {name: work and work(speed_m_s) for name, work in works.items()}
+        estimates = {name: work and work(speed_m_s) for name, work in works.items()}
+        if microscope is None or microscope.sets(names.SCAN_SPEED):
+            return estimates
+        default = f"scan-speed is the simulator's default, {quantity(speed_m_s, 'm/s')}"
+        for name, work in works.items():
+            estimate, without = estimates[name], work and work(None)
+            if estimate is not None and without is not None and estimate.duration_s != without.duration_s:
+                estimates[name] = replace(estimate, why="; ".join(filter(None, (estimate.why, default))))
+        return estimates
 
     def clock(self) -> ExperimentClock:
         """Return the clock of a run that begins now, from [clock]."""

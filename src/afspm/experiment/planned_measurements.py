@@ -44,6 +44,10 @@ class PlannedMeasurements:
     drift_doubts: tuple[AfspmError, ...] = ()
     work: Callable[[float | None], PlannedWork | None] | None = None
 
+    def sets(self, name: str) -> bool:
+        """Return whether the file sets this parameter."""
+        return any(one.name == name for parameters in self.parameters.values() for one in parameters)
+
     def frame(self) -> Iterator[Parameter]:
         """Yield the parameters that its scans set: sizes, places and pixels."""
         for region in self.regions:

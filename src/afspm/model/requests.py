@@ -43,7 +43,7 @@ LONGEST_LEASE_S = 86_400.0
 OTHER_RUN_RESPONSE = 100
 """Response to a component that named another run than the scheduler's; an extension of afspm."""
 
-_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "TELL", RESTART_REQUEST: "RESTART", LEASE_REQUEST: "LEASE"}
+_OURS = {CLOCK_REQUEST: "CLOCK", RELAY_REQUEST: "RELAY", RESTART_REQUEST: "RESTART", LEASE_REQUEST: "LEASE"}
 
 
 def request_name(kind: int) -> str:

@@ -12,9 +12,9 @@ from typing import Any
 from afspm import wire
 from afspm.basics.clock import iso_utc
 from afspm.model import Packet, ProblemNames, Scan, ScopeState
-from afspm.record import nexus, provenance
+from afspm.record import nexus_writer, provenance
 from afspm.record.journal import SCHEDULER
-from afspm.record.nexus import FileProvenance
+from afspm.record.nexus_writer import FileProvenance
 from afspm.record.provenance import ControlAtStart
 from afspm.record.scan_assembler import Assembled, AssembledScan, AssembledSpectrum
 from afspm.storage.atomic import FileBatch, replace_file
@@ -119,7 +119,7 @@ class MeasuredFiles:
             facts["drift"] = mapping
         at = FileProvenance(time_ns, stood.began_ns, facts, header_of(filename, self._folder))
         if scans:
-            self._batch.write(self._folder / name, nexus.encode_scan(scans, at))
+            self._batch.write(self._folder / name, nexus_writer.encode_scan(scans, at))
         region, shape = (scans[0].region, scans[0].shape) if scans else (None, (None, None))
         place = (None,) * 5 if region is None else (*region.center_m, *region.size_m, region.angle_rad)
         frame = None if region is None else region.frame.value
@@ -141,9 +141,9 @@ class MeasuredFiles:
         if new.keys() <= there:
             return
         scans = [*content.scans, *(scan for channel, scan in new.items() if channel not in there)]
-        about = nexus.facts_of(path)
+        about = nexus_writer.facts_of(path)
         at = FileProvenance(about["time_ns"], about["began_ns"], about, header_of(scans[0].filename, self._folder))
-        self._batch.write(path, nexus.encode_scan(scans, at))
+        self._batch.write(path, nexus_writer.encode_scan(scans, at))
         channels = json.dumps([[scan.channel, scan.unit] for scan in scans], ensure_ascii=False)
         self._journal.execute("UPDATE scans SET channels = ? WHERE number = ?", (channels, number))
 
@@ -177,7 +177,7 @@ class MeasuredFiles:
             number, name = self._next(SPECTRA, time_ns)
             facts = {**self._facts, **stood.facts(self._problems), "number": number}
             at = FileProvenance(time_ns, stood.began_ns, facts, header_of(spectrum.filename, self._folder))
-            self._batch.write(self._folder / name, nexus.encode_spectrum(spectrum, at))
+            self._batch.write(self._folder / name, nexus_writer.encode_spectrum(spectrum, at))
             place = (None, None) if spectrum.position_m is None else spectrum.position_m
             names, units = (json.dumps(texts, ensure_ascii=False) for texts in (spectrum.names, spectrum.units))
             self._journal.execute(

@@ -1,4 +1,4 @@
-"""Reader of the record's HDF5 files, which follow NeXus' NXspm (`record.nexus`), without loss.
+"""Reader of the record's HDF5 files, which follow NeXus' NXspm (`record.nexus_writer`), without loss.
 
 It also reads a grid of spectra in one file (`record.export.nexus`), which holds the mean of several spectra at a point.
 """

@@ -218,11 +218,6 @@ class Overview:
         return sorted(spans, key=lambda span: span.start_ns)
 
     @property
-    def progress(self) -> dict[str, tuple[int, int]]:
-        """(done, total) of each component that reports its progress."""
-        return {name: (report.done, report.of) for name, report in self.progress_reports.items()}
-
-    @property
     def control_since_ns(self) -> int | None:
         """The time of the last change of control; in MANUAL, of the mode. None if it is unknown."""
         is_manual = self.control is not None and self.control.mode is ControlMode.MANUAL

@@ -78,7 +78,7 @@ class Scheduler:
         folder = Path(launch.state_dir) if launch.state_dir else None
         state = StateFile(folder and folder / f"{launch.name}.json", log)
         coordinates = self.coordinates(context)
-        core = SchedulerCore(self._settings(context), WireCodec(), coordinates.frame)
+        core = SchedulerCore(self.settings(context), WireCodec(), coordinates.frame)
         _restore(core, state, log_folder(folder) if folder else None)
         write_ahead = WriteAhead(state, PacketLog(log_folder(folder)) if folder else None, core.cached, log)
         warnings = RateLimitedLog(log, clock)
@@ -103,7 +103,12 @@ class Scheduler:
             shell.close()
         return ExitCode.ENDED if shell.ended else ExitCode.ORPHAN
 
-    def _settings(self, context: ProcessContext) -> SchedulerSettings:
+    def settings(self, context: ProcessContext) -> SchedulerSettings:
+        """Return the settings of the core.
+
+        Raises:
+            ConfigError: a problem that ends the experiment has no number.
+        """
         launch, control, cache = context.launch, self._control, self._cache
         try:
             rules = control.rules(context.problems)
@@ -118,8 +123,12 @@ class Scheduler:
             run=RunFacts(dict(launch.clock), launch.run, launch.simulated, asdict(versions_here())),
         )
 
-    def coordinates(self, context: ProcessContext) -> Coordinates:
-        """Return the coordinates of components: those of the tip, unless a subclass has others."""
+    def coordinates(self, context: ProcessContext, *, in_process: bool = False) -> Coordinates:
+        """Return the coordinates of components: those of the tip, unless a subclass has others.
+
+        Args:
+            in_process: whether the worker works in this process and at once, as a test needs it.
+        """
         return Coordinates()
 
 

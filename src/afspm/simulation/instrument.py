@@ -247,6 +247,15 @@ class Instrument:
             self.world.restore(self._before)
             self._redraw((*self.scan.adjusted, Adjustment(now_s, self.setup.feedback, self.setup.bias_v)))
 
+    def change_tip(self, condition: str, now_s: float) -> None:
+        """Change the tip, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        self.drawing.wait()
+        self.world.change_tip(condition, now_s)
+        self.note(now_s, "tip changed on demand", {"condition": condition})
+        if self._scans and self.scan is not None and self.scan.running(now_s):
+            self.world.restore(self._before)
+            self._redraw(self.scan.adjusted)
+
     @property
     def _scans(self) -> bool:
         return self.scan is not None and self.scan is self._doing and self.scan.stopped_s is None
@@ -280,7 +289,8 @@ class Instrument:
         end_s = now_s + sweeps * self.world.spectrum_s(kind)
         self.spectrum = SpectrumActivity(number, kind, self._probe_m, now_s, end_s, names, units, values)
         self._doing = self.spectrum
-        self.note(now_s, "spectrum starts", {"number": number, "kind": kind})
+        truth = self.world.property_truth(self._probe_m, now_s)
+        self.note(now_s, "spectrum starts", {"number": number, "kind": kind, **truth})
         return self.spectrum
 
     def stop_spectrum(self, now_s: float) -> None:

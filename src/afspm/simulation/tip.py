@@ -282,6 +282,11 @@ class SimulatedTip:
         self.scheduled_until_s = min(self.scheduled_until_s, t_s)
         self.advance(t_s)
 
+    def schedule(self, condition: str, t_s: float) -> None:
+        """Add a change to the schedule: also scans that are drawn again have it."""
+        change = (t_s - self._start_s, condition)
+        self._settings = replace(self._settings, schedule=(*self._settings.schedule, change))
+
     def advance(self, until_s: float) -> None:
         """Apply the scheduled changes up to a time."""
         for number, (after_s, condition) in enumerate(self._settings.schedule):

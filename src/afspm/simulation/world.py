@@ -23,11 +23,13 @@ from afspm.simulation.feedback import FeedbackSettings, Loop
 from afspm.simulation.fields import Array
 from afspm.simulation.measuring import Adjustment, Felt, Setup, SignalSettings, TipTimes, at_rest, feel, measure
 from afspm.simulation.noise import NoiseSettings
+from afspm.simulation.property_map import PropertyMap, PropertyMapSettings
 from afspm.simulation.sample import Sample, SurfaceMark
 from afspm.simulation.scanning import Course, ScannerPlace, ScannerSettings, SimulatedScan
 from afspm.simulation.settings import build, nearest
 from afspm.simulation.surfaces import surface_from
 from afspm.simulation.tip import (
+    CONDITIONS,
     SimulatedTip,
     TipChange,
     TipChangeSettings,
@@ -67,6 +69,7 @@ class WorldSettings:
     signals: SignalSettings = field(default_factory=SignalSettings)
     iv: spectra.IVSettings = field(default_factory=spectra.IVSettings)
     force: spectra.ForceSettings = field(default_factory=spectra.ForceSettings)
+    property_map: PropertyMapSettings = field(default_factory=PropertyMapSettings)
 
 
 def read_settings(settings: Mapping[str, object]) -> tuple[object, WorldSettings]:
@@ -126,6 +129,7 @@ class World:
         self.settings = settings or WorldSettings()
         self.seed, self.start_s = seed, start_s
         self.sample = Sample(surface, self.settings.drift, seed, start_s)
+        self.property_map = PropertyMap(self.settings.property_map, seed)
         self._tip = SimulatedTip(self.settings.tip, self.settings.tip_changes, seed, start_s)
         self._calls = 0
         self._place = ScannerPlace(self.settings.scanner.creep, start_s)
@@ -258,8 +262,18 @@ class World:
         material = float(relief.material[0, 0])
         random = chance.generator(self.seed, 3, call)
         if kind == "IV":
-            return spectra.current_voltage(self.settings.iv, tip, material, bias_v, loop, random)
-        return spectra.force_distance(self.settings.force, tip, material, random)
+            iv, material = self.property_map.on_iv(self.settings.iv, material, x, y)
+            return spectra.current_voltage(iv, tip, material, bias_v, loop, random)
+        force = self.property_map.on_force(self.settings.force, x, y)
+        return spectra.force_distance(force, tip, material, random)
+
+    def property_truth(self, position_m: tuple[float, float], t_s: float) -> dict[str, object]:
+        """Return the true value of the property map under a position, JSON-able; empty without a map."""
+        if not self.property_map.is_on:
+            return {}
+        x, y = self.sample.under(position_m, t_s)
+        value, quantity = float(self.property_map.at(x, y)), self.property_map.quantity
+        return {"property": {"quantity": quantity, "value": value, "unit": self.property_map.unit, "sample_m": [x, y]}}
 
     def spectrum_s(self, kind: str) -> float:
         return self.settings.iv.duration_s if kind == "IV" else self.settings.force.duration_s
@@ -275,6 +289,12 @@ class World:
         self.sample.compensation.set(velocity_m_per_s, t_s)
 
     # -- treating the tip
+
+    def change_tip(self, condition: str, t_s: float) -> None:
+        """Change the tip at a time that has not passed: "sharp", "blunt", "double" or "contaminated"."""
+        if condition not in CONDITIONS:
+            raise InvalidValue(f"a tip is not {condition!r}", hint=f"one of {', '.join(CONDITIONS)}")
+        self._tip.schedule(condition, t_s)
 
     def pulse(
         self, voltage_v: float, duration_s: float, t_s: float, position_m: tuple[float, float] | None = None

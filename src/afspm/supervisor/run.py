@@ -124,8 +124,8 @@ def go(
         files = before.get(FILES) or list(map(str, experiment.files))
         facts = {**run_facts(name, starts, common), **facts_to_resume(experiment, starts, options), FILES: files}
         facts[METADATA] = before.get(METADATA) or experiment.resolved.metadata() | dict(options.metadata)
-        works = {name: work for name, work in experiment.planned_work().items() if work is not None}
-        facts[PLANNED] = before.get(PLANNED) or {name: work.as_dict() for name, work in works.items()}
+        works = experiment.planned_work().items()
+        facts[PLANNED] = before.get(PLANNED) or {name: work and work.as_dict() for name, work in works}
         if before.get(ENDED) and REAL_S in before:
             facts[REAL_S] = before[REAL_S]
         run_folder.write_run(folder, facts)

@@ -11,7 +11,7 @@ from google.protobuf.message import Message
 from afspm import model
 from afspm.basics.errors import AfspmError, InvalidValue, UnitError, WireError
 from afspm.basics.units import convert as convert_unit
-from afspm.wire import convert
+from afspm.wire import unit_conversion
 from afspm.wire.generated import analysis_pb2, lines_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import MAPPINGS, MessageMapping, time_ns, timestamp
 from afspm.wire.messages import message_type, parse
@@ -69,7 +69,7 @@ def header(name: str, payload: Buffer) -> model.PacketHeader:
 
 def _encode_scan(scan: model.Scan) -> tuple[str, bytes]:
     message = scan_pb2.Scan2d(
-        params=convert.scan_parameters_to_wire(scan.parameters),
+        params=unit_conversion.scan_parameters_to_wire(scan.parameters),
         channel=scan.channel,
     )
     if scan.time_ns is not None:
@@ -88,7 +88,7 @@ def _decode_scan(payload: Buffer) -> model.Scan:
     shape = message.params.data.shape
     if values.size and values.size != shape.x * shape.y:
         raise WireError(f"a scan of {shape.x} x {shape.y} pixels with {values.size} values")
-    region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
+    region = unit_conversion.whole_region(unit_conversion.spatial_from_wire(message.params.spatial))
     if region is None:
         raise WireError("a scan without a place")
     return model.Scan(
@@ -116,7 +116,7 @@ def _scan_header(payload: Buffer) -> model.PacketHeader:
 
 def _encode_lines(lines: model.ScanLines) -> tuple[str, bytes]:
     message = lines_pb2.ScanLines(
-        params=convert.scan_parameters_to_wire(model.ScanParameters(lines.region, lines.shape, lines.unit)),
+        params=unit_conversion.scan_parameters_to_wire(model.ScanParameters(lines.region, lines.shape, lines.unit)),
         channel=lines.channel,
         first_row=lines.first_row,
     )
@@ -129,7 +129,7 @@ def _decode_lines(payload: Buffer) -> model.ScanLines:
     rest, chunks = split(payload, _VALUES_OF_LINES)
     message = parse(lines_pb2.ScanLines, rest)
     values, shape = doubles(chunks), message.params.data.shape
-    region = convert.whole_region(convert.spatial_from_wire(message.params.spatial))
+    region = unit_conversion.whole_region(unit_conversion.spatial_from_wire(message.params.spatial))
     if region is None or not shape.x or values.size % shape.x:
         raise WireError(f"{values.size} values are no lines of {shape.x} pixels of a scan with a known place")
     return model.ScanLines(
@@ -151,7 +151,7 @@ def _lines_header(payload: Buffer) -> model.PacketHeader:
 def _encode_spectrum(spectrum: model.Spectrum) -> tuple[str, bytes]:
     message = spectroscopy_pb2.Spec1d(type=spectrum.kind)
     if spectrum.position_m is not None:
-        message.position.CopyFrom(convert.position_to_wire(model.ProbePosition(spectrum.position_m)))
+        message.position.CopyFrom(unit_conversion.position_to_wire(model.ProbePosition(spectrum.position_m)))
     if spectrum.filename:
         message.filename = spectrum.filename
     if spectrum.time_ns is not None:
@@ -177,7 +177,7 @@ def _decode_spectrum(payload: Buffer) -> model.Spectrum:
         raise WireError(
             f"a spectrum of {data.num_variables} variables of {data.data_per_variable} values each with {values.size}"
         )
-    position = convert.position_from_wire(message.position).xy_m if message.HasField("position") else None
+    position = unit_conversion.position_from_wire(message.position).xy_m if message.HasField("position") else None
     return model.Spectrum(
         position,
         message.type,
@@ -214,9 +214,9 @@ def _encode_mapped(mapping: MessageMapping[object], thing: object) -> tuple[str,
 
 
 def _published_parameters(payload: Buffer) -> model.ScanParameters:
-    parameters = convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, payload))
+    parameters = unit_conversion.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, payload))
     if isinstance(parameters.region, model.RegionChange):  # published parameters are in force: no angle means unrotated
-        whole = convert.whole_region(parameters.region)
+        whole = unit_conversion.whole_region(parameters.region)
         parameters = model.ScanParameters(whole or parameters.region, parameters.shape, parameters.unit)
     # a request may change one axis alone, but parameters in force have both
     if isinstance(parameters.shape, model.ShapeChange):
@@ -228,8 +228,8 @@ _ENCODERS: dict[type, Callable[[Any], tuple[str, bytes]]] = {
     model.Scan: _encode_scan,
     model.ScanLines: _encode_lines,
     model.Spectrum: _encode_spectrum,
-    model.ScanParameters: lambda thing: _serialised(convert.scan_parameters_to_wire(thing)),
-    model.ProbePosition: lambda thing: _serialised(convert.position_to_wire(thing)),
+    model.ScanParameters: lambda thing: _serialised(unit_conversion.scan_parameters_to_wire(thing)),
+    model.ProbePosition: lambda thing: _serialised(unit_conversion.position_to_wire(thing)),
     **{mapping.kind: partial(_encode_mapped, mapping) for mapping in MAPPINGS},
 }
 
@@ -238,7 +238,7 @@ _DECODERS: dict[str, Callable[[Buffer], object]] = {
     "ScanLines": _decode_lines,
     "Spec1d": _decode_spectrum,
     "ScanParameters2d": _published_parameters,
-    "ProbePosition": lambda payload: convert.position_from_wire(parse(spectroscopy_pb2.ProbePosition, payload)),
+    "ProbePosition": lambda payload: unit_conversion.position_from_wire(parse(spectroscopy_pb2.ProbePosition, payload)),
     **{mapping.name: mapping.decode for mapping in MAPPINGS},
 }
 

@@ -26,7 +26,7 @@ from afspm.model import (
     ResponseDetail,
     request_name,
 )
-from afspm.wire import convert
+from afspm.wire import unit_conversion
 from afspm.wire.codec import encode
 from afspm.wire.generated import control_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.mapping import FEEDBACK, PARAMETER, RELAYED, known, time_ns, timestamp
@@ -204,7 +204,7 @@ def _action(payload: bytes) -> str:
 
 
 def _new_action(payload: bytes) -> str:
-    return convert.action_from_wire(parse(control_pb2.ActionMsg, payload))
+    return unit_conversion.action_from_wire(parse(control_pb2.ActionMsg, payload))
 
 
 _known_action = lru_cache(256)(_new_action)
@@ -235,9 +235,13 @@ def _seconds(payload: bytes) -> float:
 _SUBJECTS: dict[int, Callable[[bytes], object]] = {
     ControlRequest.ACTION: _action,
     ControlRequest.PARAM: PARAMETER.decode,
-    ControlRequest.SET_SCAN_PARAMS: lambda p: convert.scan_parameters_from_wire(parse(scan_pb2.ScanParameters2d, p)),
+    ControlRequest.SET_SCAN_PARAMS: lambda p: unit_conversion.scan_parameters_from_wire(
+        parse(scan_pb2.ScanParameters2d, p)
+    ),
     ControlRequest.SET_ZCTRL_PARAMS: FEEDBACK.decode,
-    ControlRequest.SET_PROBE_POS: lambda p: convert.position_change_from_wire(parse(spectroscopy_pb2.ProbePosition, p)),
+    ControlRequest.SET_PROBE_POS: lambda p: unit_conversion.position_change_from_wire(
+        parse(spectroscopy_pb2.ProbePosition, p)
+    ),
     ControlRequest.REQUEST_CTRL: _number,
     ControlRequest.RELEASE_CTRL: _nothing,
     ControlRequest.ADD_EXP_PRBLM: _number,

@@ -9,7 +9,7 @@ from google.protobuf.message import Message
 
 from afspm.basics.errors import WireError
 from afspm.model import ProbePosition, Region
-from afspm.wire import convert
+from afspm.wire import unit_conversion
 from afspm.wire.generated import lines_pb2, scan_pb2, spectroscopy_pb2
 from afspm.wire.messages import parse
 from afspm.wire.split import Buffer, nested, packed, packed_chunks, split
@@ -73,8 +73,8 @@ def with_nan(head: bytes) -> bytes:
 def encode_place(place: Region | ProbePosition) -> bytes:
     """Return a place as the part of a message that holds it: a SpatialAspects, or a ProbePosition."""
     if isinstance(place, Region):
-        return convert.spatial_to_wire(place).SerializeToString()
-    return convert.position_to_wire(place).SerializeToString()
+        return unit_conversion.spatial_to_wire(place).SerializeToString()
+    return unit_conversion.position_to_wire(place).SerializeToString()
 
 
 def place_in(name: str, payload: Buffer) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+from pathlib import Path
 
 import numpy as np
 
@@ -36,10 +37,11 @@ class Hangs:
 
 
 class Forks(Brightest):
-    """Leaves a child process behind that holds all pipes of the worker, and hangs."""
+    """Leaves a child process behind that holds all pipes of the worker, and hangs. The child writes to $FORKED."""
 
     def register(self, reference: DriftScan, scan: DriftScan, prior: Prior | None = None) -> Registration:
         if os.fork() == 0:
+            Path(os.environ["FORKED"]).write_text("forked", encoding="utf-8")
             threading.Event().wait(15.0)
             os._exit(0)
         threading.Event().wait()

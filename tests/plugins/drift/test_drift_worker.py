@@ -9,7 +9,6 @@ import subprocess
 import sys
 import textwrap
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -279,7 +278,7 @@ def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatc
 def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: Path) -> None:
     """Otherwise it would write the state that the worker of the next scheduler reads."""
     program = """
-        import logging, sys, time
+        import logging, sys, threading
         from afspm.plugins.drift.scheduler.messages import StartWorker
         from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
         from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
@@ -295,7 +294,7 @@ def test_worker_ends_with_a_killed_scheduler_even_while_it_registers(tmp_path: P
         heard.next(Registered)
         worker.take(job(1, 33, 28))
         print(worker._process.pid, flush=True)
-        time.sleep(600)
+        threading.Event().wait()
     """
     command = [sys.executable, "-c", textwrap.dedent(program)]
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
@@ -325,14 +324,18 @@ def test_simulated_time_passes_again_when_a_hanging_worker_is_restarted(work: Ca
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="a process can't be forked here")
-def test_restart_does_not_wait_for_processes_that_an_estimator_has_forked(work: Callable[..., Heard]) -> None:
+def test_restart_does_not_wait_for_processes_that_an_estimator_has_forked(
+    work: Callable[..., Heard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fifo = tmp_path / "forked"
+    os.mkfifo(fifo)
+    monkeypatch.setenv("FORKED", str(fifo))
     heard = work("Forks")
     heard.registrar.take(job(0, 30, 30))
     heard.next(Registered)
     former = psutil.Process(heard.registrar._process.pid)  # type: ignore[union-attr]
     heard.registrar.take(job(1, 33, 28))
-    while not former.children():
-        time.sleep(0.01)
+    assert fifo.read_text(encoding="utf-8") == "forked"  # waits for the child
     (left,) = former.children()
     heard.registrar.take(StartWorker())
     assert left.status() != psutil.STATUS_ZOMBIE, "the restart has waited for its end"

@@ -20,11 +20,23 @@ from matplotlib.text import Text
 
 from afspm.components.surveying import SurveyRecord, Target
 from afspm.components.surveying.figure import draw_survey
-from afspm.plugins.drift.figures.drawings import ScanPair, draw_errors, draw_histogram, draw_offsets, draw_pairs
+from afspm.plugins.drift.figures.drawings import (
+    ScanPair,
+    draw_errors,
+    draw_estimates,
+    draw_features,
+    draw_histogram,
+    draw_offsets,
+    draw_pairs,
+)
+from afspm.plugins.drift.registration import Matches
 from afspm.record import night_figure
 
 SHOWN_PX = 800.0  # the width of a column of text in the report and the README
 LEAST_PX = 7.0
+
+AT = np.random.default_rng(2).uniform(-0.9e-6, 0.9e-6, (40, 2))
+MATCHES = Matches(AT, AT + 20e-9, np.arange(40) % 4 > 0)
 
 
 def drawn_night(path: Path) -> None:
@@ -49,6 +61,8 @@ PICTURES: dict[str, Callable[[Path], None]] = {
     "offset": lambda path: saved(draw_offsets(record(), truth_m=record().drift_m), path),
     "pairs": lambda path: saved(draw_pairs([ScanPair(scan(0), scan(8), np.array([3e-9, 4e-9]), "on")]), path),
     "histogram": lambda path: saved(draw_histogram(record(), title="off"), path),
+    "estimates": lambda path: saved(draw_estimates(record(), title="off", truth_m=record().misplacement_m), path),
+    "features": lambda path: saved(draw_features(scan(0), scan(1), MATCHES), path),
     "errors": lambda path: saved(draw_errors(record(), record().drift_m), path),
 }
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.unit.record.record_lab import ABOUT, Night
+from tests.unit.record.test_measured_tables import start
 from typer.testing import CliRunner
 
 from afspm.basics.errors import InvalidValue
@@ -45,11 +46,13 @@ def true_m(xy_m: tuple[float, float]) -> tuple[float, float]:
     return (cos * xy_m[0] - sin * xy_m[1] + OFFSET_M[0], sin * xy_m[0] + cos * xy_m[1] + OFFSET_M[1])
 
 
-def record(folder: Path, *scans: Scan) -> Path:
+def record(folder: Path, *scans: Scan, keys: tuple[str, ...] = ()) -> Path:
     folder.mkdir()
     night, store = Night(), RecordStore(folder, ABOUT)
     for number, scan in enumerate(scans, 1):
         taken = Scan(scan.region, scan.channel, scan.unit, scan.values, night.now_ns, f"s{number}.nc")
+        for key in keys[number - 1 : number]:
+            store.take([start(night, key)])
         scanning, free = night.state(ScopeState.SCANNING), night.state(ScopeState.FREE)
         store.take([scanning, night.packet(taken, "Scan2d_Height"), free])
     store.close()
@@ -130,6 +133,21 @@ def test_command_prints_offset_and_angle_or_that_it_is_not_found(tmp_path: Path)
     lost = CliRunner().invoke(app, ["find", str(other), str(night)])
     assert lost.exit_code == 1
     assert lost.output.startswith("not found: ")
+
+
+def test_command_prints_the_keyed_regions_in_coordinates_of_today(tmp_path: Path) -> None:
+    zoom = Region((9e-7, -9e-7), (2e-7, 1e-7), math.radians(20.0))
+    night = record(tmp_path / "night", scanned(FRAME, 1), scanned(zoom, 3), keys=("wide", "zoom-1"))
+    today = record(tmp_path / "today", scanned(TODAY, 2, turn_rad=TURN_RAD, offset_m=OFFSET_M))
+    found = CliRunner().invoke(app, ["find", str(today), str(night)])
+    assert found.exit_code == 0, found.output
+    (line,) = (line for line in found.output.splitlines() if "zoom-1" in line)
+    number = r"(-?[\d.]+)"
+    cells = re.search(rf"zoom-1 +\(900, -900\) nm +\({number}, {number}\) (µm|nm) .* 200 x 100 nm +{number}°", line)
+    assert cells, line
+    unit_m = {"µm": 1e-6, "nm": 1e-9}[cells[3]]
+    assert math.dist((float(cells[1]) * unit_m, float(cells[2]) * unit_m), true_m(zoom.center_m)) < 30e-9
+    assert float(cells[4]) == pytest.approx(20.0 + math.degrees(TURN_RAD), abs=0.5)
 
 
 def test_compare_registers_scans_and_writes_its_page(tmp_path: Path) -> None:

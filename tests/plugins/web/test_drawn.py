@@ -24,14 +24,16 @@ from afspm.model import (
     ProcessCondition,
     ProcessState,
     ProcessStates,
+    Progress,
     Region,
     RegistrationOutcome,
     ScopeState,
     ScopeStatus,
     Spectrum,
 )
+from afspm.model.planned_work import PlannedWork
 from afspm.plugins.web.dashboard.charts import drift_chart, spectrum_chart
-from afspm.plugins.web.dashboard.content import refusals_html, rows_of, unheard
+from afspm.plugins.web.dashboard.content import refusals_html, rows_of, status_html, unheard
 from afspm.plugins.web.dashboard.panels import log_html, process_words
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, places_of
 from afspm.plugins.web.watch import Watch
@@ -319,6 +321,23 @@ def test_processes_of_a_lost_computer_are_not_shown_as_alive() -> None:
 def test_a_faster_simulated_night_makes_no_process_count_as_gone() -> None:
     watch = Watch(ExperimentClock.starting_now(speed=600.0), past=gone())
     assert unheard(watch, watch.overview) == {}
+
+
+def test_page_shows_the_end_of_each_component_and_of_the_experiment() -> None:
+    clock = ExperimentClock.starting_now(1_700_000_000.0, 1e-6)  # stands still, near enough
+    began_ns = clock.now_ns() - 100 * S
+    plans = {"series": PlannedWork(scans=4, duration_s=1000.0, ends_experiment=True), "grid": None}
+    watch = Watch(clock, plans=plans, began_ns=began_ns)
+    watch.take("ControlState", ControlState(ControlMode.AUTOMATED, "series"), clock.now_ns())
+    before = status_html(watch, watch.overview)
+    assert re.search(r'data-part="end">ends about \d\d:\d\d<small>15 min', before), before
+    watch.take("Progress", Progress(clock.now_ns(), "series", 1, 4, 2 * 86_400.0), clock.now_ns(), "Progress_series")
+    html = status_html(watch, watch.overview)
+    assert "<b>series</b> 1 of 4</span>" in html, "the end of the experiment stands beside it"
+    assert re.search(r'data-part="end">ends about \d{4}-\d\d-\d\d \d\d:\d\d<small>2 d', html), html
+    alone = status_html(Watch(clock, past=watch.overview), watch.overview)
+    assert 'data-part="end"' not in alone
+    assert re.search(r"<b>series</b> 1 of 4<small>ends \d{4}-\d\d-\d\d \d\d:\d\d</small>", alone), alone
 
 
 # --- curves ---

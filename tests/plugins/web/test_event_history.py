@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from afspm.model import (
     ControlMode,
@@ -20,8 +22,9 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.plugins.web.gateway.events import MOST_BYTES, MOST_EVENTS, EventHistory
+from afspm.plugins.web.gateway.events import MOST_BYTES, MOST_EVENTS, EventHistory, fill
 from afspm.plugins.web.gateway.models import event_kinds
+from afspm.record.journal import JOURNAL_FILE
 
 ALL = frozenset(event_kinds())
 
@@ -108,3 +111,10 @@ def test_a_past_from_the_cache_alone_is_reported_as_incomplete() -> None:
     made.incomplete_before(15)
     assert made.after(5, ALL, 10).missed_until_ns == 15
     assert made.after(15, ALL, 10).missed_until_ns is None
+
+
+def test_damaged_journal_is_logged(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / JOURNAL_FILE).write_bytes(b"damaged")
+    fill(EventHistory(ProblemNames()), tmp_path, None, 100)
+    (line,) = caplog.messages
+    assert line.startswith("older events are not served: "), line

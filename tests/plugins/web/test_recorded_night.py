@@ -27,6 +27,7 @@ from afspm.plugins.web.dashboard.content import Contents
 from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.record.journal import SCHEDULER
 from afspm.record.notes import append_note
+from afspm.record.run import open_run
 from afspm.record.store import RecordSettings, RecordStore
 
 S = 1_000_000_000
@@ -141,3 +142,13 @@ def test_the_flip_book_has_the_scans_with_a_known_place(night: Night) -> None:
     assert (number, found.tip_m) == (2, (30e-9, -10e-9))
     assert found.sample_m == pytest.approx((0.0, 0.0), abs=1e-15)
     assert night.published_ns() == {scan(at_s).time_ns: START + at_s * S + 1 for at_s in (10, 40)}
+
+
+def test_damaged_spectrum_is_logged_once(night: Night, caplog: pytest.LogCaptureFixture) -> None:
+    with open_run(night.folder) as run:
+        (row,) = run.spectra
+    (night.folder / row.file).write_bytes(b"damaged")
+    for _ in range(2):
+        assert not night.spectra_until(START + 60 * S).newest()
+    (line,) = caplog.messages
+    assert line.startswith("a spectrum is not shown: "), line

@@ -116,6 +116,9 @@ def test_status_says_who_is_in_control_and_how_far_it_is(night: Running) -> None
     assert told["mode"] == "AUTOMATED"
     assert told["progress"]["series"]["of"] == 1000
     assert told["progress"]["series"]["remaining_s"] > 0
+    assert told["progress"]["series"]["end"] > told["time"]
+    assert told["end"]["time"] > told["time"]
+    assert told["end"]["remaining_s"] > 0
 
 
 def test_status_lists_the_processes(night: Running) -> None:

@@ -98,8 +98,9 @@ def test_tip_left_in_danger_is_retracted_and_blocks_measurements_until_cleared(
     assert one.output.count("x-retract: done") == 1
     with afspm.open_run(one.folder) as record:
         (problem,) = record.problems.where(lambda row: row.name == "device-malfunction")
-        assert problem.cleared_ns is not None
-        during = record.scans.where(lambda row: problem.flagged_ns <= (row.began_ns or 0) < problem.cleared_ns)
+        flagged_ns, cleared_ns = problem.flagged_ns, problem.cleared_ns
+        assert cleared_ns is not None
+        during = record.scans.where(lambda row: flagged_ns <= (row.began_ns or 0) < cleared_ns)
     assert not during, one.output
     require_each_once(one, 6)
 

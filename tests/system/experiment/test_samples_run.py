@@ -23,6 +23,7 @@ QUICKER: dict[str, tuple[str, int, int]] = {
     "scan_list": ('[list]\nevery = "5 min"\npixels = [16, 8]\n', 6, 0),
     "sweep": ("[sweep]\npixels = [16, 16]\n[sweep.parameters]\nscan-speed = [8e-6]\n", 9, 0),
     "region_grid": ("[grid]\ncounts = [2, 2]\npixels = [16, 16]\n", 4, 0),
+    "adaptive_map": ("[map.until]\nspectra = 12\n", 0, 12),
     "spectroscopy_grid": ("[curves]\ncounts = [2, 2]\n", 0, 4),
     "picture": ("[clock]\nspeed = 600.0\n[details]\npixels = [16, 12]\n", 3, 0),
     "own_component": (SERIES, 2, 0),

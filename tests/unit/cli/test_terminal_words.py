@@ -12,8 +12,11 @@ import pytest
 from rich.console import Console
 
 from afspm import model
+from afspm.basics.clock import utc_time
+from afspm.basics.formatting import day_and_time
 from afspm.cli.status_text import RunDescription, StatusText, bar
 from afspm.model import ControlMode, ControlState, ProcessCondition, ScopeState
+from afspm.model.planned_work import PlannedWork
 from afspm.record.overview import Overview
 
 S = 1_000_000_000
@@ -24,6 +27,10 @@ REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))
 
 def process(name: str, condition: ProcessCondition, **more: object) -> model.ProcessState:
     return model.ProcessState(name, "component", condition, START, **more)  # type: ignore[arg-type]
+
+
+def iso(time_ns: int) -> str:
+    return utc_time(time_ns).isoformat()
 
 
 @pytest.fixture
@@ -169,7 +176,19 @@ def test_json_has_the_same_facts_as_the_text(night: Overview) -> None:
     assert (told["mode"], told["holder"], told["simulated"]) == ("AUTOMATED", "series", True)
     assert [(one["name"], one["by"]) for one in told["problems"]] == [("tip-shape-changed", "judge")]
     assert told["scan"] == {"part": 0.5, "remaining_s": 50.0}
-    assert told["progress"]["series"] == {"done": 1, "of": 5, "remaining_s": 440.0}
+    end = iso(START + 600 * S)
+    assert told["progress"]["series"] == {"done": 1, "of": 5, "remaining_s": 440.0, "end": end}
+    assert told["end"] is None, "no plans are known"
     assert [one["condition"] for one in told["processes"]] == ["BUSY", "GIVEN_UP", "ENDED"]
     assert told["refusals"][0]["reason"] == "at most 1e-5 m/s"
     assert told["log"][0]["text"] == "lost the tip [/x]"
+
+
+def test_status_shows_the_end_of_the_experiment(night: Overview) -> None:
+    about = replace(ABOUT, plans={"series": PlannedWork(scans=5, duration_s=500.0, ends_experiment=True), "note": None})
+    end = day_and_time(START + 600 * S, seconds=False)  # of the reported pace, 440 s after the moment shown
+    assert f"end about {end}, 7 min 20 s left (7 s real)" in " ".join(shown(night, about).split())
+    found: Any = StatusText(night, about, START + 160 * S).as_json()["end"]
+    assert found == {"time": iso(START + 600 * S), "remaining_s": 440.0}
+    later: Any = StatusText(night, about, START + 700 * S).as_json()["end"]
+    assert later["remaining_s"] == 0.0

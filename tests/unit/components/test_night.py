@@ -290,3 +290,17 @@ def test_scans_of_one_size_share_a_range_that_one_odd_scan_does_not_widen() -> N
     low, high = record.shots[1].picture.span.low, record.shots[1].picture.span.high
     assert np.nanmax(record.shots[1].picture.values) == pytest.approx(high)
     assert np.nanmin(record.shots[1].picture.values) == pytest.approx(low)
+
+
+def test_scale_bar_of_a_night_is_as_long_as_its_label(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    figures: list[Any] = []
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, *rest, **how: figures.append(self))
+    draw(night(), tmp_path / "night.png", {TIP: "tip-shape-changed"})
+    sheet = next(ax for ax in figures[0].axes if any(text.get_text().endswith("nm") for text in ax.texts))
+    length = next(text.get_text() for text in sheet.texts if text.get_text().endswith("nm"))
+    canvas = np.asarray(sheet.images[0].get_array())
+    row = canvas[night_figure.THUMB_PX - 6, : night_figure.THUMB_PX]  # through the bar of the first picture
+    white = np.flatnonzero((row == 255).all(axis=1))
+    pixels = white[(white >= night_figure.GAP_PX // 2 + 4) & (white < night_figure.THUMB_PX)]
+    bar_px = int(np.argmax(np.diff(pixels, append=10**6) > 1)) + 1
+    assert bar_px == pytest.approx(float(length.split()[0]) * 1e-9 / 1e-6 * night_figure.THUMB_PX, abs=1.0)

@@ -8,6 +8,8 @@ from afspm.components.planned_scans import ListedRegion, RegionGrid, ScanList, S
 from afspm.components.spectroscopy_grid import SpectroscopyGrid
 from afspm.components.survey import Survey
 from afspm.model.planned_work import SPEED_UNKNOWN, PlannedWork, planned_end_s
+from afspm.testing import Bench
+from afspm.testing.components.simulated_time import START_S
 
 SPEED_M_S = 4e-6
 
@@ -102,3 +104,20 @@ def test_end_is_unknown_beside_work_without_an_estimate() -> None:
 def test_work_is_the_same_after_a_file() -> None:
     work = series(scans=3)
     assert PlannedWork.from_dict({**work.as_dict(), "of_a_later_version": 1}) == work
+
+
+def test_simulated_night_takes_as_long_as_planned() -> None:
+    for component in (
+        ScanSeries(size=(2e-6, 1e-6), pixels=(8, 16), scans=3, every=60.0),
+        ScanList([ListedRegion((0.0, 0.0), (width, 1e-6)) for width in (2e-6, 1e-6)], pixels=(8, 16), rounds=2),
+    ):
+        planned = component.planned_work(SPEED_M_S)
+        assert planned is not None
+        assert planned.duration_s is not None
+        bench = Bench(component, microscope={"initial": {"scan-speed": "4 um/s"}})
+        bench.run(until="10 min")
+        assert len(bench.scans) == planned.scans
+        end_ns = bench.scans[-1].first.time_ns
+        assert end_ns is not None
+        took_s = end_ns / 1e9 - START_S
+        assert planned.duration_s <= took_s < 1.05 * planned.duration_s + 5.0

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from afspm.model import Region, Scan, Spectrum
-from afspm.record.nexus import FileProvenance, encode_scan, encode_spectrum
+from afspm.record.nexus_writer import FileProvenance, encode_scan, encode_spectrum
 
 h5py = pytest.importorskip("h5py")
 METADATA = {

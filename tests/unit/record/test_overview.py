@@ -278,7 +278,8 @@ def test_progress_is_the_newest_of_each_component() -> None:
     night = Overview()
     for name, done, time_s in (("series", 3, 1), ("grid", 1, 2), ("series", 4, 3)):
         night.take("Progress", model.Progress(time_s * S, name, done, 9), time_s * S, f"Progress_{name}")
-    assert night.progress == {"series": (4, 9), "grid": (1, 9)}
+    reports = {name: (report.done, report.of) for name, report in night.progress_reports.items()}
+    assert reports == {"series": (4, 9), "grid": (1, 9)}
 
 
 def test_remaining_time_falls_between_packets() -> None:

@@ -499,9 +499,12 @@ def test_first_thermal_drift_is_shown_as_routine(tmp_path: Path) -> None:
 def test_planned_work_stands_beside_the_measured_work(run: Path) -> None:
     facts = json.loads((run / "run.json").read_text(encoding="utf-8"))
     plan = {"scans": 4, "spectra": 0, "path_m": 1.28e-4, "pixels": 256, "duration_s": 1800.0}
-    (run / "run.json").write_text(json.dumps({**facts, "planned": {"series <b>": plan}}), encoding="utf-8")
+    (run / "run.json").write_text(
+        json.dumps({**facts, "planned": {"series <b>": plan, "tuner": None}}), encoding="utf-8"
+    )
     text = write(run).read_text(encoding="utf-8")
     Page(text)
     head = "<td>series &lt;b&gt;</td><td>planned</td><td>4</td><td>0</td><td>128 µm</td><td>30 min</td>"
     measured = "<td></td><td>measured</td><td>3</td><td>0</td><td>96 µm</td><td>22 min</td>"
     assert f"<tr>{head}</tr><tr>{measured}</tr>" in re.sub(r"\s*\n\s*", "", text)
+    assert "tuner" not in text, "it has no estimate to compare"

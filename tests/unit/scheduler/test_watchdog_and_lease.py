@@ -416,7 +416,7 @@ def test_requested_lease_runs_out_during_a_scan_and_stops_it() -> None:
     lab.step(Tick())
     assert lab.holder is None
     assert lab.forwarded[-1].request.subject == "stop-scan"
-    assert [entry.reason for entry in lab.entries() if entry.event is ControlEvent.CONTROL_LOST] == [Cause.IDLE.value]
+    assert [entry.reason for entry in lab.entries() if entry.event is ControlEvent.CONTROL_LOST] == [Cause.IDLE.text]
 
 
 def test_renewals_and_commands_restart_a_requested_lease_and_a_release_ends_it() -> None:

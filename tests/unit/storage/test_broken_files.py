@@ -16,7 +16,7 @@ from tests.unit.storage.samples import DATA, WHOLE
 
 from afspm.basics.errors import FileError
 from afspm.model import Region, Scan
-from afspm.record import nexus
+from afspm.record import nexus_writer
 from afspm.storage.formats import read
 
 h5py = pytest.importorskip("h5py")
@@ -117,7 +117,7 @@ def test_values_that_are_in_another_file_are_refused(
         secret["values"] = np.full((2, 4), 42.0)
     scan = Scan(Region((0.0, 0.0), (1e-6, 1e-6)), "Height", "m", np.zeros((2, 4)), 5, "one.dat")
     file = tmp_path / "scan.h5"
-    file.write_bytes(nexus.encode_scan([scan], nexus.FileProvenance(5, None, {}, {})))
+    file.write_bytes(nexus_writer.encode_scan([scan], nexus_writer.FileProvenance(5, None, {}, {})))
     assert read(file).scans[0].values.shape == (2, 4)
     with h5py.File(file, "r+") as changed:
         (name,) = (key for key, node in changed["entry/data"].items() if getattr(node, "ndim", 0) == 2)

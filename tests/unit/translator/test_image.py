@@ -35,7 +35,7 @@ def scanned(microscope: ImageMicroscope, folder: Path, clock: Any) -> Scan:
     microscope.connect()
     microscope.start_scan()
     assert microscope._controller is not None
-    microscope._controller._instrument.drawing.wait()
+    microscope._controller.instrument.drawing.wait()
     clock.t_s += 1e4
     assert microscope.status().state is ScopeState.FREE
     (height,) = [scan for scan in microscope.load(microscope.results()[-1]) if getattr(scan, "channel", "") == "Height"]

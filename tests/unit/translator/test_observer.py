@@ -114,7 +114,7 @@ def test_the_simulators_lines_make_up_its_scan(direction: str, tmp_path: Path, f
     simulator.connect()
     simulator.start_scan()  # 16 lines of a second
     assert simulator._controller is not None
-    simulator._controller._instrument.drawing.wait()
+    simulator._controller.instrument.drawing.wait()
     pictures: dict[str, np.ndarray] = {}
     start = 0
     for seconds, rows in ((0.5, 0), (3.0, 3), (3.0, 3), (9.0, 9)):

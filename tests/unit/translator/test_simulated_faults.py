@@ -31,7 +31,7 @@ def scanned(scope: Simulator, fake_clock: Any) -> ScopeState:
     """The state after the time of a scan."""
     scope.start_scan()
     assert scope._controller is not None
-    scope._controller._instrument.drawing.wait()
+    scope._controller.instrument.drawing.wait()
     fake_clock.t_s += 5.0
     return scope.status().state
 
@@ -82,7 +82,7 @@ def test_controller_is_lost_for_a_while_and_its_scan_goes_on(scope: Simulator, f
     fake_clock.t_s += 10.0
     scope.connect()
     assert scope._controller is not None
-    scope._controller._instrument.drawing.wait()
+    scope._controller.instrument.drawing.wait()
     assert scope.status().state is FREE
     assert len(scope.results()) == 1
 

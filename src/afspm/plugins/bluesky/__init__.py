@@ -38,7 +38,7 @@ from afspm.client.connect import connect
 from afspm.client.parameter_text import Value
 from afspm.client.scope import Scope
 from afspm.model import Region, names
-from afspm.record.nexus import field_names
+from afspm.record.nexus_writer import field_names
 
 __all__ = ["Microscope"]
 

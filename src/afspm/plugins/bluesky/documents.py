@@ -14,7 +14,7 @@ from uuid import NAMESPACE_URL, uuid5
 
 from afspm.basics.clock import NS_PER_S
 from afspm.record.journal import measured_file
-from afspm.record.nexus import field_names
+from afspm.record.nexus_writer import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 

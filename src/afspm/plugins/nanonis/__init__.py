@@ -24,8 +24,7 @@ from typing import Any, ClassVar, Final
 from afspm.basics.errors import ConfigError, FileError, Refused
 from afspm.basics.units import Duration
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
-from afspm.plugins.nanonis import fetched, protocol
-from afspm.plugins.nanonis import settings as own
+from afspm.plugins.nanonis import fetched, geometry, parameter_groups, protocol
 from afspm.plugins.nanonis.activity import NanonisActivity
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import MODULES, Session
@@ -46,6 +45,16 @@ _AT_FIRST: Final[dict[str, Value]] = {
 _AT_ONCE: Final = 0
 """Argument of functions that could also wait for the end of their action."""
 _NO_TIMEOUT: Final = -1
+_BY_VALUE: Final = (
+    geometry.ScanFrame,
+    parameter_groups.ScanSpeed,
+    parameter_groups.Gains,
+    parameter_groups.MoveSpeed,
+    parameter_groups.Slope,
+    parameter_groups.DriftRate,
+)
+_GROUPS: Final = (*_BY_VALUE, geometry.Probe, parameter_groups.FeedbackOn)
+_TRANSLATED: Final = tuple(name for group in _GROUPS for name in group.names)
 
 
 class Nanonis(Driver):
@@ -64,7 +73,7 @@ class Nanonis(Driver):
     """
 
     parameters_file = Path(__file__).with_name("parameters.toml")
-    translated = (*own.TRANSLATED, *_AT_FIRST, names.CONTROLLER)
+    translated = (*_TRANSLATED, *_AT_FIRST, names.CONTROLLER)
     maker: ClassVar[str] = "SPECS Zurich"
     software: ClassVar[str] = "Nanonis"
     max_pixels: ClassVar[int] = 8192 * 8192
@@ -93,10 +102,9 @@ class Nanonis(Driver):
         self._session: Session | None = None
         self._kept = KeptSettings(_AT_FIRST)
         ask = self._ask
-        self._probe = own.Probe(ask, lambda: self.clock.now_s())
-        feedback = own.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
-        by_value = (own.ScanFrame, own.ScanSpeed, own.Gains, own.MoveSpeed, own.Slope, own.DriftRate)
-        self.groups = (*(group(ask) for group in by_value), self._probe, feedback, self._kept)
+        self._probe = geometry.Probe(ask, lambda: self.clock.now_s())
+        feedback = parameter_groups.FeedbackOn(ask, lambda holds: self.wait_for(holds, reply_timeout_s))
+        self.groups = (*(group(ask) for group in _BY_VALUE), self._probe, feedback, self._kept)
         self._files: NanonisFiles
 
     def connect(self) -> None:
@@ -135,13 +143,13 @@ class Nanonis(Driver):
         return self._activity.next_change_s()
 
     def same(self, name: str, a: Value, b: Value, among: Mapping[str, Value]) -> bool:
-        return own.same_float32(name, a, b, among)
+        return geometry.same_float32(name, a, b, among)
 
     def get(self, vendor: str) -> Value:
         """Return a value by the prefix of a pair of functions: "Bias." stands for Bias.Get."""
         if vendor == names.CONTROLLER:
             return self._there.controller
-        value: Value = own.numbers(self._ask, f"{vendor}Get")[0]
+        value: Value = parameter_groups.numbers(self._ask, f"{vendor}Get")[0]
         return value
 
     def set(self, values: Mapping[str, Value]) -> None:
@@ -218,7 +226,7 @@ class Nanonis(Driver):
         self._activity.refuse_safe_tip()
         depth_m = self._kept.number(names.CRASH_DEPTH)
         ramp_s = depth_m / self._kept.number(names.CRASH_SPEED)
-        bias_v = own.numbers(self._ask, "Bias.Get")[0]
+        bias_v = parameter_groups.numbers(self._ask, "Bias.Get")[0]
         # one dip at the present bias: the tip shaper's second lift undoes the first
         same_bias, settle_s, restore = 2, 0.1, 1
         before = (settle_s, same_bias, bias_v)

@@ -10,10 +10,10 @@ from typing import ClassVar, Final
 from afspm.basics.clock import Clock
 from afspm.basics.errors import Refused
 from afspm.model import ControlResponse, Region, ScopeState, ScopeStatus
+from afspm.plugins.nanonis.geometry import Probe, ScanFrame
 from afspm.plugins.nanonis.protocol import NanonisError
 from afspm.plugins.nanonis.result_files import NanonisFiles
 from afspm.plugins.nanonis.session import APPROACH, MODULES, CurveEnded, ListenerEvent, ScanEnded, Session
-from afspm.plugins.nanonis.settings import Probe, ScanFrame
 from afspm.translator.activity import Activity
 from afspm.translator.driver_base import ControllerLost
 from afspm.translator.result_files import SCAN, as_list

@@ -12,8 +12,8 @@ import numpy as np
 
 from afspm.basics.errors import ConfigError, FileError
 from afspm.model import Region, Scan, ScanLines, Spectrum
+from afspm.plugins.nanonis.parameter_groups import Ask
 from afspm.plugins.nanonis.session import CurveEnded
-from afspm.plugins.nanonis.settings import Ask
 from afspm.storage.atomic import write_atomic
 from afspm.translator.own_files import FileFacts, encode_scan, encode_spectrum
 

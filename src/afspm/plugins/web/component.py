@@ -5,11 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
+from afspm.basics.clock import NS_PER_S
 from afspm.basics.errors import ConfigError
 from afspm.client.component import Component
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.server import STALLED_S, WebServer, listening, url_of
 from afspm.plugins.web.watch import Watch
+from afspm.record.expected_end import plans_of
+from afspm.record.run_json import run_json_or_empty
 from afspm.record.run_lock import cut_off_message
 from afspm.transport.process.priority import step_back
 
@@ -77,7 +80,12 @@ class WebComponent(Component):
         """Return the record of the run so far, and the watch that receives later messages."""
         archive = Archive(self.run_dir if self._context.launch.run_dir else None)
         problems = self._context.problems
-        watch = Watch(self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir))
+        launch = self._context.launch
+        watch = Watch(
+            self.clock, problems, archive.past(problems), lambda: cut_off_message(self.run_dir),
+            plans=plans_of(run_json_or_empty(self.run_dir)) if launch.run_dir else None,
+            began_ns=round(float(launch.clock["start_s"]) * NS_PER_S) if launch.clock else None,
+        )  # fmt: skip
         return archive, watch
 
     def serve(self, app: AsgiApp, bound: socket.socket, *, most_requests: int | None = None) -> None:

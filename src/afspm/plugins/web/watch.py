@@ -15,6 +15,7 @@ from afspm.basics.clock import Clock
 from afspm.model import ProblemNames, Scan, ScanLines, ScopeState, Spectrum
 from afspm.model.line_levelling import Array
 from afspm.plugins.web.frames import FrameStore
+from afspm.record.expected_end import Plans, expected_end_ns
 from afspm.record.overview import Overview
 
 MOST_SPECTRA, SPECTRA_BYTES = 200, 64 << 20
@@ -54,6 +55,8 @@ class Watch:
         clock: of the experiment.
         past: the overview before the start; None: unknown.
         cut_off: returns a text if no process runs the experiment any more, else an empty text.
+        plans: planned work of each component; None: no estimate.
+        began_ns: experiment time at the start; None: unknown.
     """
 
     def __init__(
@@ -62,10 +65,13 @@ class Watch:
         problems: ProblemNames | None = None,
         past: Overview | None = None,
         cut_off: Callable[[], str] = str,
+        plans: Plans | None = None,
+        began_ns: int | None = None,
     ) -> None:
         self.clock = clock
         self.problems = problems or ProblemNames()
         self.cut_off = cut_off
+        self._plans, self._began_ns = plans or {}, began_ns
         self.overview = past or Overview(self.problems)
         self.frames = FrameStore()
         self.spectra = SpectrumStore()
@@ -92,6 +98,10 @@ class Watch:
     def is_over(self) -> bool:
         """Whether no process of the run is left at the moment shown."""
         return self.ended
+
+    def expected_end_ns(self, overview: Overview, now_ns: int) -> int | None:
+        """Return the experiment time of the end; None if unknown."""
+        return expected_end_ns(self._plans, overview.progress_reports, self._began_ns, now_ns)
 
     @contextlib.contextmanager
     def reading(self) -> Iterator[Overview]:

@@ -21,7 +21,7 @@ from typing import IO, Final
 from afspm.basics.clock import iso_utc
 from afspm.basics.formatting import counted
 from afspm.record import journal
-from afspm.record.nexus import afspm_version
+from afspm.record.nexus_writer import afspm_version
 from afspm.record.report import REPORT_FILE
 from afspm.record.run import Run
 from afspm.record.run_json import EXPERIMENT_FILE, RUN_FILE

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from afspm.model import ScanSet, Spectrum
-from afspm.record.nexus import field_names
+from afspm.record.nexus_writer import field_names
 from afspm.record.run import Run
 from afspm.record.tables import ScanRow, SpectrumRow
 from afspm.storage.formats.netcdf import Attributes, Variable, encoded

@@ -19,10 +19,11 @@ from afspm.model import (
     names,
 )
 from afspm.record.drawing.timeline import TimelineRow
+from afspm.record.expected_end import plans_of
 from afspm.record.overview import Overview, ProcessRestart
 from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
-from afspm.record.run_json import PLANNED, REAL_S
+from afspm.record.run_json import REAL_S
 from afspm.record.run_lock import describe_state
 from afspm.record.tables import NoteRow, ScanRow
 from afspm.record.timeline import Span, Timeline
@@ -166,7 +167,7 @@ def read(run: Run) -> RunStory:
         actions=[entry for entry in run.journal if entry.what in names.EXTENSION_ACTIONS and entry.response == 0],
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
-        comparisons=compare(run.facts.get(PLANNED) or {}, scans, run.spectra),
+        comparisons=compare(plans_of(run.facts), scans, run.spectra),
     )
 
 

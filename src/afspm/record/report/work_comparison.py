@@ -20,25 +20,26 @@ class WorkComparison:
 
 
 def compare(
-    planned: Mapping[str, Mapping[str, object]], scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]
+    planned: Mapping[str, PlannedWork | None], scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]
 ) -> list[WorkComparison]:
     """Return the comparison of each component with a plan.
 
     Args:
-        planned: as in run.json.
+        planned: by component; None: no estimate.
         scans, spectra: all of the run; each counts if it began while the component was in control.
     """
     all_scans, all_spectra = list(scans), list(spectra)
     return [
         WorkComparison(
             name,
-            PlannedWork.from_dict(data),
+            plan,
             _measured(
                 [scan for scan in all_scans if scan.holder == name and not scan.interrupted],
                 [spectrum for spectrum in all_spectra if spectrum.holder == name],
             ),
         )
-        for name, data in planned.items()
+        for name, plan in planned.items()
+        if plan is not None
     ]
 
 

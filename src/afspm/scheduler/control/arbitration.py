@@ -53,13 +53,29 @@ class ControlChange(Enum):
 class Cause(Enum):
     """Why control was taken from its holder."""
 
-    RELEASED = "it gave control back"
-    PROBLEM = "a problem was flagged"
-    SOLVED = "the problem it solved was cleared"
-    MANUAL = "the mode changed to MANUAL"
-    DEAD = "its process died"
-    IDLE = "it did nothing for longer than its lease"
-    ENDED = "the experiment ended"
+    RELEASED = "released"
+    PROBLEM = "problem"
+    SOLVED = "solved"
+    MANUAL = "manual"
+    DEAD = "dead"
+    IDLE = "idle"
+    ENDED = "ended"
+
+    @property
+    def text(self) -> str:
+        """The cause in words, about the former holder."""
+        return _CAUSE_TEXTS[self]
+
+
+_CAUSE_TEXTS = {
+    Cause.RELEASED: "it gave control back",
+    Cause.PROBLEM: "a problem was flagged",
+    Cause.SOLVED: "the problem it solved was cleared",
+    Cause.MANUAL: "the mode changed to MANUAL",
+    Cause.DEAD: "its process died",
+    Cause.IDLE: "it did nothing for longer than its lease",
+    Cause.ENDED: "the experiment ended",
+}
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ def _log_change(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
     draft.lease = replace(draft.lease, announced=after.holder or draft.lease.announced)
     is_sent = "is sent to the microscope" if draft.forwarder.up else "will be sent when the translator is back"
     for action in wanted:
-        why = f"{before.holder} had died in control" if change.had_died else cause.value if cause else ""
+        why = f"{before.holder} had died in control" if change.had_died else cause.text if cause else ""
         draft.log("WARNING", f"{action} {is_sent}, since {why}")
     from_hand = before.mode is ControlMode.MANUAL and after.mode is not ControlMode.MANUAL
     if from_hand:
@@ -169,5 +169,5 @@ def _log_change(draft: StateDraft, change: _Change, wanted: list[str]) -> None:
     draft.microscope, danger = draft.microscope.telling()
     if danger is not None:
         expected = cause in (None, Cause.RELEASED, Cause.SOLVED, Cause.MANUAL)
-        why = cause.value if cause else "the mode is automated again"
+        why = cause.text if cause else "the mode is automated again"
         draft.log("WARNING" if expected else "CRITICAL", f"{danger}, and no component is in control: {why}")

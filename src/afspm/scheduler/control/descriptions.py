@@ -72,7 +72,7 @@ def _ended_control(holder: str, cause: Cause) -> str:
         case Cause.RELEASED:
             return f"{holder} gave control back"
         case Cause.DEAD | Cause.IDLE:
-            return f"{holder} lost control: {cause.value}"
+            return f"{holder} lost control: {cause.text}"
         case _:
             return f"{holder} lost control"
 

@@ -199,7 +199,7 @@ def control_entries(
     name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
     entries = []
     if before.holder is not None and after.holder != before.holder:
-        cause = row.cause.value if row.cause is not None else ""
+        cause = row.cause.text if row.cause is not None else ""
         entries.append(entry(before.holder, "lost control", reason=cause, event=ControlEvent.CONTROL_LOST))
     for number in sorted(after.problems.keys() - before.problems.keys()):
         flagged = ControlEvent.PROBLEM_FLAGGED

@@ -80,7 +80,7 @@ def answer_job(draft: StateDraft, job: ForwardedRequest, response: Response) -> 
 
 def call_back(draft: StateDraft, former: str | None, cause: Cause | None) -> None:
     """Remove unsent commands of a former holder (None: of all clients) from the queue, and answer them."""
-    reason = f"control was taken before this was sent: {cause.value if cause else 'the mode was changed'}"
+    reason = f"control was taken before this was sent: {cause.text if cause else 'the mode was changed'}"
     draft.forwarder, jobs = draft.forwarder.called_back(lambda job: job.command and former in (None, job.client))
     for job in jobs:
         answer_unsent(draft, job, Response(int(ControlResponse.NOT_IN_CONTROL), b"", reason, job.request.id))

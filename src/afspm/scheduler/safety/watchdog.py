@@ -22,25 +22,37 @@ _SOON_S = 1.0
 class TipDuty(Enum):
     """The duty of the scheduler towards a tip that its holder left in danger. Its values stand in saved states."""
 
-    NONE = "nothing"
-    OWED = "it is to be retracted"  # word: is to be
-    ASKED = "the microscope is asked to retract it"
-    PUT_OFF = "it was not retracted, which is tried again later"
+    NONE = "none"
+    OWED = "owed"
+    """A retract is due."""
+    ASKED = "asked"
+    """The microscope is asked to retract the tip."""
+    PUT_OFF = "put-off"
+    """The tip was not retracted; the retract is tried again later."""
 
 
 class TipEvent(Enum):
     """An event that changes the duty."""
 
-    ENDANGERED = "its holder lost control and left it in danger"
-    SEEN_TO = "a person or a solver attends to it, or it is out of danger"
-    SENT = "the microscope is asked to retract it"
-    NOT_YET = "the microscope could not be asked, was not free, or did not answer"
-    RETRACTED = "the microscope has retracted it"
-    RETRACTED_LATE = "the microscope has retracted it after the deadline"
-    IMPOSSIBLE = "the microscope has no such action"
-    FAILED = "the microscope refuses, or was waited for in vain"
-    DUE = "it is time to try again"
-    LEFT = "the run is stopped with the tip in danger"
+    ENDANGERED = "endangered"
+    """The holder lost control and left the tip in danger."""
+    SEEN_TO = "seen-to"
+    """A person or a solver attends to the tip, or it is out of danger."""
+    SENT = "sent"
+    """The microscope is asked to retract the tip."""
+    NOT_YET = "not-yet"
+    """The microscope could not be asked, was not free, or did not answer."""
+    RETRACTED = "retracted"
+    RETRACTED_LATE = "retracted-late"
+    """The microscope has retracted the tip after the deadline."""
+    IMPOSSIBLE = "impossible"
+    """The microscope has no such action."""
+    FAILED = "failed"
+    """The microscope refuses, or does not end the retract in time."""
+    DUE = "due"
+    """It is time to try again."""
+    LEFT = "left"
+    """The run is stopped with the tip in danger."""
 
 
 _NONE, _OWED, _ASKED, _PUT_OFF = TipDuty

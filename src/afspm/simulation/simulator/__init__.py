@@ -100,7 +100,7 @@ class Simulator(Driver):
     Args:
         seed: of all random numbers.
         surface: a kind, or a table of `kind` and its settings.
-        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force: a table of its own settings.
+        tip, tip_changes, drift, feedback, scanner, noise, signals, iv, force, property_map: a table of settings.
         initial: values of parameters at the start, by their generic names.
         approach_s: duration of engaging and retracting.
         faults: faults and their times, each a table of `kind`, `at_s`, `count`, `duration_s` (below).
@@ -135,6 +135,7 @@ class Simulator(Driver):
         signals: Table | None = None,
         iv: Table | None = None,
         force: Table | None = None,
+        property_map: Table | None = None,
         initial: Table | None = None,
         approach_s: Duration = 1.0,
         faults: list[Table] | None = None,
@@ -157,6 +158,7 @@ class Simulator(Driver):
             "signals": signals,
             "iv": iv,
             "force": force,
+            "property_map": property_map,
         }
         self._world_settings = {name: settings for name, settings in world.items() if settings is not None}
         self._seed = seed
@@ -217,6 +219,10 @@ class Simulator(Driver):
     def rows(cls, settings: PlainMapping) -> Rows:
         loop = _loop_of(settings)
         return _merged({} if loop is None else _rows_for(loop.mode), settings.get("parameters") or {})
+
+    def change_tip(self, condition: str) -> None:
+        """Change the tip now, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        self._reached(refuses=False).instrument.change_tip(condition, self.clock.now_s())
 
     def run_drawing(self, work: Callable[[], None]) -> None:
         """Draw a scan beside everything else."""

@@ -78,7 +78,7 @@ class SimulatedController:
         log: logging.Logger,
         panel: list[PanelEvent],
     ) -> None:
-        self._instrument = instrument
+        self.instrument = instrument
         self._table = table
         self._kept = kept
         self._faults = faults
@@ -106,16 +106,16 @@ class SimulatedController:
     def state(self, now_s: float) -> ScopeState:
         """Return the state of the instrument, after all events up to now."""
         self._advance(now_s)
-        if self._instrument.doing(now_s) == "scan":
+        if self.instrument.doing(now_s) == "scan":
             if self._faults.strikes("stopped", now_s):
                 self.stop(now_s)
             elif self._faults.strikes("withdrawn", now_s):
                 self.retract(now_s)
-        return _STATES[self._instrument.doing(now_s)]
+        return _STATES[self.instrument.doing(now_s)]
 
     def next_change_s(self) -> float | None:
         """Return the time of the next event; None without one, or if the computation of a scan wakes the driver."""
-        times = (self._panel_s(), self._files.whole_s(), self._instrument.ends_s)
+        times = (self._panel_s(), self._files.whole_s(), self.instrument.ends_s)
         return min((at_s for at_s in times if at_s is not None), default=None)
 
     def results(self) -> list[str]:
@@ -124,8 +124,8 @@ class SimulatedController:
 
     def lines(self, start: int, now_s: float) -> list[ScanLines]:
         """Return the complete lines of the running scan after the first `start`."""
-        scan = self._instrument.scan
-        if scan is None or scan.drawing or self._instrument.doing(now_s) != "scan":
+        scan = self.instrument.scan
+        if scan is None or scan.drawing or self.instrument.doing(now_s) != "scan":
             return []
         rows = np.sort(scan.course.order[start : scan.lines_done(now_s)])
         if not rows.size:
@@ -145,7 +145,7 @@ class SimulatedController:
                 self._end(at_s)
 
     def _end(self, end_s: float) -> None:
-        ended = self._instrument.ended(end_s)
+        ended = self.instrument.ended(end_s)
         try:
             if isinstance(ended, ScanActivity) and ended.stopped_s is None:
                 self._save_scan(ended)
@@ -157,7 +157,7 @@ class SimulatedController:
         self._keep()
 
     def _keep(self) -> None:
-        self._kept["instrument"] = self._instrument.state()
+        self._kept["instrument"] = self.instrument.state()
 
     # --- values ---
 
@@ -169,19 +169,19 @@ class SimulatedController:
         self._put_in_force()
         rate_m_s = (float(after[names.DRIFT_RATE_X]), float(after[names.DRIFT_RATE_Y]))
         if rate_m_s != (float(before[names.DRIFT_RATE_X]), float(before[names.DRIFT_RATE_Y])):
-            self._instrument.follow(rate_m_s, now_s)
+            self.instrument.follow(rate_m_s, now_s)
         if any(before.get(name) != after.get(name) for name in ADJUSTED):  # a table of parameters may lack some
-            self._instrument.adjust(now_s)
+            self.instrument.adjust(now_s)
         way_m = _distance(before, after, names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y)
         if way_m > 0.0 or _distance(before, after, names.PROBE_POS_X, names.PROBE_POS_Y) > 0.0:
             self.stop(now_s)  # a change allowed at this moment ends the measurement
             place_m = (float(after[names.PROBE_POS_X]), float(after[names.PROBE_POS_Y]))
             with _refusing():
-                self._instrument.move_probe(place_m, now_s, way_m=way_m)
+                self.instrument.move_probe(place_m, now_s, way_m=way_m)
         self._keep()
 
     def _put_in_force(self) -> None:
-        values, setup = self._si(), self._instrument.setup
+        values, setup = self._si(), self.instrument.setup
         setup.region, setup.shape = frame(values)
         setup.line_s = 2.0 * setup.region.size_m[0] / float(values[names.SCAN_SPEED])
         setup.upwards = values[names.SCAN_DIRECTION] == names.UP
@@ -189,7 +189,7 @@ class SimulatedController:
         setup.bias_v = float(values[names.TIP_BIAS_VOLTAGE])
         setup.slope = (float(values[names.SAMPLE_SLOPE_X]), float(values[names.SAMPLE_SLOPE_Y]))
         setup.move_speed_m_s = float(values[names.MOVE_SPEED])
-        self._instrument.engaged = bool(values[names.ENGAGED])
+        self.instrument.engaged = bool(values[names.ENGAGED])
 
     def _si(self, values: Kept | None = None) -> dict[str, Value]:
         found: dict[str, Value] = self._kept["values"] if values is None else values
@@ -202,7 +202,7 @@ class SimulatedController:
         self._prepare(now_s)
         if not self._faults.strikes("scan-refused", now_s):
             with _refusing():
-                self._instrument.start_scan(now_s)
+                self.instrument.start_scan(now_s)
             self._measures()
 
     def start_spectrum(self, now_s: float) -> None:
@@ -210,13 +210,13 @@ class SimulatedController:
         self._prepare(now_s)
         if not self._faults.strikes("spectrum-refused", now_s):
             with _refusing():
-                self._instrument.start_spectrum(str(self._kept["values"][names.SPEC_KIND]), now_s)
+                self.instrument.start_spectrum(str(self._kept["values"][names.SPEC_KIND]), now_s)
             self._measures()
 
     def stop(self, now_s: float) -> None:
         """Interrupt the measurement; it has no result."""
-        self._instrument.stop_scan(now_s)
-        self._instrument.stop_spectrum(now_s)
+        self.instrument.stop_scan(now_s)
+        self.instrument.stop_spectrum(now_s)
         self._keep()
 
     def pulse(self, now_s: float) -> None:
@@ -224,7 +224,7 @@ class SimulatedController:
         self._prepare(now_s)
         values = self._si()
         with _refusing():
-            self._instrument.pulse(float(values[names.PULSE_VOLTAGE]), float(values[names.PULSE_DURATION]), now_s)
+            self.instrument.pulse(float(values[names.PULSE_VOLTAGE]), float(values[names.PULSE_DURATION]), now_s)
         self._keep()
 
     def crash(self, now_s: float) -> None:
@@ -232,29 +232,29 @@ class SimulatedController:
         self._prepare(now_s)
         values = self._si()
         with _refusing():
-            self._instrument.crash(float(values[names.CRASH_DEPTH]), float(values[names.CRASH_SPEED]), now_s)
+            self.instrument.crash(float(values[names.CRASH_DEPTH]), float(values[names.CRASH_SPEED]), now_s)
         self._keep()
 
     def retract(self, now_s: float) -> None:
         """End the activity, and withdraw the tip."""
         self._kept["values"][names.ENGAGED] = False
-        self._instrument.withdraw(now_s)
+        self.instrument.withdraw(now_s)
         self._keep()
 
     def engage(self, now_s: float) -> None:
         """Approach the sample."""
         self.stop(now_s)
         with _refusing():
-            self._instrument.engage(now_s)
+            self.instrument.engage(now_s)
         self._kept["values"][names.ENGAGED] = True
         self._keep()
 
     def _prepare(self, now_s: float) -> None:
         self._advance(now_s)
-        doing = self._instrument.doing(now_s)
+        doing = self.instrument.doing(now_s)
         if doing:
             raise Refused(ControlResponse.NOT_FREE, f"the instrument is busy: {doing}")
-        if not self._instrument.engaged:
+        if not self.instrument.engaged:
             raise Refused(ControlResponse.ACTION_ERROR, f"the tip is retracted: {names.ENGAGE} it first")
 
     def _measures(self) -> None:
@@ -275,7 +275,7 @@ class SimulatedController:
 
     def _saved(self, event: str, name: str, content: bytes, end_s: float, facts: Kept) -> None:
         self._files.save(name, content, end_s)
-        self._instrument.note(end_s, event, {"file": name, **facts})
+        self.instrument.note(end_s, event, {"file": name, **facts})
 
     def _facts(self, end_s: float) -> FileFacts:
         rows, facts = self._table, dict[str, str | float]()

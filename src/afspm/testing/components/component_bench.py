@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,9 +14,11 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
+from afspm.basics.launch import Launch
 from afspm.basics.units import si
 from afspm.client.component import Component
 from afspm.client.loop import ComponentLoop
+from afspm.experiment.class_loader import ComponentDeclaration
 from afspm.model import (
     ControlMode,
     ControlRequest,
@@ -28,17 +31,21 @@ from afspm.model import (
     Scan,
     ScanSet,
 )
+from afspm.model.snapshot import to_plain
 from afspm.scheduler.events import Effect, Input, Publish
 from afspm.scheduler.safety.limits import ExperimentLimits
-from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.scheduler import Scheduler
+from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.wire_codec import WireCodec
 from afspm.simulation.simulator import Simulator
+from afspm.testing.components.bench_cast import BenchCast, cast_of
 from afspm.testing.components.hosted_processes import ComponentProcess, TranslatorProcess
 from afspm.testing.components.memory_network import ControlLine, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime
-from afspm.transport.process.context import ProcessContext
+from afspm.transport.port import Port
+from afspm.transport.process.context import ProcessActivity, ProcessContext
 
 Time = str | float
 """Experiment time: text with a unit ("20 min"), or seconds."""
@@ -84,29 +91,76 @@ class Bench:
         seed: int = 1,
         dies_in_call: float = 0.0,
     ) -> None:
+        name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(component).__name__).lower()
+        if name in (others or {}):
+            raise ConfigError(f"two components have the name {name!r}", hint="rename the one in `others`")
+        named, given = dict(problems or {}), dict(microscope or {})
+        components = {name: component, **(others or {})}
+        launches = {
+            each: Launch(each, envelopes=ComponentDeclaration.of_class(type(one)).listens, problems=named)
+            for each, one in components.items()
+        }
+        cast = BenchCast(
+            name, components, launches, Scheduler(limits=to_plain(limits or ExperimentLimits())),
+            Launch("scheduler", problems=named, simulated=True), Simulator, given,
+        )  # fmt: skip
+        self._set_up(cast, folder, seed, dies_in_call)
+
+    @classmethod
+    def of(
+        cls,
+        file: str | Path,
+        *overlays: str | Path,
+        component: str = "",
+        without: Collection[str] = (),
+        folder: Path | None = None,
+        seed: int = 1,
+        dies_in_call: float = 0.0,
+    ) -> Bench:
+        """Return a bench with the components, the scheduler and the simulated microscope of an experiment file.
+
+        The recorder is left out: `scans` holds the scans.
+
+        Args:
+            overlays: experiment files that override the first.
+            component: under test, by name; by default the only one with a plan of its own.
+            without: names of components to leave out, as pages and programs in other languages must be.
+            folder, seed, dies_in_call: as for a bench of one component.
+
+        Raises:
+            ConfigError: the file has errors, or a part of it can't run on the bench.
+        """
+        bench = cls.__new__(cls)
+        bench._set_up(cast_of(file, *overlays, component=component, without=without), folder, seed, dies_in_call)
+        return bench
+
+    def _set_up(self, cast: BenchCast, folder: Path | None, seed: int, dies_in_call: float) -> None:
         self._temporary = TemporaryDirectory(prefix="afspm-bench-") if folder is None else None
         self.folder = Path(self._temporary.name) if self._temporary else Path(folder or "")
-        self.name = re.sub(r"(?<!^)(?=[A-Z])", "_", type(component).__name__).lower()
-        if self.name in (others or {}):
-            raise ConfigError(f"two components have the name {self.name!r}", hint="rename the one in `others`")
+        self.name = cast.name
+        if taken := {"translator", "scheduler", "person"} & cast.components.keys():
+            raise ConfigError(f"a component has the name {min(taken)!r}, which the bench uses", hint="rename it")
         self.packets: list[Packet] = []
-        self._times = {self.name: _Life(), **{name: _Life() for name in others or {}}}
-        self._problems, self._named = ProblemNames(problems), dict(problems or {})
+        self._times = {name: _Life() for name in cast.components}
+        self._problems = ProblemNames(cast.scheduler_launch.problems)
         self._time = time = SimulatedTime(seed)
         self._weather = Weather()
-        settings = SchedulerSettings(limits=limits or ExperimentLimits())
-        settings = replace(settings, rules=settings.control.rules(self._problems), watchdog=settings.control.watchdog())
         self._scheduler = SchedulerHost(
-            time, self._weather, settings, WireCodec(), lambda one: wire.header(one.envelope, one.payload), self
-        )
+            time, self._weather, cast.scheduler.settings(self._context(cast)), WireCodec(),
+            lambda one: wire.header(one.envelope, one.payload), self, make_core=lambda: self._core(cast),
+        )  # fmt: skip
         self._scheduler.writes_ahead = True
-        given = dict(microscope or {})
-        self._translator = _BenchTranslator(time, lambda: _BenchSimulator(**copy.deepcopy(given)), self.folder)
+        self._simulators = type(f"Bench{cast.simulator.__name__}", (_DrawsInItsThread, cast.simulator), {})
+        self._microscope = copy.deepcopy(dict(cast.microscope))
+        self._translator = _BenchTranslator(time, self._make_simulator, self.folder)
         self._scheduler.translator = (self._translator, self._translator)
         self._components = {
-            name: self._process(name, one, dies_in_call if name == self.name else 0.0)
-            for name, one in {self.name: component, **(others or {})}.items()
+            name: self._process(name, one, cast.launches[name], dies_in_call if name == self.name else 0.0)
+            for name, one in cast.components.items()
         }
+        publishing = [self._components[name] for name, one in cast.components.items() if one.publishes]
+        for hosted in self._components.values():
+            hosted.publishers = [one for one in publishing if one is not hosted]
         self._person = _Person(time, self._weather, self._scheduler)
         self._processes: dict[str, Process] = {
             "translator": self._translator,
@@ -119,7 +173,24 @@ class Bench:
             process.exited = lambda code, process=process: self._exited(process, code)  # type: ignore[misc]
             process.start()
 
-    def _process(self, name: str, component: Component, dies_in_call: float) -> ComponentProcess:
+    def _context(self, cast: BenchCast) -> ProcessContext:
+        launch = replace(cast.scheduler_launch, state_dir=str(self.folder), run_dir=str(self.folder))
+        log, activity = logging.getLogger("afspm.scheduler"), ProcessActivity(self._time)
+        return ProcessContext(launch, self._time, open_port=_no_port, log=log, activity=activity)
+
+    def _core(self, cast: BenchCast) -> SchedulerCore:
+        context = self._context(cast)
+        coordinates = cast.scheduler.coordinates(context, in_process=True)
+        if hasattr(self, "_scheduler"):  # else the host makes a core before its first life
+            self._scheduler.worker = coordinates.worker
+        return SchedulerCore(cast.scheduler.settings(context), WireCodec(), coordinates.frame)
+
+    def _make_simulator(self) -> Simulator:
+        made: Simulator = self._simulators(**copy.deepcopy(self._microscope))
+        self._simulator = made
+        return made
+
+    def _process(self, name: str, component: Component, launch: Launch, dies_in_call: float) -> ComponentProcess:
         life = self._times[name]
 
         def make() -> Component:
@@ -127,11 +198,9 @@ class Bench:
             made.run_process = life.run  # type: ignore[method-assign]
             return made
 
-        process = ComponentProcess(
-            self._time, Weather(), self._scheduler, name, make, self.folder, dies_in_call=dies_in_call
+        return ComponentProcess(
+            self._time, Weather(), self._scheduler, name, make, self.folder, dies_in_call=dies_in_call, launch=launch
         )
-        process.problems = self._named
-        return process
 
     # --- running ---
 
@@ -205,6 +274,17 @@ class Bench:
         """Have the microscope refuse the next requests of an action ("start-scan") or of a parameter."""
         self._translator.refusals[subject] = (times, reason)
 
+    def change_tip(self, condition: str) -> None:
+        """Change the tip now, also during a scan: "sharp", "blunt", "double" or "contaminated"."""
+        if not self.now_s:
+            self._settle()  # the microscope is not switched on before the first step
+        self._simulator.change_tip(condition)
+        # a translator that is killed before it saves has the change in its next life, too
+        changes = dict(self._microscope.get("tip_changes") or {})
+        changes["schedule"] = [*changes.get("schedule", ()), [self.now_s, condition]]
+        self._microscope["tip_changes"] = changes
+        self._settle()
+
     def _ask(self, kind: ControlRequest, subject: object) -> None:
         self._person.ask(Request(kind, subject, wire.encode_request(Request(kind, subject))[-1]))
         self._settle()
@@ -225,6 +305,11 @@ class Bench:
     def component(self) -> Any:
         """The component in its current or last life."""
         return self._times[self.name].component
+
+    @property
+    def components(self) -> dict[str, Any]:
+        """All components by name, in their current or last life."""
+        return {name: life.component for name, life in self._times.items()}
 
     @property
     def memory(self) -> dict[str, Any]:
@@ -279,9 +364,13 @@ class _RaisingLoop(ComponentLoop):
         raise error
 
 
-class _BenchSimulator(Simulator):
+class _DrawsInItsThread:
     def run_drawing(self, work: Callable[[], None]) -> None:
-        work()  # in this thread: the same seed gives the same run
+        work()  # in the thread of the bench: the same seed gives the same run
+
+
+def _no_port(heard: tuple[str, ...] | None = None) -> Port:
+    raise AssertionError("the scheduler of a bench has no port")
 
 
 class _BenchTranslator(TranslatorProcess):

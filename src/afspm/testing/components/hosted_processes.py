@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from afspm import wire
@@ -17,7 +18,7 @@ from afspm.client.component import Component
 from afspm.model import Packet, Request, Response
 from afspm.storage.memory import Memory
 from afspm.testing.components.baton import Baton
-from afspm.testing.components.memory_network import ControlLine, Feed, Weather
+from afspm.testing.components.memory_network import ControlLine, Feed, PacketSource, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process
 from afspm.testing.components.simulated_time import SimulatedTime, Timer
@@ -130,6 +131,10 @@ class ComponentProcess(BlockingProcess):
     Args:
         make: makes the component.
         folder: its state_dir.
+        launch: its launch line, without sockets and folders.
+
+    Attributes:
+        publishers: other components to whose publishers it subscribes.
     """
 
     def __init__(
@@ -142,34 +147,49 @@ class ComponentProcess(BlockingProcess):
         folder: Path,
         *,
         dies_in_call: float = 0.0,
+        launch: Launch | None = None,
     ) -> None:
         super().__init__(timeline, name, dies_in_call=dies_in_call)
+        self._launch = launch or Launch(name)
+        self.publishers: list[ComponentProcess] = []
         self._weather = weather
         self._scheduler = scheduler
         self._make = make
         self._folder = folder
         self._inbox: list[Incoming] = []
-        self._newest: dict[str, int] = {}
-        self.problems: dict[str, int] = {}
+        self._newest: dict[str, dict[str, int]] = {}
+        self._feeds: dict[Feed, str] = {}
 
     def connect(self) -> None:
         self._inbox = []
         self._newest = {}
+        self._published = PublishedHistory(self.timeline)
+        self._subscribers: list[Feed] = []
         self._line = ControlLine(self.timeline, self._weather, self, self._scheduler, self.name)
-        self._feed = Feed(self.timeline, self._weather, self, self._scheduler, sorted(wire.followed_messages()))
+        wanted = self._launch.envelopes
+        envelopes = wire.messages_of_the_experiment() if wanted is None else wanted
+        prefixes = sorted({*envelopes, *wire.followed_messages()})
+        sources: dict[str, PacketSource] = {
+            SOURCE: self._scheduler,
+            **{f"memory://{one.name}": one for one in self.publishers},
+        }
+        self._feeds = {
+            Feed(self.timeline, self._weather, self, publisher, prefixes): source
+            for source, publisher in sources.items()
+        }
 
     def disconnect(self) -> None:
         self._line.close()
-        self._feed.close()
+        for feed in self._feeds:
+            feed.close()
 
     def body(self) -> int:
-        launch = Launch(
-            self.name,
-            sockets=Sockets(subscribe=(SOURCE,)),
+        launch = replace(
+            self._launch,
+            sockets=Sockets(publish=f"memory://{self.name}", subscribe=tuple(self._feeds.values())),
             state_dir=str(self._folder),
             run_dir=str(self._folder),
             simulated=True,
-            problems=self.problems,
         )
         context = ProcessContext(
             launch,
@@ -185,7 +205,8 @@ class ComponentProcess(BlockingProcess):
         """Break the connections, which are reopened after about `for_s`."""
         self._weather.reconnect_s, before_s = max(for_s, self._weather.reconnect_s), self._weather.reconnect_s
         self._line.cut()
-        self._feed.cut()
+        for feed in self._feeds:
+            feed.cut()
         self._weather.reconnect_s = before_s
 
     # --- what comes ---
@@ -200,16 +221,19 @@ class ComponentProcess(BlockingProcess):
         self._put(ReplyReceived(wire.decode_response(wire.encode_response(response))))
 
     def since_ns(self, feed: Feed) -> int:
-        return max(self._newest.values(), default=-1)
+        return max(self._newest_from(feed).values(), default=-1)
 
     def received(self, feed: Feed, packet: Packet) -> None:
-        time_ns = packet.time_ns or 0
-        if time_ns > self._newest.get(packet.envelope, -1):
-            self._newest[packet.envelope] = time_ns
-            self._put(PacketReceived(packet, SOURCE))
+        time_ns, newest = packet.time_ns or 0, self._newest_from(feed)
+        if time_ns > newest.get(packet.envelope, -1):
+            newest[packet.envelope] = time_ns
+            self._put(PacketReceived(packet, self._feeds[feed]))
+
+    def _newest_from(self, feed: Feed) -> dict[str, int]:
+        return self._newest.setdefault(self._feeds.get(feed, ""), {})
 
     def caught_up(self, feed: Feed) -> None:
-        self._put(CaughtUp(SOURCE))
+        self._put(CaughtUp(self._feeds[feed]))
 
     def killed(self, feed: Feed) -> None:
         self._put(Killed())
@@ -218,7 +242,24 @@ class ComponentProcess(BlockingProcess):
         self._inbox.append(incoming)
         self.arrived()
 
+    # --- as a publisher ---
+
+    def joined(self, feed: Feed, prefixes: Sequence[str], since_ns: int) -> Sequence[Packet]:
+        if feed not in self._subscribers:
+            self._subscribers.append(feed)
+        return self._published(feed, tuple(prefixes), since_ns)
+
+    def left(self, feed: Feed) -> None:
+        if feed in self._subscribers:
+            self._subscribers.remove(feed)
+
     # --- what its port does ---
+
+    def publish(self, envelope: str, payload: bytes) -> None:
+        self.may_die()
+        packet = self._published.stamp(envelope, payload)
+        for feed in list(self._subscribers):
+            feed.publish(packet)
 
     def send(self, frames: Sequence[bytes]) -> None:
         self.may_die()
@@ -254,7 +295,7 @@ class MemoryPort:
         return self._host.poll(timeout_s)
 
     def publish(self, envelope: str, payload: bytes) -> None:
-        raise NotImplementedError("components that publish are not simulated yet")
+        self._host.publish(envelope, payload)
 
     def wake_up(self, incoming: Incoming | None = None) -> None:
         self._host.wake(incoming)

@@ -23,6 +23,7 @@ from afspm.model.snapshot import restored, snapshot
 from afspm.scheduler.events import (
     Codec,
     Connected,
+    Delegate,
     Disconnected,
     Effect,
     Forward,
@@ -46,6 +47,7 @@ from afspm.scheduler.events import (
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
+from afspm.scheduler.shell import FrameWorker
 from afspm.testing.components.memory_network import ControlLine, Feed, LineServer, PacketSource, Weather
 from afspm.testing.components.simulated_process import Alarm, Process
 from afspm.testing.components.simulated_time import SimulatedTime
@@ -103,6 +105,9 @@ class SchedulerHost(Process):
         journal_s: how long after a packet the journal is written.
         dies_in_step: the chance that it is killed between two effects of one step.
         make_core: makes the core of each life, if it is not a plain one.
+
+    Attributes:
+        worker: takes the jobs of the coordinate frame in this life; None: the observer does.
     """
 
     def __init__(
@@ -129,6 +134,7 @@ class SchedulerHost(Process):
         self._observer = observer
         self.journal_s = journal_s
         self.writes_ahead = False
+        self.worker: FrameWorker | None = None
         self._connections = 0
         self._forget()
 
@@ -242,6 +248,10 @@ class SchedulerHost(Process):
         """Process a report of the coordinate frame's worker."""
         self._step(FrameReported(report))
 
+    def _receive_reports(self, worker: FrameWorker) -> None:
+        for report in worker.reports():
+            self.reported(report)
+
     @property
     def _has_ended(self) -> bool:
         # after the end only supervisors' messages are processed
@@ -280,6 +290,10 @@ class SchedulerHost(Process):
             if effect.history and not self._journal_due:
                 self._journal_due = True
                 self.later(self.journal_s * self.timeline.random.random(), self._write_journal)
+        elif isinstance(effect, Delegate):
+            if self.worker is not None:
+                self.worker.take(effect.job)
+                self.later(0.0, self._receive_reports, self.worker)
         elif isinstance(effect, Replay):
             self._replay = effect.packets
         elif isinstance(effect, SaveState):

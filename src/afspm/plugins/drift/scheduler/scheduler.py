@@ -16,6 +16,7 @@ from afspm.plugins.drift.scheduler.response import RESCAN
 from afspm.plugins.drift.scheduler.sample_frame import SampleFrame
 from afspm.plugins.drift.scheduler.scan_intake import MAPPING
 from afspm.plugins.drift.scheduler.settings import DriftCompensationSettings
+from afspm.plugins.drift.scheduler.worker import DriftWorkerInProcess
 from afspm.plugins.drift.scheduler.worker_process import DriftWorkerProcess
 from afspm.scheduler.scheduler import Coordinates, Scheduler
 from afspm.scheduler.wire_codec import WireCodec
@@ -75,15 +76,18 @@ class DriftCompensatedScheduler(Scheduler):
                 hint='tracker = "bank", or leave compensate out',
             )
 
-    def coordinates(self, context: ProcessContext) -> Coordinates:
+    def coordinates(self, context: ProcessContext, *, in_process: bool = False) -> Coordinates:
         launch = context.launch
         file = Path(launch.state_dir) / f"{launch.name}.drift.npz" if launch.state_dir else None
         drift = self.drift.beside(launch.solved)
         if drift != self.drift:
             context.log.info("no component solves thermal-drift: the first scan is not taken in both directions")
+        frame = SampleFrame.initial(drift, DriftWireCodec(), launch.name)
+        if in_process:
+            return Coordinates(frame, DriftWorkerInProcess(drift, file, context.log))
         worker = DriftWorkerProcess(drift, file, context.log)
         worker.late = context.clock.late
-        return Coordinates(SampleFrame.initial(drift, DriftWireCodec(), launch.name), worker)
+        return Coordinates(frame, worker)
 
 
 class DriftWireCodec(WireCodec):

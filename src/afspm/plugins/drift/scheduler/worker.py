@@ -6,14 +6,18 @@ scheduler's process, even during a registration: by then the worker of the next 
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import sys
 import threading
+from collections import deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from multiprocessing import connection
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -28,6 +32,7 @@ from afspm.plugins.drift.scheduler.messages import (
     Forecasted,
     NotRegistered,
     ScanJob,
+    StartWorker,
     WorkerGone,
     WorkerReport,
 )
@@ -42,6 +47,52 @@ class Complaint:
     """An error for the log; the worker goes on."""
 
     reason: str
+
+
+class Reports(Protocol):
+    """Takes the reports of a worker."""
+
+    def send(self, obj: object, /) -> None: ...
+
+
+class DriftWorkerInProcess:
+    """The worker without a process, for tests: a job is done when `take` returns. See `scheduler.shell.FrameWorker`.
+
+    Args:
+        file: where the worker keeps its state; None: nowhere.
+
+    Attributes:
+        wake: called when there is a report.
+    """
+
+    def __init__(self, settings: DriftCompensationSettings, file: Path | None, log: logging.Logger) -> None:
+        self.wake: Callable[[], None] = lambda: None
+        self._settings, self._file, self._log = settings, file, log
+        self._reports: deque[object] = deque()
+        self._worker: _Worker | None = None
+
+    def take(self, job: object) -> None:
+        if isinstance(job, StartWorker):
+            try:
+                self._worker = _Worker(self._settings, WorkerStateFile(self._file), self)
+            except AfspmError as error:
+                self.send(WorkerGone(str(error)))
+        elif self._worker is not None and isinstance(job, ScanJob | Compensated):
+            self._worker.take(job)
+
+    def send(self, report: object) -> None:
+        if isinstance(report, Complaint):
+            self._log.error("drift: %s", report.reason)
+            return
+        self._reports.append(report)
+        self.wake()
+
+    def reports(self) -> Iterator[object]:
+        while self._reports:
+            yield self._reports.popleft()
+
+    def close(self) -> None:
+        """There is nothing to close: the state is on disk."""
 
 
 def main(jobs: Connection, reports: Connection, settings: DriftCompensationSettings, file: Path | None) -> None:
@@ -72,7 +123,7 @@ def _end_with_parent() -> None:
 
 
 class _Worker:
-    def __init__(self, settings: DriftCompensationSettings, store: WorkerStateFile, reports: Connection) -> None:
+    def __init__(self, settings: DriftCompensationSettings, store: WorkerStateFile, reports: Reports) -> None:
         self._settings = settings
         self._store = store
         self._reports = reports

@@ -10,7 +10,7 @@ from datetime import datetime
 from html import escape
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import duration_text, time_of_day, typeset_area
+from afspm.basics.formatting import day_and_time, duration_text, time_of_day, typeset_area
 from afspm.model import ControlMode, JournalEntry, LogLine, Note, ProcessCondition, ProcessState, Region
 from afspm.model.events import PERSON
 from afspm.plugins.web.dashboard.charts import Chart, drift_chart
@@ -26,6 +26,7 @@ SLOWLY_S = 2.0  # the same for slow content
 OLD_AFTER_S = 8.0  # a supervisor publishes its processes every 2 s
 NO_REPORT = "no report"
 _STARTING = "starting"
+_DAY_NS, _MINUTE_NS = 86_400 * NS_PER_S, 60 * NS_PER_S
 _AS_USUAL = {_STARTING, "alive", "ended"}
 
 
@@ -259,11 +260,25 @@ def status_html(watch: Watch, overview: Overview) -> str:
         _chip(f"{who} is in control<small>{since}</small>", "holder"),
         *_microscope(overview, now_ns),
     ]
-    for name, (done, of) in overview.progress.items():
-        parts.append(_chip(f"<b>{escape(name)}</b> {done} of {of}", "progress"))
+    end_ns = watch.expected_end_ns(overview, now_ns)
+    for name, report in overview.progress_reports.items():
+        left_ns = report.remaining_ns(now_ns) if report.done < report.of else None
+        # the component that decides the end needs no end of its own
+        has_end = left_ns and (end_ns is None or abs(now_ns + left_ns - end_ns) > _MINUTE_NS)
+        end = f"<small>ends {_end_text(now_ns + left_ns, now_ns)}</small>" if left_ns and has_end else ""
+        parts.append(_chip(f"<b>{escape(name)}</b> {report.done} of {report.of}{end}", "progress"))
+    if end_ns is not None and end_ns > now_ns:
+        left = duration_text((end_ns - now_ns) / NS_PER_S)
+        parts.append(_chip(f"ends about {_end_text(end_ns, now_ns)}<small>{left} left</small>", "end"))
     zone = datetime.fromtimestamp(now_ns / NS_PER_S).astimezone().tzname()
     parts.append(_chip(f"{time_of_day(now_ns, seconds=False)} {zone}", "clock", "time"))
     return "".join(parts)
+
+
+def _end_text(end_ns: int, now_ns: int) -> str:
+    if end_ns - now_ns < _DAY_NS:
+        return time_of_day(end_ns, seconds=False)
+    return day_and_time(end_ns, seconds=False)
 
 
 def _chip(html: str, part: str, style: str = "") -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ from afspm.plugins.web.watch import SpectrumStore, Watch
 from afspm.record.overview import Overview
 from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
+
+_log = logging.getLogger("afspm.plugins.web.dashboard")
 
 SPECTRA = 8
 """Spectra read before a moment."""
@@ -57,6 +60,7 @@ class Night:
             self.folder = run.folder
             self.title, self.simulated, self.problems = run.name, run.simulated, run.problem_names
             self.speed = float((run.facts.get("clock") or {}).get("speed", 1.0))
+        self._unreadable: set[int] = set()
         self.reload()
 
     def reload(self) -> None:
@@ -82,8 +86,12 @@ class Night:
         store = SpectrumStore()
         with open_run(self.folder) as run:
             for row in [row for row in run.spectra if row.time_ns <= time_ns][-SPECTRA:]:
-                with suppress(FileError):  # its file is missing or damaged
+                try:
                     store.take(run.spectrum(row), row.time_ns)
+                except FileError as error:  # missing or damaged; once a spectrum, not at each move of the slider
+                    if row.time_ns not in self._unreadable:
+                        self._unreadable.add(row.time_ns)
+                        _log.warning("a spectrum is not shown: %s", error)
         return store
 
     def drifted(self) -> dict[int, DriftedScan]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import threading
 from bisect import bisect_right
 from collections.abc import Collection, Iterator
@@ -32,6 +33,8 @@ from afspm.model.snapshot import to_plain
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.run import open_run
 from afspm.storage.packet_log import log_folder, logged_packets
+
+_log = logging.getLogger("afspm.plugins.web.gateway")
 
 # both bounds: notes and log lines may be long
 MOST_EVENTS, MOST_BYTES = 20_000, 16 << 20
@@ -144,8 +147,8 @@ def _recorded(run_dir: Path, state_dir: Path | None) -> Iterator[tuple[str, obje
                 for packet, message, thing in run.messages([one.name for one in wire.declared() if one.event]):
                     newest_ns = packet.time_ns or newest_ns
                     yield message, thing, newest_ns
-        except AfspmError:
-            pass  # the recorder is just creating the file; the packet log has the events
+        except AfspmError as error:  # the recorder is just creating the file, or it is damaged
+            _log.warning("older events are not served: %s; the packet log is read instead", error)
     for entry in () if state_dir is None else logged_packets(log_folder(state_dir)):
         packet = entry.packet
         try:

@@ -5,12 +5,12 @@ import afspm.Control.ControlResponse;
 import afspm.Control.ScopeState;
 import java.util.function.BooleanSupplier;
 
-/** Commands to the microscope, repeated with the same id until they are answered, and refused loudly. */
+/** Sends commands to the microscope, repeated with the same id until an answer arrives; a refusal is thrown. */
 final class Commands {
-    private static final double PATIENCE_S = 60; // that a translator may take to be there again
-    private static final double RETRY_S = 1; // before an unreachable one is asked again, when nothing is published in between
-    private static final double SETTLED_WITHIN_S = 2; // what was set is published, if it changed anything
-    private static final double ASK_BUSY_AGAIN_S = 25; // should the state FREE never reach us
+    private static final double PATIENCE_S = 60; // longest absence of a translator
+    private static final double RETRY_S = 1; // before the next attempt at an unreachable microscope, if nothing is published in between
+    private static final double SETTLED_WITHIN_S = 2; // a setting that changed something is published within this time
+    private static final double ASK_BUSY_AGAIN_S = 25; // in case the state FREE is never received
 
     private final Link link;
     private final ControlHold control;
@@ -20,7 +20,7 @@ final class Commands {
         this.control = control;
     }
 
-    /** Ask until it succeeds. Control must be held around it; where it is lost it is waited for. */
+    /** Repeat a request until it succeeds. The caller holds control; after a loss this waits for control. */
     Response ask(int number, byte[] object, long deadline) {
         String id = link.requests.nextId();
         while (true) {
@@ -30,14 +30,14 @@ final class Commands {
             if (response.ok()) {
                 return response;
             }
-            if (!response.isUnanswered()) { // else it may have been carried out: the same id again
+            if (!response.isUnanswered()) { // otherwise it may have been carried out: repeat with the same id
                 getOver(number, response, states, deadline);
                 id = link.requests.nextId();
             }
         }
     }
 
-    /** Ask for a setting, and wait until its {@code message} is published and the tip has stopped moving. */
+    /** Change a setting, and wait until its {@code message} is published and the tip has stopped moving. */
     void set(int number, byte[] object, String message, long deadline) {
         int count = link.count(message);
         ask(number, object, deadline);
@@ -47,17 +47,17 @@ final class Commands {
     }
 
     /**
-     * Ask once, with patience for a microscope that is silent: the same id has it executed once.
+     * Send a request and repeat it with the same id while the microscope is silent, so that it is executed once.
      *
-     * @param isSeen whether what was asked for is seen to happen, which is as good as an answer
+     * @param isSeen whether the effect of the request is observed, which counts as an answer
      * @return the answer; one without an outcome only if control was lost before there was any
      */
     Response send(int number, byte[] object, String id, long deadline, BooleanSupplier isSeen) {
         long giveUp = Time.earlier(PATIENCE_S, deadline);
-        link.await(() -> link.count("ScopeStateMsg") > 0, giveUp); // a microscope that has not said a word would refuse
+        link.await(() -> link.count("ScopeStateMsg") > 0, giveUp); // a microscope without a published state refuses
         for (boolean isRepeated = false;; isRepeated = true) {
             Response response = link.requests.ask(number, object, id, deadline);
-            if (isRepeated && response.isNotInControl()) { // now; whether it was done before is still unknown
+            if (isRepeated && response.isNotInControl()) { // now; the outcome of the earlier attempt is still unknown
                 control.lost(response.reason());
                 return response.as(ControlResponse.REP_NO_RESPONSE_VALUE);
             }
@@ -78,10 +78,10 @@ final class Commands {
         }
     }
 
-    /** After a refusal: wait for what stands in the way, or throw it. */
+    /** Wait until the cause of a refusal is gone, or throw the refusal. */
     void getOver(int number, Response response, int states, long deadline) {
         if (response.isUnanswered()) {
-            return; // control is lost, and waited for when it is asked again
+            return; // control is lost; the next attempt waits for it
         }
         if (response.isNotInControl()) {
             control.lost(response.reason());
@@ -92,7 +92,7 @@ final class Commands {
         }
     }
 
-    /** Wait until the microscope says that it is free, later than {@code states}; not for ever, should that get lost. */
+    /** Wait for a state FREE newer than {@code states}, with a time limit in case that packet is lost. */
     private void awaitFree(int states, long deadline) {
         double patienceS = link.state() == ScopeState.SS_FREE ? RETRY_S : ASK_BUSY_AGAIN_S;
         link.await(() -> link.state() == ScopeState.SS_FREE && link.count("ScopeStateMsg") != states, Time.earlier(patienceS, deadline));

@@ -13,9 +13,9 @@ import java.util.logging.ConsoleHandler;
 import java.util.logging.Formatter;
 import java.util.logging.LogRecord;
 
-/** Runs a component that {@code afspm run} has started. */
+/** Runs a component that {@code afspm run} started. */
 public final class Component {
-    /** Exit codes, by which a process tells its supervisor why it ends. Every other is a crash: it is started again. */
+    /** Exit codes: the reason why a process ends, for its supervisor. Every other code is a crash that a restart follows. */
     public static final int DONE = 0;
     public static final int CRASHED = 1;
     /** The settings can't work: a restart would fail the same way. */
@@ -25,8 +25,8 @@ public final class Component {
     /** Standard input has ended. */
     public static final int STOPPED = 81;
 
-    private static final long AFTER_THE_END_MS = 1000; // to handle what came before it
-    private static final long AFTER_A_STOP_MS = 200; // the parent that stops us kills us soon
+    private static final long AFTER_THE_END_MS = 1000; // to handle packets received before it
+    private static final long AFTER_A_STOP_MS = 200; // the parent kills a stopped process soon after
 
     private Component() {
     }
@@ -40,8 +40,8 @@ public final class Component {
      * Run a component, and end the process when {@code main} returns, the experiment ends, or standard input does.
      *
      * @param main what the component does; when it returns, the component is done
-     * @param onLine takes the further lines of standard input, in a thread of their own
-     * @param longestStepS how many seconds may pass between two calls before the process counts as frozen
+     * @param onLine receives further lines of standard input, in its own thread
+     * @param longestStepS longest time between two calls, in s; after it the process counts as frozen
      */
     public static void run(Consumer<Experiment> main, Consumer<String> onLine, double longestStepS) {
         logToStandardError();
@@ -81,7 +81,7 @@ public final class Component {
         return done;
     }
 
-    /** Wait until the component is done, or there is nothing more to do; return the exit code. */
+    /** Wait until the component is done or has to end; return the exit code. */
     private static int awaitEnd(Experiment experiment, CompletableFuture<Integer> done) {
         try {
             experiment.link().await(done::isDone, Long.MAX_VALUE);
@@ -130,7 +130,7 @@ public final class Component {
         thread.start();
     }
 
-    /** Have the log begin each line with its level, which the supervisor knows. */
+    /** Begin each line of the log with its level, which the supervisor reads. */
     private static void logToStandardError() {
         ConsoleHandler handler = new ConsoleHandler();
         handler.setFormatter(new Formatter() {

@@ -5,12 +5,12 @@ import afspm.Control.ControlResponse;
 import java.util.function.Supplier;
 
 /**
- * This component's hold on control: asking for it, waiting for it, noticing that it is gone, giving it back. Answers of
- * the scheduler grant control; its published state takes it away, once that has named us: a state from before the grant
- * may still be under way.
+ * This component's hold on control: requests it, waits for it, notices its loss, releases it. Answers of
+ * the scheduler grant control; its published state revokes it, once a state has named this component: a state from
+ * before the grant may still be in transit.
  */
 final class ControlHold {
-    private static final double ASK_AGAIN_S = 10; // should a published control state ever not reach us
+    private static final double ASK_AGAIN_S = 10; // in case a published control state is not received
 
     private final Link link;
     private boolean isHeld;
@@ -35,7 +35,7 @@ final class ControlHold {
         }
     }
 
-    /** Whether control is wanted and not there. */
+    /** Whether control is wanted and not held. */
     boolean wasLost() {
         synchronized (link) {
             return depth > 0 && !isHeld;
@@ -48,7 +48,7 @@ final class ControlHold {
         }
     }
 
-    /** Have control while {@code body} runs; within another such call it is that one's. */
+    /** Hold control while {@code body} runs; a nested call shares the control of the outer one. */
     <T> T hold(Supplier<T> body, int problem, long deadline) {
         acquire(problem, deadline);
         try {
@@ -58,7 +58,7 @@ final class ControlHold {
         }
     }
 
-    /** Have control until {@link #relinquish} was called as often. */
+    /** Hold control until {@link #relinquish} was called as often. */
     void acquire(int problem, long deadline) {
         synchronized (link) {
             if (depth > 0 && problem != 0 && problem != solving) {
@@ -86,7 +86,7 @@ final class ControlHold {
         }
     }
 
-    /** Have control until {@link #giveUp} is called: a second call only sees that it is there. */
+    /** Hold control until {@link #giveUp} is called; a second call only checks that it is held. */
     void keep(int problem, long deadline) {
         if (!isKept) {
             acquire(problem, deadline);
@@ -98,7 +98,7 @@ final class ControlHold {
         isKept = true;
     }
 
-    /** Have control for another problem than now: the scheduler says whether that may be. */
+    /** Hold control for another problem than now, if the scheduler allows it. */
     private void change(int problem, long deadline) {
         Response response = link.requests.ask(ControlRequest.REQ_REQUEST_CTRL_VALUE, new byte[] {(byte) problem}, deadline);
         if (!response.ok()) {
@@ -117,7 +117,7 @@ final class ControlHold {
         isKept = false;
     }
 
-    /** Be in control: at once if we are, else ask, wait for the control state to change, and ask again. */
+    /** Return once in control: request it, wait for the control state to change, and request again. */
     void regain(long deadline) {
         String reported = "";
         Response refusal = null;
@@ -129,7 +129,7 @@ final class ControlHold {
             } catch (NoResponseException error) {
                 if (refusal == null || !Time.isOver(deadline)) {
                     throw error;
-                } // else the last that was heard is the answer
+                } // otherwise the newest published state is the answer
             }
             if (refusal == null) {
                 return;
@@ -147,7 +147,7 @@ final class ControlHold {
         }
     }
 
-    /** Give back control that an earlier life of this component had and nothing here wants now. */
+    /** Release control that an earlier life of this component held and that is not wanted now. */
     void releaseInherited() {
         ControlState state = link.control();
         boolean isInherited;
@@ -159,7 +159,7 @@ final class ControlHold {
         }
     }
 
-    /** The scheduler says that we are not in control. */
+    /** Note the scheduler's answer that this component is not in control. */
     void lost(String why) {
         link.change(() -> {
             isHeld = false;
@@ -167,7 +167,7 @@ final class ControlHold {
         });
     }
 
-    /** Give control back, if we have it. */
+    /** Release control if it is held. */
     void release() {
         if (!isHeld()) {
             return;
@@ -184,7 +184,7 @@ final class ControlHold {
         }
     }
 
-    /** Ask once. Returns the refusal if it has to be waited for; null: control is ours. */
+    /** Request control once. Return a refusal that may pass with time; null: control is granted. */
     private Response ask(long deadline) {
         Response response = link.requests.ask(ControlRequest.REQ_REQUEST_CTRL_VALUE, new byte[] {(byte) solving}, deadline);
         switch (response.code()) {
@@ -211,7 +211,7 @@ final class ControlHold {
         return solving != 0 && (link.control() == null || !link.control().problems().contains(solving));
     }
 
-    /** Return what stands between us and control, for a person; empty if nothing does. */
+    /** Return the reason why control is withheld, for a person; empty without one. */
     private String obstacle() {
         ControlState state = link.control();
         if (state == null) {

@@ -1,6 +1,6 @@
 package afspm.client;
 
-/** Control was not given in time, or the problem to be solved is not flagged. */
+/** Control was not granted in time, or the problem to solve is not flagged. */
 public class ControlLostException extends RequestException {
     ControlLostException(String what, Response response) {
         super(what, response.code(), response.reason(), response.detail());

@@ -39,10 +39,10 @@ final class ControlSocket {
         List<byte[]> message = new ArrayList<>();
         message.add(DELIMITER);
         message.addAll(frames);
-        Sockets.send(socket, message); // or not, if it is full: the request is repeated
+        Sockets.send(socket, message); // dropped if the socket is full: the request is repeated
     }
 
-    /** A connection that stands but leads nowhere would never lead anywhere again: make another. */
+    /** Replace a connection that is established but without answers: it would never recover. */
     void reconnect() {
         onConnected.accept(false);
         socket.disconnect(address);
@@ -58,12 +58,12 @@ final class ControlSocket {
     void receive() {
         for (List<byte[]> frames = Sockets.receive(socket); !frames.isEmpty(); frames = Sockets.receive(socket)) {
             if (frames.size() < 2 || !Arrays.equals(frames.get(0), DELIMITER)) {
-                continue; // empty: the scheduler looks whether we are there
+                continue; // empty: the scheduler probes whether this client is alive
             }
             try {
                 onResponse.accept(Response.decode(frames.subList(1, frames.size())));
             } catch (WireException error) {
-                continue; // not an answer; the request is asked again
+                continue; // not an answer; the request is repeated
             }
         }
     }

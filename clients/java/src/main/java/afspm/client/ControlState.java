@@ -22,12 +22,12 @@ public final class ControlState {
         return mode.name();
     }
 
-    /** Return the component in control; empty: none. */
+    /** Return the name of the component in control; empty: none. */
     public String holder() {
         return holder;
     }
 
-    /** Return the numbers of the problems that are flagged. */
+    /** Return the numbers of the flagged problems. */
     public List<Integer> problems() {
         return problems;
     }

@@ -5,23 +5,23 @@ import java.util.LinkedHashMap;
 import java.util.Map;
 
 /**
- * One scan or spectrum, followed through what the scheduler publishes: the state {@code busy}, then results, then FREE.
- * While a connection was lost the cache may have kept the results and not {@code busy}: then they are taken for ours, too.
- * Pure: packets in, an outcome out.
+ * One scan or spectrum, followed by published packets: the state {@code busy}, then results, then FREE.
+ * After a lost connection the cache may hold the results but not {@code busy}: such results count, too.
+ * Pure: takes packets, returns an outcome.
  */
 final class Cycle<T> {
-    /** How a cycle may end. */
+    /** The possible ends of a cycle. */
     enum Outcome {
         COMPLETED,
-        /** The microscope says that it was stopped. */
+        /** The microscope published an interruption. */
         INTERRUPTED,
-        /** The microscope is free and there is nothing: it was started anew in the middle, say. */
+        /** The microscope is free without a result, for example after a restart of the translator. */
         VANISHED,
-        /** The results can't be those asked for: a person at the panel has moved the frame, say. */
+        /** The results do not match the request, for example after a person moved the frame. */
         ANOTHER
     }
 
-    /** The newest result of each name: a restarted translator may have published one twice. */
+    /** The newest result of each name: a restarted translator may publish one twice. */
     final Map<String, T> results = new LinkedHashMap<>();
     private final ScopeState busy;
     private final long sinceNs;
@@ -31,8 +31,8 @@ final class Cycle<T> {
     private Outcome outcome;
 
     /**
-     * @param sinceNs what is not newer belongs to something earlier
-     * @param isResumed it was asked for in an earlier life of ours, or control was lost: another may have measured since
+     * @param sinceNs packets up to this time belong to an earlier measurement
+     * @param isResumed it was requested in an earlier life, or control was lost: another component may have measured since
      */
     Cycle(ScopeState busy, long sinceNs, boolean isResumed) {
         this.busy = busy;
@@ -44,12 +44,12 @@ final class Cycle<T> {
         return isBegun;
     }
 
-    /** Return how it ended; null while it goes on. */
+    /** Return the outcome; null before the end. */
     Outcome outcome() {
         return outcome;
     }
 
-    /** Another component may measure from now on. */
+    /** Note that another component may measure from now on. */
     void controlWasLost() {
         isResumed = true;
     }
@@ -63,7 +63,7 @@ final class Cycle<T> {
             return;
         }
         if (state == busy) {
-            results.clear(); // what came before this began belongs to another
+            results.clear(); // results from before the start belong to another measurement
             isAnother = false;
             isBegun = true;
         } else if (isBegun && state == ScopeState.SS_INTERRUPTED) {

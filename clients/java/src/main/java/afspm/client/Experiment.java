@@ -17,15 +17,15 @@ import java.util.function.BooleanSupplier;
 import java.util.function.Supplier;
 
 /**
- * A running experiment, as one component takes part in it.
+ * A running experiment, from the side of one component.
  *
- * <p>Lengths are in metres, angles in radians, times in seconds; where a parameter has another unit, it is named. Commands
- * ask for control by themselves and give it back; where it is refused or taken away, they wait until it is back. Every
+ * <p>Lengths are in metres, angles in radians, times in seconds; other units of parameters are named. Commands
+ * request control by themselves and release it; while it is refused or revoked, they wait for it. Every
  * call may throw {@link RefusedException}, {@link NoResponseException}, {@link ControlLostException},
  * {@link ExperimentEndedException} and {@link StopRequestedException}. All methods may be called from any thread.
  */
 public final class Experiment implements AutoCloseable {
-    /** How many seconds a step may take, by default, before the process counts as frozen. */
+    /** Default of the longest step, in s; a process in a longer step counts as frozen. */
     public static final double LONGEST_STEP_S = 30;
     private static final double JOINED_WITHIN_S = 5;
     private static final double FOR_EVER = Double.POSITIVE_INFINITY;
@@ -40,9 +40,9 @@ public final class Experiment implements AutoCloseable {
     private final Publisher publisher;
 
     /**
-     * Take part as a launch line says; {@link Component#run} and {@link #join} do so.
+     * Take part as described by a launch line; {@link Component#run} and {@link #join} do so.
      *
-     * @param longestStepS how many seconds may pass between two calls before the process counts as frozen
+     * @param longestStepS longest time between two calls, in s; after it the process counts as frozen
      */
     public Experiment(Launch launch, double longestStepS) {
         this.launch = launch;
@@ -56,10 +56,10 @@ public final class Experiment implements AutoCloseable {
     }
 
     /**
-     * Join an experiment that is running.
+     * Join a running experiment.
      *
-     * @param where the folder of the run, or the folder of all runs: the newest is meant
-     * @param name what others see as the holder of control; two that join need different names
+     * @param where the folder of a run, or of all runs: then the newest one
+     * @param name the name shown as the holder of control; different for each program that joins
      */
     public static Experiment join(String where, String name) {
         Experiment experiment = new Experiment(Launch.ofGuest(where, name), LONGEST_STEP_S);
@@ -73,12 +73,12 @@ public final class Experiment implements AutoCloseable {
         }
     }
 
-    /** Begin to receive: what {@link #listen} was called for before misses nothing. */
+    /** Begin to receive. Queues made by {@link #listen} before this call miss no packet. */
     void start() {
         link.start();
     }
 
-    /** Wait until the scheduler is there, and all that it has published before has come. */
+    /** Wait until the scheduler is connected and all packets of its cache have arrived. */
     public void awaitReady(double timeoutS) {
         long deadline = Time.deadline(timeoutS);
         if (launch.sockets.control != null && !link.await(link.requests::isConnected, deadline)) {
@@ -87,14 +87,14 @@ public final class Experiment implements AutoCloseable {
         link.awaitCaughtUp(deadline);
     }
 
-    /** Return the part that this component has: name, settings, folder. */
+    /** Return the launch line of this component: name, settings, folder. */
     public Launch launch() {
         return launch;
     }
 
     // --- looking ---
 
-    /** Return what the microscope does, such as "SS_FREE". */
+    /** Return the state of the microscope, such as "SS_FREE". */
     public String state() {
         return link.state().name();
     }
@@ -103,37 +103,37 @@ public final class Experiment implements AutoCloseable {
         return link.state() == ScopeState.SS_FREE;
     }
 
-    /** Return mode, holder of control and problems; null before the scheduler has said. */
+    /** Return mode, holder of control and problems; null before the first packet. */
     public ControlState controlState() {
         return link.control();
     }
 
-    /** Whether control is ours now. */
+    /** Whether this component is in control. */
     public boolean isInControl() {
         return control.isHeld();
     }
 
-    /** Return where the next scan will be taken; null before the microscope has said. */
+    /** Return region and shape of the next scan; null before the first packet. */
     public ScanParameters scanParameters() {
         return link.scanParameters();
     }
 
-    /** Return the feedback; null before the microscope has said. */
+    /** Return the feedback; null before the first packet. */
     public ZCtrlParameters feedback() {
         return link.feedback();
     }
 
-    /** Return the place of the probe in metres, as {x, y}; null before the microscope has said. */
+    /** Return the position of the probe in metres, as {x, y}; null before the first packet. */
     public double[] probePositionM() {
         return link.probePositionM();
     }
 
-    /** Return a queue of what is published from now on under envelopes that begin so; "" for all. Close it at the end. */
+    /** Return a queue of packets published from now on under envelopes with this prefix; "" for all. Close it at the end. */
     public PacketQueue listen(String prefix) {
         return new PacketQueue(link, prefix);
     }
 
-    /** Wait until a condition holds, tried whenever something was published; false when the time is up. */
+    /** Wait until a condition holds, tested after each published packet; return false at the timeout. */
     public boolean waitUntil(BooleanSupplier condition, double timeoutS) {
         return link.await(condition, Time.deadline(timeoutS));
     }
@@ -145,7 +145,7 @@ public final class Experiment implements AutoCloseable {
 
     // --- measuring ---
 
-    /** Take a scan of a region (null: what is set) in so many pixels (0: what is set). */
+    /** Take a scan of a region (null: as set) with a number of pixels (0: as set). */
     public ScanSet scan(Region region, int rows, int columns) {
         return scan(region, rows, columns, null, FOR_EVER);
     }
@@ -156,13 +156,13 @@ public final class Experiment implements AutoCloseable {
     }
 
     /**
-     * Take a scan. One that is interrupted (a problem, MANUAL, a restart of anything) is taken again when control is back.
+     * Take a scan. A scan interrupted by a problem, MANUAL or a restart is repeated once control is granted again.
      *
-     * @param region where; null: what is set
-     * @param rows of pixels; 0: what is set
-     * @param columns of pixels; 0: what is set
-     * @param key makes it happen once in this run: a component that is killed and started again gets the scan of its
-     *     earlier life. Each measurement has a key of its own; null: it has none
+     * @param region null: as set
+     * @param rows 0: as set
+     * @param columns 0: as set
+     * @param key unique in this run: a component that is killed and restarted gets the scan of its earlier life
+     *     instead of a second one; null: no key
      * @param timeoutS in real seconds
      */
     public ScanSet scan(Region region, int rows, int columns, String key, double timeoutS) {
@@ -170,7 +170,7 @@ public final class Experiment implements AutoCloseable {
         return new ScanSet(measurements.take(target, key, Time.deadline(timeoutS)));
     }
 
-    /** Take a spectrum where the probe is moved to, in metres, such as of the kind "IV". */
+    /** Move the probe to a position in metres and take a spectrum of a kind such as "IV". */
     public Spectrum spectrum(double xM, double yM, String kind) {
         return spectrum(new double[] {xM, yM}, kind, null, FOR_EVER).spectrum();
     }
@@ -178,8 +178,8 @@ public final class Experiment implements AutoCloseable {
     /**
      * Take a spectrum.
      *
-     * @param atM where the probe is moved to in metres, as {x, y}; null: where it stands
-     * @param kind such as "IV"; null: what is set
+     * @param atM position in metres, as {x, y}; null: the present one
+     * @param kind such as "IV"; null: as set
      * @param key as of a scan
      * @param timeoutS in real seconds
      */
@@ -190,12 +190,12 @@ public final class Experiment implements AutoCloseable {
 
     // --- setting and getting ---
 
-    /** Set a parameter to a number in its SI unit; return what is then in force. */
+    /** Set a parameter to a number in its SI unit; return the value in force. */
     public double set(String parameter, double value) {
         return set(parameter, value, null);
     }
 
-    /** Set a parameter to a number in {@code unit} (null: SI); return what is then in force, in the same unit. */
+    /** Set a parameter to a number in {@code unit} (null: SI); return the value in force, in the same unit. */
     public double set(String parameter, double value, String unit) {
         if (Double.isNaN(value) || Double.isInfinite(value)) {
             throw new InvalidValueException(parameter + " can't be set to " + value);
@@ -206,13 +206,13 @@ public final class Experiment implements AutoCloseable {
         return answer.length == 0 ? value : number(answer, unit);
     }
 
-    /** Set a parameter to a word, such as "up" or "true"; return what is then in force. */
+    /** Set a parameter to a word, such as "up" or "true"; return the value in force. */
     public String setText(String parameter, String value) {
         byte[] answer = command(ControlRequest.REQ_PARAM_VALUE, Wire.parameter(parameter, value, null)).object();
         return answer.length == 0 ? value : parameterIn(answer).getValue();
     }
 
-    /** Return the value of a parameter in its SI unit, or as it comes if it is not a base parameter. */
+    /** Return the value of a parameter in its SI unit; that of other than base parameters in the microscope's unit. */
     public double get(String parameter) {
         return get(parameter, null);
     }
@@ -227,12 +227,12 @@ public final class Experiment implements AutoCloseable {
         return parameterIn(read(parameter)).getValue();
     }
 
-    /** Set what is there of the z feedback; the rest stays as it is. */
+    /** Set the given parts of the z feedback; null parts stay unchanged. */
     public void setFeedback(ZCtrlParameters feedback) {
         command(ControlRequest.REQ_SET_ZCTRL_PARAMS_VALUE, feedback.toByteArray());
     }
 
-    /** Move the probe to (x, y) in metres; returns when it stands there. */
+    /** Move the probe to (x, y) in metres; return on arrival. */
     public void moveProbe(double xM, double yM) {
         control.hold(() -> {
             commands.set(ControlRequest.REQ_SET_PROBE_POS_VALUE, Wire.place(xM, yM), "ProbePosition", Long.MAX_VALUE);
@@ -240,32 +240,32 @@ public final class Experiment implements AutoCloseable {
         }, 0, Long.MAX_VALUE);
     }
 
-    /** Have the microscope do something, such as "x-pulse". */
+    /** Perform an action of the microscope, such as "x-pulse". */
     public void action(String name) {
         command(ControlRequest.REQ_ACTION_VALUE, Wire.action(name));
     }
 
-    /** Whether the microscope knows an action. */
+    /** Whether the microscope has an action. */
     public boolean supports(String action) {
         return commands.send(ControlRequest.REQ_ACTION_SUPPORT_VALUE, Wire.action(action), link.requests.nextId(), Long.MAX_VALUE, () -> false).ok();
     }
 
     // --- control and the experiment ---
 
-    /** Have control while {@code body} runs: between two calls in it no other component has it, unless it is lost. */
+    /** Hold control while {@code body} runs: no other component acts between two calls in it, unless control is lost. */
     public <T> T withControl(Supplier<T> body) {
         return control.hold(body, 0, Long.MAX_VALUE);
     }
 
-    /** Have control while {@code body} runs, to put a problem right: it is only given while that is flagged. */
+    /** Hold control while {@code body} runs, to solve a problem: it is granted only while the problem is flagged. */
     public <T> T solving(String problem, Supplier<T> body) {
         return control.hold(body, problems.number(problem), Long.MAX_VALUE);
     }
 
     /**
-     * Ask for control and keep it until {@link #releaseControl}.
+     * Request control and keep it until {@link #releaseControl}.
      *
-     * @param problem the number of the problem to put right; 0 for none
+     * @param problem the number of the problem to solve; 0 for none
      * @param timeoutS in real seconds
      */
     public void requestControl(int problem, double timeoutS) {
@@ -276,12 +276,12 @@ public final class Experiment implements AutoCloseable {
         control.giveUp();
     }
 
-    /** Flag a problem: control is taken from its holder, until the problem is cleared. */
+    /** Flag a problem: it revokes control until a component clears the problem. */
     public void flag(String problem) {
         order("flagging a problem", ControlRequest.REQ_ADD_EXP_PRBLM_VALUE, problems.number(problem));
     }
 
-    /** Remove the flag of a problem; that it was not flagged is no error. */
+    /** Clear a problem; no error if it is not flagged. */
     public void clear(String problem) {
         order("clearing a problem", ControlRequest.REQ_RMV_EXP_PRBLM_VALUE, problems.number(problem));
     }
@@ -301,12 +301,12 @@ public final class Experiment implements AutoCloseable {
         link.requests.order("ending the experiment", ControlRequest.REQ_END_EXPERIMENT_VALUE, Requests.NOTHING);
     }
 
-    /** Return what time it is in the experiment, ns since the Unix epoch. */
+    /** Return the experiment time, ns since the Unix epoch. */
     public long timeNs() {
         return clock().get("now_ns").getAsLong();
     }
 
-    /** Let so many seconds of experiment time pass. */
+    /** Wait for a number of seconds of experiment time. */
     public void sleep(double seconds) {
         long end = timeNs() + (long) (seconds * 1e9);
         for (JsonObject clock = clock(); clock.get("now_ns").getAsLong() < end; clock = clock()) {
@@ -332,13 +332,13 @@ public final class Experiment implements AutoCloseable {
         relay("Note", note.build().toByteString());
     }
 
-    /** Publish how far this component is, for those who look on. */
+    /** Publish the progress of this component, for people. */
     public void progress(long done, long of) {
         relay("Progress", Progress.newBuilder().setTimestamp(Time.timestamp(timeNs())).setName(launch.name).setDone(done).setOf(of)
                 .build().toByteString());
     }
 
-    /** Publish a message of this component's own. The envelope is its name, or begins with that and an underscore. */
+    /** Publish a message defined by this component. The envelope is the message's name, or begins with it and an underscore. */
     public void publish(String envelope, byte[] message) {
         if (publisher == null) {
             throw new ConfigException(launch.name + " was given no address to publish on: say what it `publishes`");
@@ -346,7 +346,7 @@ public final class Experiment implements AutoCloseable {
         publisher.publish(envelope, message, timeNs());
     }
 
-    /** Send one request as it is, repeated with its id until it is answered; for what has no method of its own. */
+    /** Send a request for which there is no method, repeated with its id until it is answered. */
     public Response request(int number, byte[] object) {
         return link.requests.ask(number, object, Long.MAX_VALUE);
     }
@@ -356,7 +356,7 @@ public final class Experiment implements AutoCloseable {
         Link.LOG.info(text);
     }
 
-    /** Leave the experiment; control that is held is given back. */
+    /** Leave the experiment, and release control. */
     @Override
     public void close() {
         if (launch.sockets.control != null) {

@@ -1,6 +1,6 @@
 package afspm.client;
 
-/** There is nothing more to ask. */
+/** The experiment has ended: the scheduler takes no more requests. */
 public class ExperimentEndedException extends AfspmException {
     public ExperimentEndedException(String what) {
         super(what);

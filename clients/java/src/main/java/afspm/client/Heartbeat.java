@@ -10,7 +10,7 @@ import org.zeromq.SocketType;
 import org.zeromq.ZContext;
 import org.zeromq.ZMQ;
 
-/** Heartbeats: a thread of its own says that this process is alive, and for how long its current step has been running. */
+/** Heartbeats: a separate thread reports that this process is alive, and the age of its current step. */
 final class Heartbeat implements AutoCloseable {
     private static final byte ALIVE = 0;
     private static final byte CLOSING = 1;
@@ -22,8 +22,8 @@ final class Heartbeat implements AutoCloseable {
     private final Thread thread;
 
     /**
-     * @param stepAgeS for how many seconds the current step has been running; 0 when idle
-     * @param longestStepS how many seconds a step may take before the process counts as frozen
+     * @param stepAgeS age of the current step, in s; 0 when idle
+     * @param longestStepS longest step, in s; a process in a longer step counts as frozen
      */
     Heartbeat(Launch launch, DoubleSupplier stepAgeS, double longestStepS) {
         this.launch = launch;
@@ -34,7 +34,7 @@ final class Heartbeat implements AutoCloseable {
         thread.start();
     }
 
-    /** Say that this process closes on purpose. */
+    /** Send the closing beat: the process ends on purpose. */
     @Override
     public void close() {
         closing.countDown();

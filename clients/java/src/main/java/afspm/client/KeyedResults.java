@@ -22,22 +22,22 @@ final class KeyedResults {
     private static final Gson GSON = new Gson();
     private static final int LONGEST_KEY = 100;
 
-    /** What was asked for and not finished yet. */
+    /** A measurement that was requested and is not finished. */
     static final class Intent {
         String key;
         String facts;
         int attempt;
-        /** What was published until then is older. */
+        /** Packets up to this time belong to earlier measurements. */
         long sinceNs;
         List<String> interruptions;
-        /** What the target is made of: a region and shape, or a place and kind. */
+        /** The parts of the target: region and shape, or position and kind. */
         double[] place;
         int rows;
         int columns;
         String kind;
     }
 
-    /** What is kept of a measurement; the messages of its packets follow in the file. */
+    /** The header of a stored measurement; the messages of its packets follow in the file. */
     static final class Kept {
         String key;
         String facts;
@@ -51,14 +51,14 @@ final class KeyedResults {
     private final Path folder;
     private Intent pending;
 
-    /** @param stateDir of the run; empty: nothing is kept over a restart */
+    /** @param stateDir of the run; empty: no measurement survives a restart */
     KeyedResults(String stateDir, String name) {
         folder = stateDir.isEmpty() ? null : Paths.get(stateDir, name + ".keyed");
         byte[] text = folder == null ? null : readOrNothing(folder.resolve("pending.json"));
         pending = text == null ? null : GSON.fromJson(new String(text, StandardCharsets.UTF_8), Intent.class);
     }
 
-    /** Return the intent that was written down and not fulfilled; null if there is none. */
+    /** Return the stored intent without a result; null if there is none. */
     Intent pending() {
         return pending;
     }
@@ -70,7 +70,7 @@ final class KeyedResults {
         }
     }
 
-    /** Return what an earlier life, or an earlier call, measured; null if there is nothing. */
+    /** Return the result of an earlier life or an earlier call; null if there is none. */
     Kept find(String key, String facts) {
         byte[] bytes = folder == null ? null : readOrNothing(path(key));
         if (bytes == null) {
@@ -138,7 +138,7 @@ final class KeyedResults {
         }
     }
 
-    /** Write a file as a whole, or not at all, and see it on the disk. */
+    /** Write a file atomically, and flush it to the disk. */
     private static void write(Path file, List<byte[]> parts) {
         Path made = file.resolveSibling(file.getFileName() + ".new");
         try {

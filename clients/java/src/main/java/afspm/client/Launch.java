@@ -17,7 +17,7 @@ import java.util.Map;
 import javax.crypto.Mac;
 import javax.crypto.spec.SecretKeySpec;
 
-/** The launch line: one line of JSON from which a program learns its part in an experiment. */
+/** The launch line: one line of JSON that describes a program's part in an experiment. */
 public final class Launch {
     private static final Gson GSON = new Gson();
 
@@ -45,7 +45,7 @@ public final class Launch {
     @SerializedName("sample_coordinates")
     boolean sampleCoordinates;
 
-    /** The addresses of this process; null where there is none. */
+    /** The addresses of this process; null for sockets that it does not use. */
     static final class Sockets {
         String publish;
         List<String> subscribe = Collections.emptyList();
@@ -53,14 +53,14 @@ public final class Launch {
         String heartbeat;
     }
 
-    /** The CURVE pair of this process, and whose key to expect at which address; keys as Z85 text. */
+    /** The CURVE key pair of this process, and the owner of the key at each address; keys as Z85 text. */
     static final class Keys {
         @SerializedName("public")
         String publicKey;
         String secret;
         /** The names of their owners, by public key. */
         Map<String, String> peers = new HashMap<>();
-        /** The names of who binds them, by address. */
+        /** The names of their binders, by address. */
         Map<String, String> servers = new HashMap<>();
         /** Whether every socket is encrypted. */
         boolean everywhere;
@@ -99,8 +99,8 @@ public final class Launch {
     /**
      * Return the launch line of a guest that joins a running experiment.
      *
-     * @param where the folder of the run, or the folder of all runs: the newest is meant
-     * @param name what others see as the holder of control
+     * @param where the folder of a run, or of all runs: then the newest one
+     * @param name the name shown as the holder of control
      */
     public static Launch ofGuest(String where, String name) {
         try {
@@ -146,7 +146,7 @@ public final class Launch {
         return Collections.unmodifiableMap(settings);
     }
 
-    /** Return a setting that is a number. */
+    /** Return a setting as a number. */
     public double number(String setting) {
         Object value = settings.get(setting);
         if (value instanceof Number) {
@@ -164,7 +164,7 @@ public final class Launch {
         return simulated;
     }
 
-    /** Return the identity of a socket that asks in our name: the same in every life and, where there are keys, secret. */
+    /** Return the identity of this component's request socket: the same in every life, and secret if there are keys. */
     byte[] routingId() {
         if (keys == null) {
             return name.getBytes(StandardCharsets.UTF_8);

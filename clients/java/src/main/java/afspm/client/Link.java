@@ -23,8 +23,8 @@ import org.zeromq.ZContext;
 import org.zeromq.ZMQ;
 
 /**
- * A component's connections to its experiment, and the newest of each state that was published. One thread owns the
- * sockets; all that it brings is guarded by this object's monitor, on which the others wait.
+ * A component's connections to its experiment, and the newest of each published state. One thread owns the
+ * sockets; this object's monitor guards everything it receives, and other threads wait on it.
  */
 final class Link implements AutoCloseable {
     static final Logger LOG = Logger.getLogger("afspm");
@@ -69,14 +69,14 @@ final class Link implements AutoCloseable {
         thread.setDaemon(true);
     }
 
-    /** Begin to receive, once all listeners are there. */
+    /** Begin to receive; call it after all listeners were added. */
     void start() {
         thread.start();
     }
 
     // --- waiting ---
 
-    /** Wait until a condition holds, tried whenever something has arrived; false if the deadline comes first. */
+    /** Wait until a condition holds, tested after each arrival; return false if the deadline comes first. */
     synchronized boolean await(BooleanSupplier condition, long deadline) {
         waiting += 1;
         try {
@@ -102,7 +102,7 @@ final class Link implements AutoCloseable {
         }
     }
 
-    /** Wait while the scheduler is away for as long as that lasts, else for {@code withinS} at most. */
+    /** Wait without limit while the scheduler is away, otherwise for at most {@code withinS}. */
     boolean awaitConnected(BooleanSupplier done, double withinS, long deadline) {
         while (!holds(done)) {
             if (!await(() -> requests.isConnected() || done.getAsBoolean(), deadline)) {
@@ -116,7 +116,7 @@ final class Link implements AutoCloseable {
         return true;
     }
 
-    /** Wait until all that the scheduler has cached is here. */
+    /** Wait until all packets of the scheduler's cache have arrived. */
     void awaitCaughtUp(long deadline) {
         if (launch.sockets.subscribe.isEmpty()) {
             return;
@@ -130,23 +130,23 @@ final class Link implements AutoCloseable {
         return condition.getAsBoolean();
     }
 
-    /** Change something that others wait for. */
+    /** Change the state and wake all waiting threads. */
     synchronized void change(Runnable what) {
         what.run();
         notifyAll();
     }
 
-    /** There is nothing more to wait for. */
+    /** End all waiting, with a reason. */
     void fail(RuntimeException reason) {
         change(() -> over = over == null ? reason : over);
     }
 
-    /** Return why there is nothing more to wait for; null while there is. */
+    /** Return the reason why waiting has ended; null while it may go on. */
     synchronized RuntimeException over() {
         return over;
     }
 
-    /** Return for how many seconds nothing has been waited for. */
+    /** Return the time since the last wait, in s. */
     synchronized double stepAgeS() {
         return waiting > 0 ? 0 : (System.nanoTime() - busySince) * 1e-9;
     }
@@ -173,7 +173,7 @@ final class Link implements AutoCloseable {
         return (double[]) newest.get("ProbePosition");
     }
 
-    /** Return how often a message has been published. */
+    /** Return the number of received packets of a message. */
     synchronized int count(String message) {
         return counts.getOrDefault(message, 0);
     }
@@ -183,7 +183,7 @@ final class Link implements AutoCloseable {
         return newestNs;
     }
 
-    /** Whether the experiment file says that this component listens to an envelope. */
+    /** Whether the experiment file lists an envelope for this component. */
     boolean isListenedTo(String envelope) {
         return launch.envelopes == null || launch.envelopes.stream().anyMatch(envelope::startsWith);
     }
@@ -198,7 +198,7 @@ final class Link implements AutoCloseable {
         post(control::reconnect);
     }
 
-    /** Send what waits, and close. */
+    /** Send the waiting requests, and close. */
     @Override
     public void close() {
         isClosed = true;
@@ -242,7 +242,7 @@ final class Link implements AutoCloseable {
         }
     }
 
-    /** Do what was asked for, and take all that has come. */
+    /** Carry out pending tasks, and process all received frames. */
     private void turn() throws IOException {
         ByteBuffer wakes = ByteBuffer.allocate(256);
         while (wakeUp.source().read(wakes) > 0) {
@@ -263,7 +263,7 @@ final class Link implements AutoCloseable {
         }
     }
 
-    /** Return the prefixes to subscribe to: what the file says, and what commands and measurements follow. */
+    /** Return the prefixes to subscribe to: those of the experiment file, and those that commands and measurements need. */
     private List<String> wanted() {
         if (launch.envelopes == null || launch.sockets.control == null) {
             return launch.envelopes;

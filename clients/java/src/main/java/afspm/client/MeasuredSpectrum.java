@@ -2,7 +2,7 @@ package afspm.client;
 
 import java.util.List;
 
-/** A spectrum, and what interrupted it before it was taken. */
+/** A spectrum, and the reasons of earlier interruptions. */
 public final class MeasuredSpectrum {
     private final Measurements.Measured<Spectrum> measured;
 

@@ -1,6 +1,6 @@
 package afspm.client;
 
-/** The microscope fails again and again at the same measurement: a person should look. */
+/** The same measurement failed repeatedly without a known reason: a person has to look. */
 public class MeasurementFailedException extends AfspmException {
     public MeasurementFailedException(String what) {
         super(what);

@@ -11,12 +11,12 @@ import java.util.Map;
 import java.util.Set;
 import java.util.function.BiConsumer;
 
-/** Takes scans and spectra over one link, one at a time, whatever gets in between, each exactly once. */
+/** Takes scans and spectra over one link, one at a time and each exactly once, over interruptions and restarts. */
 final class Measurements {
-    private static final double BEGUN_WITHIN_S = 5; // from the success of the action to the state that says so
-    private static final int MOST_FAILURES = 5; // in a row, that nothing explains: then a person should look
+    private static final double BEGUN_WITHIN_S = 5; // from the success of the action to its published state
+    private static final int MOST_FAILURES = 5; // in a row without a known reason, before a person has to look
 
-    /** What was measured, and what interrupted it, for a person. */
+    /** A result, and the reasons of interruptions, for a person. */
     static final class Measured<T> {
         final List<T> things;
         final List<String> interruptions;
@@ -27,7 +27,7 @@ final class Measurements {
         }
     }
 
-    /** A cycle that takes in what the scheduler publishes, until it is closed. */
+    /** A cycle that receives the scheduler's packets until it is closed. */
     private final class Watch<T> {
         final Cycle<T> cycle;
         private final BiConsumer<Packet, Boolean> listener;
@@ -80,7 +80,7 @@ final class Measurements {
             this.deadline = deadline;
         }
 
-        /** Return the id of the action that begins it: another in every attempt, the same in every life. */
+        /** Return the id of the action that starts the measurement: different for each attempt, equal in every life. */
         String id() {
             return stem + "/" + attempt;
         }
@@ -109,12 +109,12 @@ final class Measurements {
         this.commands = commands;
         this.results = new KeyedResults(link.launch.stateDir, link.launch.name);
         KeyedResults.Intent intent = results.pending();
-        if (intent != null) { // watch, from the first packet on, for what an earlier life asked for and did not get
+        if (intent != null) { // follow from the first packet on the measurement that an earlier life requested
             unfinished = new Watch<>(target(intent), intent.sinceNs, true);
         }
     }
 
-    /** Measure until there is a complete result; with a key, once in all lives of the component. */
+    /** Measure until the result is complete; with a key, once in all lives of the component. */
     <T> Measured<T> take(Target<T> target, String key, long deadline) {
         if (key != null) {
             KeyedResults.check(key);
@@ -128,7 +128,7 @@ final class Measurements {
         begin();
         Task<T> task = new Task<>(target, key, deadline);
         try {
-            link.awaitCaughtUp(deadline); // what is cached must not be taken for ours
+            link.awaitCaughtUp(deadline); // cached results must not count as new ones
             takeUp(task);
             Map<String, T> found = finish(task);
             channels.put(target.what, new HashSet<>(found.keySet()));
@@ -140,7 +140,7 @@ final class Measurements {
             return new Measured<>(new ArrayList<>(found.values()), task.interruptions);
         } catch (RuntimeException error) {
             if (key != null && task.watch != null && !task.watch.isOver()) {
-                unfinished = task.watch; // what becomes of it is taken up by its key
+                unfinished = task.watch; // its key leads to the result later
                 task.watch = null;
             }
             throw error;
@@ -159,14 +159,14 @@ final class Measurements {
         }
     }
 
-    /** Continue what an earlier life, or an earlier call, was at, if it was this. */
+    /** Continue this measurement if an earlier life or call had started it. */
     @SuppressWarnings("unchecked") // the facts say that the watch is one for this target
     private <T> void takeUp(Task<T> task) {
         KeyedResults.Intent intent = results.pending();
         Watch<?> watch = unfinished;
         if (task.key == null && watch != null) {
             if (watch.isBegun()) {
-                link.await(watch::isOver, task.deadline); // what comes now is not of this
+                link.await(watch::isOver, task.deadline); // later results belong to another measurement
             }
             watch.close();
             unfinished = watch.isOver() ? watch : null;
@@ -179,7 +179,7 @@ final class Measurements {
             }
             return;
         }
-        task.attempt = intent.attempt; // ids of attempts before are answered, not executed
+        task.attempt = intent.attempt; // ids of earlier attempts are answered, not executed
         task.interruptions = new ArrayList<>(intent.interruptions);
         task.watch = (Watch<T>) watch;
     }
@@ -196,7 +196,7 @@ final class Measurements {
         return control.hold(() -> measure(task), 0, task.deadline).results;
     }
 
-    /** Attempt after attempt, until one is complete. */
+    /** Repeat attempts until one is complete. */
     private <T> Cycle<T> measure(Task<T> task) {
         if (task.watch != null && task.watch.isOver() && task.watch.cycle.outcome() != Cycle.Outcome.COMPLETED) {
             task.dropWatch();
@@ -214,13 +214,13 @@ final class Measurements {
     }
 
     /**
-     * Prepare and begin once, and follow to the end. What was left without an answer when control was lost, or asked for
-     * in an earlier life, is asked for with the same id, so that it is not executed twice.
+     * Prepare and start once, and follow to the end. A request left unanswered when control was lost, or sent in an earlier
+     * life, is repeated with the same id, so that it is not executed twice.
      */
     private <T> void attempt(Task<T> task) {
         control.regain(task.deadline);
         if (task.watch != null && task.watch.isOver()) {
-            return; // it had begun, and ended while control was waited for
+            return; // it had started, and ended during the wait for control
         }
         boolean isNew = task.watch == null;
         if (isNew) {
@@ -241,7 +241,7 @@ final class Measurements {
             return;
         }
         if (response.isUnanswered() || (!isNew && response.isNotInControl())) {
-            link.change(watch.cycle::controlWasLost); // it may have begun
+            link.change(watch.cycle::controlWasLost); // it may have started
         } else {
             task.dropWatch();
         }
@@ -250,11 +250,11 @@ final class Measurements {
         } catch (RefusedException error) {
             if (isNew) {
                 throw error;
-            } // what was refused to an earlier life is asked for with another id
+            } // a request refused to an earlier life needs another id
         }
     }
 
-    /** From the success of the action to the end of it. */
+    /** Follow a measurement from the success of its action to its end. */
     private <T> void follow(Task<T> task, Watch<T> watch) {
         if (!link.awaitConnected(() -> watch.isBegun() || watch.isOver(), BEGUN_WITHIN_S, task.deadline)) {
             link.change(watch.cycle::vanish);
@@ -263,7 +263,7 @@ final class Measurements {
         }
     }
 
-    /** Whether the result is complete; else note why not, before the next attempt. */
+    /** Whether the result is complete; otherwise note the reason for the next attempt. */
     private <T> boolean isDone(Task<T> task, Cycle<T> cycle) {
         String what = task.target.what;
         Set<String> missing = new HashSet<>(channels.getOrDefault(what, new HashSet<>()));
@@ -273,12 +273,12 @@ final class Measurements {
             return true;
         }
         if (isCompleted) {
-            channels.remove(what); // the same again: then these are not recorded any more
+            channels.remove(what); // missing again: these channels are no longer recorded
         }
         String why = isCompleted ? "without " + missing + ", which it had before" : whyFailed(cycle);
         task.interruptions.add(why);
         Link.LOG.warning(what + " interrupted: " + why + "; retrying");
-        task.failures = control.isHeld() ? task.failures + 1 : 0; // losing control explains itself and is waited for
+        task.failures = control.isHeld() ? task.failures + 1 : 0; // a loss of control is a known reason
         if (task.failures >= MOST_FAILURES) {
             throw new MeasurementFailedException("the " + what + " failed " + task.failures + " times: " + why);
         }
@@ -299,7 +299,7 @@ final class Measurements {
         }
     }
 
-    /** Set what a target needs, unless it is set. */
+    /** Set the parameters of a target that differ from those in force. */
     private void prepare(Target<?> target, long deadline) {
         if (target instanceof Target.OfScan) {
             prepareScan((Target.OfScan) target, deadline);
@@ -318,14 +318,14 @@ final class Measurements {
         ScanParameters wanted = target.wanted;
         ScanParameters now = link.scanParameters();
         boolean isRounded = roundedFacts.equals(target.facts) && now != null && now.equals(rounded);
-        // in sample coordinates the same region is another place of the tip a while later
+        // in sample coordinates the tip position of a region changes with time
         boolean isFixed = !target.moves || wanted.region() == null;
         boolean isNothing = wanted.region() == null && wanted.rows() == 0;
         if (isNothing || (isFixed && (wanted.isSetBy(now, Target.SAME) || isRounded))) {
             return;
         }
         commands.set(ControlRequest.REQ_SET_SCAN_PARAMS_VALUE, wanted.toWire().toByteArray(), "ScanParameters2d", deadline);
-        // a controller may round: then this is what our wish looks like when it is set
+        // a controller may round: this is the requested value after rounding
         rounded = link.scanParameters();
         roundedFacts = wanted.isSetBy(rounded, Target.FITS) ? target.facts : "";
     }

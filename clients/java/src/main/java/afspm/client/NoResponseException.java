@@ -2,7 +2,7 @@ package afspm.client;
 
 import afspm.Control.ControlResponse;
 
-/** Nobody answered, or not in time. */
+/** No answer arrived in time. */
 public class NoResponseException extends RequestException {
     NoResponseException(String what, String reason, int detail) {
         super(what, ControlResponse.REP_NO_RESPONSE_VALUE, reason, detail);

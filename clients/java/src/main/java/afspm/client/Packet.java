@@ -6,7 +6,7 @@ import java.nio.charset.StandardCharsets;
 import java.util.ArrayList;
 import java.util.List;
 
-/** What was published: a message under its envelope. */
+/** A published message with its envelope. */
 public final class Packet {
     private static final int LONGEST_ENVELOPE = 1000;
 
@@ -64,25 +64,25 @@ public final class Packet {
         return payload;
     }
 
-    /** Return when it was first published, ns since the Unix epoch; 0 where the publisher does not say. */
+    /** Return the time of its first publication, ns since the Unix epoch; 0 if unknown. */
     public long timeNs() {
         return timeNs;
     }
 
     /**
      * Return a {@link Scan}, {@link Spectrum}, {@link ScanLines}, {@link ScanParameters}, {@link ControlState}, a place
-     * of the probe as {x, y}, a {@code ScopeState} or {@code ZCtrlParameters}; null if it is of another kind.
+     * of the probe as {x, y}, a {@code ScopeState} or {@code ZCtrlParameters}; null for other messages.
      */
     public Object value() {
         return value;
     }
 
-    /** Return the scan in this packet; null if it is none. */
+    /** Return the scan in this packet; null if it contains none. */
     public Scan scan() {
         return value instanceof Scan ? (Scan) value : null;
     }
 
-    /** Return the spectrum in this packet; null if it is none. */
+    /** Return the spectrum in this packet; null if it contains none. */
     public Spectrum spectrum() {
         return value instanceof Spectrum ? (Spectrum) value : null;
     }

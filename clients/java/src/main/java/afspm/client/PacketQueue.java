@@ -4,7 +4,7 @@ import java.util.ArrayDeque;
 import java.util.Queue;
 import java.util.function.BiConsumer;
 
-/** What is published from now on, oldest first, until this is closed. */
+/** Packets published from its creation until it is closed, oldest first. */
 public final class PacketQueue implements AutoCloseable {
     private final Link link;
     private final Queue<Packet> packets = new ArrayDeque<>();
@@ -20,19 +20,19 @@ public final class PacketQueue implements AutoCloseable {
         link.listeners.add(listener);
     }
 
-    /** Return the next packet, as soon as there is one; throws ExperimentEndedException when there will be none. */
+    /** Wait for the next packet and return it; throws ExperimentEndedException at the end of the experiment. */
     public Packet take() {
         return poll(Double.POSITIVE_INFINITY);
     }
 
-    /** Return the next packet; null if none comes within so many seconds. */
+    /** Return the next packet; null if none arrives within the timeout, in s. */
     public Packet poll(double timeoutS) {
         synchronized (link) {
             return !packets.isEmpty() || link.await(() -> !packets.isEmpty(), Time.deadline(timeoutS)) ? packets.poll() : null;
         }
     }
 
-    /** Return the oldest packet that is there and begins so, and remove it; null if there is none. */
+    /** Remove and return the oldest packet with this prefix; null if there is none. */
     public Packet pollBeginningWith(String prefix) {
         synchronized (link) {
             Packet found = packets.stream().filter(packet -> packet.envelope().startsWith(prefix)).findFirst().orElse(null);

@@ -5,7 +5,7 @@ import java.util.Locale;
 import java.util.Map;
 import java.util.TreeMap;
 
-/** The problems that an experiment knows: those of the wire, and those that its file adds. */
+/** The problems of an experiment: those of the wire format, and those added by its file. */
 final class ProblemNames {
     private final Map<String, Integer> numbers = new TreeMap<>();
 
@@ -27,7 +27,7 @@ final class ProblemNames {
         return number;
     }
 
-    /** "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" as "tip-shape-changed". */
+    /** Return Return "EP_TIP_SHAPE_CHANGED" and "Tip shape changed" as "tip-shape-changed". */
     private static String plain(String name) {
         return name.trim().toLowerCase(Locale.ROOT).replaceAll("[_ ]", "-").replaceAll("^ep-", "");
     }

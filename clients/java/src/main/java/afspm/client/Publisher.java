@@ -35,7 +35,7 @@ final class Publisher implements AutoCloseable {
         context.close();
     }
 
-    /** Answer ZeroMQ's question whether a key may come in (RFC 27): those of the launch line may. */
+    /** Answer ZeroMQ's authentication requests (RFC 27): accept the keys of the launch line. */
     private void letInPeers(Launch.Keys keys) {
         ZMQ.Socket guard = context.createSocket(SocketType.REP);
         guard.setLinger(0);
@@ -53,7 +53,7 @@ final class Publisher implements AutoCloseable {
                             utf8(owner == null ? "this key is not known" : ""), utf8(owner == null ? "" : owner), utf8("")));
                 }
             } catch (RuntimeException closed) {
-                Link.LOG.fine("nobody is let in any more: " + closed);
+                Link.LOG.fine("no more connections are accepted: " + closed);
             }
         }, "guard");
         thread.setDaemon(true);

@@ -6,7 +6,7 @@ import afspm.Geometry.Size2d;
 import afspm.Scan.SpatialAspects;
 import java.util.Locale;
 
-/** A rectangle turned about its centre; x grows to the right, y upwards. */
+/** A rectangle rotated about its centre; x points right, y up. */
 public final class Region {
     private final double xM;
     private final double yM;
@@ -14,18 +14,18 @@ public final class Region {
     private final double heightM;
     private final double angleRad;
 
-    /** A rectangle that is not turned, by its centre and size in metres. */
+    /** Create an unrotated rectangle from its centre and size in metres. */
     public Region(double xM, double yM, double widthM, double heightM) {
         this(xM, yM, widthM, heightM, 0);
     }
 
     /**
-     * A rectangle by its centre and size.
+     * Create a rectangle from its centre and size.
      *
      * @param xM the centre, in metres
      * @param yM the centre, in metres
-     * @param widthM in metres, before it is turned; above zero
-     * @param heightM in metres, before it is turned; above zero
+     * @param widthM in metres, before the rotation; above zero
+     * @param heightM in metres, before the rotation; above zero
      * @param angleRad counter-clockwise, in radians
      * @throws InvalidValueException a value is not finite, or a size not above zero
      */
@@ -65,7 +65,7 @@ public final class Region {
         return angleRad;
     }
 
-    /** Return the place in metres that lies at (u, v) of the sides, each from -0.5 to 0.5, as {x, y}. */
+    /** Return the position in metres, as {x, y}, at the fractions (u, v) of the sides, each from -0.5 to 0.5. */
     public double[] placeM(double u, double v) {
         double cos = Math.cos(angleRad);
         double sin = Math.sin(angleRad);
@@ -81,7 +81,7 @@ public final class Region {
         return new Region(other.xM, other.yM, widthM, heightM, angleRad);
     }
 
-    /** Whether two regions differ by less than {@code tolerance} of their size everywhere. */
+    /** Whether all corners of two regions differ by less than {@code tolerance} of their size. */
     boolean isNear(Region other, double tolerance) {
         double size = Math.hypot(widthM, heightM);
         double turned = Math.IEEEremainder(angleRad - other.angleRad, 2 * Math.PI);
@@ -105,7 +105,7 @@ public final class Region {
                 .build();
     }
 
-    /** Return the region of a message; null if that does not give all of it. */
+    /** Return the region of a message; null if it is incomplete. */
     static Region of(SpatialAspects spatial) {
         RotRect2d roi = spatial.getRoi();
         Point2d corner = roi.getTopLeft();

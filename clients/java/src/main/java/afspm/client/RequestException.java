@@ -1,6 +1,6 @@
 package afspm.client;
 
-/** The base of what may come of a request. */
+/** Base of the errors of a request. */
 public class RequestException extends AfspmException {
     private final int code;
     private final String reason;
@@ -23,7 +23,7 @@ public class RequestException extends AfspmException {
         return Response.name(code);
     }
 
-    /** Return why, for a person. */
+    /** Return the reason, for a person. */
     public String reason() {
         return reason;
     }

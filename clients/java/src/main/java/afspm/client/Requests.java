@@ -5,16 +5,16 @@ import java.util.HashMap;
 import java.util.List;
 import java.util.Map;
 
-/** Asks the scheduler: each request has an id, is repeated with it until it is answered, and is executed once. */
+/** Sends requests to the scheduler: each has an id, is repeated with it until it is answered, and is executed once. */
 final class Requests {
     static final byte[] NOTHING = {};
-    /** Longer than the scheduler waits for the microscope: what it says then is an answer. */
+    /** Longer than the scheduler waits for the microscope, so that its NO_RESPONSE arrives before the timeout. */
     private static final double LONGER_THAN_THE_SCHEDULER = 1.2;
 
     private final Link link;
     private final Launch launch;
     private final String session;
-    private final Map<String, Response> answers = new HashMap<>(); // null: not yet there
+    private final Map<String, Response> answers = new HashMap<>(); // null: not yet received
     private int requests;
     private boolean isConnected;
     private int connections;
@@ -26,7 +26,7 @@ final class Requests {
         session = launch.run.isEmpty() ? life : launch.run + "-" + life;
     }
 
-    /** Return an id for a request, not used before in any life of this component. */
+    /** Return an id for a request, unique over all lives of this component. */
     String nextId() {
         synchronized (link) {
             return launch.name + "/" + session + "/" + ++requests;
@@ -39,21 +39,21 @@ final class Requests {
         }
     }
 
-    /** Return how often a connection was made. */
+    /** Return the number of connections so far. */
     int connections() {
         synchronized (link) {
             return connections;
         }
     }
 
-    /** Whether the connection was lost since there were so many. */
+    /** Whether the connection was replaced since a number of connections. */
     boolean isChangedSince(int before) {
         synchronized (link) {
             return !isConnected || connections != before;
         }
     }
 
-    /** Send a request whose answer is not waited for. */
+    /** Send a request without waiting for its answer. */
     void sendOnly(int number) {
         if (isConnected()) {
             link.send(Wire.request(number, NOTHING, nextId()));
@@ -64,7 +64,7 @@ final class Requests {
         return ask(number, object, nextId(), deadline);
     }
 
-    /** Ask, and wait for the answer, whatever it is. */
+    /** Send a request and return its answer, also a refusal. */
     Response ask(int number, byte[] object, String id, long deadline) {
         if (launch.sockets.control == null) {
             throw new ConfigException(launch.name + " was given no scheduler to ask");
@@ -87,7 +87,7 @@ final class Requests {
                 if (Time.isOver(deadline)) {
                     break;
                 }
-                if (!isChangedSince(before)) { // a restart of the scheduler is no silence of it
+                if (!isChangedSince(before)) { // a restart of the scheduler does not count as silence
                     tries += 1;
                     link.reconnect();
                     link.await(() -> isChangedSince(before), Time.deadline(1));
@@ -99,7 +99,7 @@ final class Requests {
         throw new NoResponseException("request " + number, "it was not answered; it may or may not have been carried out", Response.OUTCOME_UNKNOWN);
     }
 
-    /** Ask the scheduler itself for something that needs no control; anything but success is thrown. */
+    /** Send a request that needs no control; anything but success is thrown. */
     Response order(String what, int number, byte[] object) {
         Response response = ask(number, object, Long.MAX_VALUE);
         if (!response.ok()) {
@@ -113,7 +113,7 @@ final class Requests {
             isConnected = isThere;
             connections += isThere ? 1 : 0;
         });
-        sendOnly(Wire.CLOCK_REQUEST); // says by its id who asks, and which run is ours
+        sendOnly(Wire.CLOCK_REQUEST); // its id contains the client's name and run
     }
 
     void onResponse(Response response) {
@@ -122,7 +122,7 @@ final class Requests {
             return;
         }
         link.change(() -> {
-            if (answers.containsKey(response.id())) { // else it is late: it was given up on
+            if (answers.containsKey(response.id())) { // otherwise a late answer to a request that was given up
                 answers.put(response.id(), response);
             }
         });

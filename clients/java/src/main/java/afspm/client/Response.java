@@ -7,7 +7,7 @@ import java.util.List;
 
 /** The answer to a request. */
 public final class Response {
-    /** Details: what a program must know beside the code. */
+    /** Details for programs, beside the code. */
     public static final int NOT_SENT = 1;
     public static final int OUTCOME_UNKNOWN = 2;
     public static final int EXPERIMENT_ENDED = 3;
@@ -28,7 +28,7 @@ public final class Response {
         this.detail = detail;
     }
 
-    /** Decode one to five frames; those that a newer peer appends are ignored. */
+    /** Decode one to five frames; frames appended by a newer peer are ignored. */
     static Response decode(List<byte[]> frames) {
         if (frames.isEmpty() || frames.get(0).length != 1) {
             throw new WireException("a response whose first frame is not one byte");
@@ -38,7 +38,7 @@ public final class Response {
                 detail.length == 0 ? 0 : detail[0] & 0xff);
     }
 
-    /** Return [code] and, where there is any of it, [object, reason, id, detail]. */
+    /** Return the frames [code, object, reason, id, detail], without empty frames at the end. */
     List<byte[]> encode() {
         List<byte[]> frames = new ArrayList<>();
         frames.add(new byte[] {(byte) code});
@@ -52,7 +52,7 @@ public final class Response {
         return frames;
     }
 
-    /** Return the same with another code. */
+    /** Return a copy with another code. */
     Response as(int other) {
         return new Response(other, object, reason, id, detail);
     }
@@ -62,17 +62,17 @@ public final class Response {
         return code;
     }
 
-    /** Return an object in bytes, such as the {@code ParameterMsg} in force; mostly empty. */
+    /** Return the object in bytes, such as the {@code ParameterMsg} in force; empty for most responses. */
     public byte[] object() {
         return object;
     }
 
-    /** Return why it is no success, for a person. */
+    /** Return the reason of a failure, for a person. */
     public String reason() {
         return reason;
     }
 
-    /** Return the id of the request that it answers; empty if that had none. */
+    /** Return the id of the answered request; empty if the request had none. */
     public String id() {
         return id;
     }
@@ -85,17 +85,17 @@ public final class Response {
         return code == ControlResponse.REP_SUCCESS_VALUE;
     }
 
-    /** Whether it is not known if the microscope has carried out what it was asked for. */
+    /** Whether the outcome of the request is unknown. */
     boolean isUnanswered() {
         return code == ControlResponse.REP_NO_RESPONSE_VALUE || detail == NOT_SENT || detail == OUTCOME_UNKNOWN;
     }
 
-    /** Whether it says that control is not ours. */
+    /** Whether the request was refused because the client is not in control. */
     boolean isNotInControl() {
         return code == ControlResponse.REP_NOT_IN_CONTROL_VALUE || code == ControlResponse.REP_WRONG_CONTROL_MODE_VALUE;
     }
 
-    /** Return the name of a response, such as "REP_PARAM_ERROR"; of one without a name the number. */
+    /** Return the name of a response, such as "REP_PARAM_ERROR", or its number if it has none. */
     public static String name(int code) {
         ControlResponse known = ControlResponse.forNumber(code);
         return known == null ? String.valueOf(code) : known.name();

@@ -46,7 +46,7 @@ public final class Scan {
         }
     }
 
-    /** Return where it was taken. */
+    /** Return the region of the scan. */
     public Region region() {
         return region;
     }
@@ -59,7 +59,7 @@ public final class Scan {
         return columns;
     }
 
-    /** Return its name, such as "Height Retrace". */
+    /** Return the name of the channel, such as "Height Retrace". */
     public String channel() {
         return channel;
     }
@@ -69,7 +69,7 @@ public final class Scan {
         return unit;
     }
 
-    /** Return the values, row after row, x and y ascending: a read-only view of the bytes that were received. */
+    /** Return the values, row after row, x and y ascending: a read-only view of the received bytes. */
     public DoubleBuffer values() {
         return values.duplicate();
     }
@@ -89,7 +89,7 @@ public final class Scan {
         return copy;
     }
 
-    /** Return a copy of the values as [row][column], which MATLAB takes for a matrix. */
+    /** Return a copy of the values as [row][column], a matrix in MATLAB. */
     public double[][] toMatrix() {
         double[][] matrix = new double[values.hasRemaining() ? rows : 0][columns];
         DoubleBuffer from = values();
@@ -99,22 +99,22 @@ public final class Scan {
         return matrix;
     }
 
-    /** Return where a pixel lies, in metres, as {x, y}; fractions lie between pixels. */
+    /** Return the position of a pixel in metres, as {x, y}; fractions are positions between pixels. */
     public double[] placeM(double row, double column) {
         return region.placeM(column / Math.max(1, columns - 1) - 0.5, row / Math.max(1, rows - 1) - 0.5);
     }
 
-    /** Return when it was finished, ns since the Unix epoch; 0 if it is not known. */
+    /** Return the time at the end of the scan, ns since the Unix epoch; 0 if unknown. */
     public long timeNs() {
         return timeNs;
     }
 
-    /** Return where the controller saved it; empty if it did not. */
+    /** Return the controller's own file; empty if there is none. */
     public String filename() {
         return filename;
     }
 
-    /** Return the packet that it came in. */
+    /** Return the packet that contained it. */
     public Packet packet() {
         return packet;
     }

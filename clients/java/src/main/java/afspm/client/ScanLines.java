@@ -4,7 +4,7 @@ import com.google.protobuf.InvalidProtocolBufferException;
 import java.nio.ByteBuffer;
 import java.nio.DoubleBuffer;
 
-/** Neighbouring rows of one channel of a scan that is still running. */
+/** Neighbouring rows of one channel of a running scan. */
 public final class ScanLines {
     private static final int VALUES = 4;
 
@@ -39,12 +39,12 @@ public final class ScanLines {
         return parameters;
     }
 
-    /** Return how many rows came. */
+    /** Return the number of rows in this message. */
     public int rows() {
         return values.remaining() / parameters.columns();
     }
 
-    /** Return the index in the whole scan of the first row that came. */
+    /** Return the index of the first row within the whole scan. */
     public int firstRow() {
         return firstRow;
     }
@@ -57,12 +57,12 @@ public final class ScanLines {
         return unit;
     }
 
-    /** Return the values, row after row: a read-only view of the bytes that were received. */
+    /** Return the values, row after row: a read-only view of the received bytes. */
     public DoubleBuffer values() {
         return values.duplicate();
     }
 
-    /** Return when the scan began, ns since the Unix epoch: the same for all its lines. */
+    /** Return the start of the scan, ns since the Unix epoch: equal for all its lines. */
     public long timeNs() {
         return timeNs;
     }

@@ -5,7 +5,7 @@ import afspm.Scan.DataAspects;
 import afspm.Scan.ScanParameters2d;
 import java.util.Objects;
 
-/** Where and in how many pixels the next scan will be taken. */
+/** Region and number of pixels of the next scan. */
 public final class ScanParameters {
     private final Region region;
     private final int rows;
@@ -37,12 +37,12 @@ public final class ScanParameters {
         return message.build();
     }
 
-    /** Return the region; null if it is not known, or left as it is. */
+    /** Return the region; null: unknown or unchanged. */
     public Region region() {
         return region;
     }
 
-    /** Return the rows of pixels; 0 if they are not known, or left as they are. */
+    /** Return the number of rows; 0: unknown or unchanged. */
     public int rows() {
         return rows;
     }
@@ -51,7 +51,7 @@ public final class ScanParameters {
         return columns;
     }
 
-    /** Whether what is in force is what is wanted here, within {@code tolerance} of the size. */
+    /** Whether the parameters in force match these within {@code tolerance} of the size. */
     boolean isSetBy(ScanParameters now, double tolerance) {
         if (now == null || (rows > 0 && (rows != now.rows || columns != now.columns))) {
             return false;

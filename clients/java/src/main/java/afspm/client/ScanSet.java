@@ -29,7 +29,7 @@ public final class ScanSet extends AbstractList<Scan> {
                 .orElseThrow(() -> new InvalidValueException("no channel " + name));
     }
 
-    /** Return what interrupted it before it was taken as it is here. */
+    /** Return the reasons of interruptions before this scan was complete. */
     public List<String> interruptions() {
         return interruptions;
     }

@@ -8,7 +8,7 @@ import org.zeromq.ZEvent;
 import org.zeromq.ZMQ;
 import org.zeromq.ZMonitor;
 
-/** Makes sockets with our options: a lost peer is found within seconds, and looked for again at once. */
+/** Creates sockets with afspm's options: a lost peer is noticed within seconds, and reconnected at once. */
 final class Sockets {
     static final int LINGER_MS = 200;
     private static final int ALIVE_S = 2;
@@ -30,7 +30,7 @@ final class Sockets {
         return socket;
     }
 
-    /** Set the keys for a connection to {@code address}, where it is encrypted. */
+    /** Set the keys for a connection to {@code address} if it is encrypted. */
     static void encrypt(ZMQ.Socket socket, Launch.Keys keys, String address) {
         String serverKey = keys == null ? null : keys.serverKey(address);
         if (serverKey != null) {
@@ -51,7 +51,7 @@ final class Sockets {
         return frames;
     }
 
-    /** Send a whole message; false if nobody is there to take it. */
+    /** Send a whole message; return false if no peer is connected. */
     static boolean send(ZMQ.Socket socket, List<byte[]> frames) {
         for (int i = 0; i < frames.size(); i++) {
             if (!socket.send(frames.get(i), ZMQ.DONTWAIT | (i < frames.size() - 1 ? ZMQ.SNDMORE : 0))) {
@@ -63,7 +63,7 @@ final class Sockets {
 
     /** The connection events of one socket, in the order in which they happened. */
     static final class Monitor {
-        /** JeroMQ 0.6 has no event for the end of the handshake; what is sent from its begin on waits for the end. */
+        /** JeroMQ 0.6 has no event for the end of the handshake; messages sent before it wait for it. */
         private static final ZMonitor.Event BEGUN = ZMonitor.Event.HANDSHAKE_PROTOCOL;
         final ZMQ.Socket socket;
 
@@ -75,7 +75,7 @@ final class Sockets {
             socket.connect(address);
         }
 
-        /** Return whether the connection was made (else lost) by the next event; null if there is none. */
+        /** Return whether the next event is a connection (false: a disconnection); null if there is no event. */
         Boolean next() {
             ZEvent event = ZEvent.recv(socket, ZMQ.DONTWAIT);
             return event == null ? null : (Boolean) (event.getEvent() == BEGUN);

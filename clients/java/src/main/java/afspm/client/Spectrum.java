@@ -48,12 +48,12 @@ public final class Spectrum {
         }
     }
 
-    /** Return the place of the probe in metres, as {x, y}; null if it is not known. */
+    /** Return the position of the probe in metres, as {x, y}; null if unknown. */
     public double[] positionM() {
         return positionM == null ? null : positionM.clone();
     }
 
-    /** Return what was done, such as "IV" or "force". */
+    /** Return the kind of spectroscopy, such as "IV" or "force". */
     public String kind() {
         return kind;
     }
@@ -70,7 +70,7 @@ public final class Spectrum {
         return values.remaining() / Math.max(1, names.size());
     }
 
-    /** Return all variables of the first point, then of the second: a read-only view of the bytes that were received. */
+    /** Return all variables of the first point, then of the second: a read-only view of the received bytes. */
     public DoubleBuffer values() {
         return values.duplicate();
     }
@@ -88,7 +88,7 @@ public final class Spectrum {
         return column;
     }
 
-    /** Return when it was taken, ns since the Unix epoch; 0 if it is not known. */
+    /** Return the time of measurement, ns since the Unix epoch; 0 if unknown. */
     public long timeNs() {
         return timeNs;
     }
@@ -97,7 +97,7 @@ public final class Spectrum {
         return filename;
     }
 
-    /** Return the packet that it came in. */
+    /** Return the packet that contained it. */
     public Packet packet() {
         return packet;
     }

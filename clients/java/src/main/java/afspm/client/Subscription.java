@@ -12,8 +12,8 @@ import org.zeromq.ZContext;
 import org.zeromq.ZMQ;
 
 /**
- * Receives what one publisher publishes: each packet once, and what was missed before anything newer. Unlike SUB, XSUB
- * lets the marker of a replay through as it is. Used by one thread.
+ * Receives the packets of one publisher: each once, and missed packets before newer ones. Unlike SUB, XSUB
+ * sends the marker of a replay unchanged. Used by one thread.
  */
 final class Subscription {
     private static final byte[] KILL = utf8("KILL");
@@ -21,7 +21,7 @@ final class Subscription {
     private static final byte SUBSCRIBE = 1;
     private static final byte UNSUBSCRIBE = 0;
 
-    /** What comes of a subscription. */
+    /** Events of a subscription. */
     interface Listener {
         void onPacket(Packet packet);
 
@@ -44,7 +44,7 @@ final class Subscription {
     private byte[] topic = {};
     private byte[] marker;
 
-    /** @param prefixes of the envelopes wanted; null: all. The signal KILL always comes. */
+    /** @param prefixes of the wanted envelopes; null: all. The signal KILL is always included. */
     Subscription(ZContext context, Launch launch, String address, List<String> prefixes, Listener listener) {
         this.name = launch.name;
         this.address = address;
@@ -61,7 +61,7 @@ final class Subscription {
         socket.connect(address);
     }
 
-    /** After each connection, the first or another: ask for what is newer than the newest that has come. */
+    /** Request packets newer than the newest received one, after each connection. */
     void follow() {
         for (Boolean isThere = monitor.next(); isThere != null; isThere = monitor.next()) {
             if (isThere) {
@@ -83,7 +83,7 @@ final class Subscription {
         }
     }
 
-    /** Else the socket would ask for the same again when the connection is next made. */
+    /** Unsubscribe: otherwise the socket would repeat the request at its next connection. */
     private void forgetMarker() {
         if (marker != null) {
             send(UNSUBSCRIBE, marker);
@@ -102,7 +102,7 @@ final class Subscription {
         byte[] first = frames.get(0);
         if (first.length > 0 && first[0] == 0) {
             if (marker == null || !Arrays.equals(first, topic)) {
-                return; // of an earlier connection, or another's
+                return; // of an earlier connection or another subscriber
             }
             if (frames.size() == 1) {
                 forgetMarker();

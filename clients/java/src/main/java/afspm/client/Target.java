@@ -2,18 +2,18 @@ package afspm.client;
 
 import afspm.Control.ScopeState;
 
-/** A scan or a spectrum as it should be taken, and whether a published result is one. Pure. */
+/** A requested scan or spectrum, and the test whether a published result matches it. Pure. */
 abstract class Target<T> {
-    static final double SAME = 1e-6; // of the size: closer than any controller positions
+    static final double SAME = 1e-6; // of the size: finer than any controller positions
     static final double FITS = 1e-2; // of the size: a controller's rounding, not another region
-    private static final double SPOT_M = 20e-9; // a scanner with sensors reports where the tip was, not where it was sent
-    private static final double MOVED = 0.5; // of the size: where drift is corrected, a scan lies where it turned out to be
-    private static final double SHEARED = 0.1; // of the size: and is as large, and as turned, as it turned out to be
+    private static final double SPOT_M = 20e-9; // a scanner with sensors reports the measured position, not the requested one
+    private static final double MOVED = 0.5; // of the size: with drift correction a scan is published at its registered position
+    private static final double SHEARED = 0.1; // of the size: and with its registered size and angle
 
     final String what;
     final String start;
     final ScopeState busy;
-    /** What it consists of, by which a later life of the component recognises it. */
+    /** The parts by which a later life of the component recognises it. */
     final String facts;
 
     private Target(String what, String start, ScopeState busy, String facts) {
@@ -28,15 +28,15 @@ abstract class Target<T> {
 
     abstract boolean fits(T result);
 
-    /** Return what is there once in a result: the channel of a scan. */
+    /** Return the name of a part of a result: the channel of a scan. */
     abstract String nameOf(T result);
 
     abstract Packet packetOf(T result);
 
-    /** A scan to take; no region, or no rows, leaves what is set. */
+    /** A scan to take; without region or rows, those in force are used. */
     static final class OfScan extends Target<Scan> {
         final ScanParameters wanted;
-        /** Places are those of the sample, and a scan lies where it turned out to have been taken. */
+        /** Positions are in sample coordinates, and a scan is published at its registered position. */
         final boolean moves;
 
         OfScan(ScanParameters wanted, boolean moves) {
@@ -72,7 +72,7 @@ abstract class Target<T> {
         }
     }
 
-    /** A spectrum to take; no place, or no kind, leaves what is set. */
+    /** A spectrum to take; without position or kind, those in force are used. */
     static final class OfSpectrum extends Target<Spectrum> {
         final double[] atM;
         final String kind;
@@ -101,7 +101,7 @@ abstract class Target<T> {
 
         @Override
         String nameOf(Spectrum spectrum) {
-            return ""; // there is one in a result, and the next may be of another kind
+            return ""; // a result has one spectrum, and the next may be of another kind
         }
 
         @Override

@@ -17,12 +17,12 @@ final class Time {
         return Timestamp.newBuilder().setSeconds(Math.floorDiv(ns, NS_PER_S)).setNanos((int) Math.floorMod(ns, NS_PER_S)).build();
     }
 
-    /** Return the moment of {@link System#nanoTime} when a timeout in seconds is over; {@link Long#MAX_VALUE}: never. */
+    /** Return the end of a timeout in seconds on the clock of {@link System#nanoTime}; {@link Long#MAX_VALUE}: never. */
     static long deadline(double seconds) {
         return seconds < 1e9 ? System.nanoTime() + (long) (seconds * NS_PER_S) : Long.MAX_VALUE;
     }
 
-    /** Return the moment when a timeout is over, or {@code deadline} if that comes first. */
+    /** Return the end of a timeout, or {@code deadline} if that comes first. */
     static long earlier(double seconds, long deadline) {
         return Math.min(deadline(seconds), deadline);
     }

@@ -4,7 +4,7 @@ import java.util.Collections;
 import java.util.HashMap;
 import java.util.Map;
 
-/** Units at the edges: everything inside is in SI (metres, seconds, volts, amperes, radians …). */
+/** Conversion of units at the edges: all values inside are in SI (metres, seconds, volts, amperes, radians …). */
 public final class Units {
     private static final String[] BASES = {"Hz", "rad", "m", "s", "V", "A", "N", "W", "K"};
     private static final Map<String, Integer> PREFIXES = new HashMap<>();
@@ -40,7 +40,7 @@ public final class Units {
     }
 
     private final String base;
-    /** Of ten: kept apart from the factor, as a division by a power of ten rounds less than a product with its inverse. */
+    /** The power of ten, separate from the factor: a division by it rounds less than a product with its inverse. */
     private final int power;
     private final double factor;
 
@@ -50,7 +50,7 @@ public final class Units {
         this.factor = factor;
     }
 
-    /** Return the SI units of the base parameters, where they do not depend on the operating mode of the microscope. */
+    /** Return the SI units of the base parameters that do not depend on the operating mode of the microscope. */
     public static Map<String, String> ofParameters() {
         return Collections.unmodifiableMap(OF_PARAMETERS);
     }

@@ -8,8 +8,8 @@ import java.util.ArrayList;
 import java.util.List;
 
 /**
- * Takes the numbers of a message out of its bytes: a packed {@code repeated double} is tag, length, then little-endian
- * float64 values, so that what lies between becomes a buffer as it is, and only the small rest is parsed.
+ * Extracts the numbers of a message from its bytes: a packed {@code repeated double} is tag, length, then little-endian
+ * float64 values, which become a buffer without a copy; only the small rest is parsed.
  */
 final class Values {
     private static final int VARINT = 0;
@@ -19,7 +19,7 @@ final class Values {
 
     /** The message without the field. */
     final ByteBuffer rest;
-    /** The contents of the field, in the order they came: usually one. */
+    /** The contents of the field, in their order: usually one. */
     final List<ByteBuffer> chunks = new ArrayList<>();
 
     /** Split a serialised message into its top-level field number {@code field} and the rest. */
@@ -49,7 +49,7 @@ final class Values {
         rest = chunks.isEmpty() ? message.duplicate() : ByteBuffer.wrap(kept.toByteArray());
     }
 
-    /** Return the numbers: a read-only view where they came in one piece, else one copy. */
+    /** Return the numbers: a read-only view of a single piece, otherwise a copy. */
     DoubleBuffer doubles() {
         ByteBuffer bytes = chunks.size() == 1 ? chunks.get(0) : joined();
         if (bytes.remaining() % Double.BYTES != 0) {

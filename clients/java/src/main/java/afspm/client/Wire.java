@@ -68,7 +68,7 @@ final class Wire {
         return new double[] {Units.convert(position.getPoint().getX(), unit, "m"), Units.convert(position.getPoint().getY(), unit, "m")};
     }
 
-    /** Decode a message of those that are followed here; null for all others. */
+    /** Decode a message that this client uses; null for all others. */
     static Object decode(Packet packet) throws InvalidProtocolBufferException {
         byte[] payload = packet.payload();
         switch (packet.message()) {

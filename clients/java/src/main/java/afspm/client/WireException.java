@@ -1,6 +1,6 @@
 package afspm.client;
 
-/** Bytes from a peer that are not what the wire format says. */
+/** Bytes from a peer that violate the wire format. */
 public class WireException extends AfspmException {
     public WireException(String what) {
         super(what);

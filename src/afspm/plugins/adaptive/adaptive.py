@@ -1,0 +1,166 @@
+"""`Adaptive`: maps a quantity of spectra over a region, and measures where the map is still uncertain."""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+from pathlib import Path
+from typing import Final
+
+from afspm.basics.errors import ConfigError
+from afspm.basics.formatting import counted, quantity
+from afspm.basics.units import Angle, Length
+from afspm.client.component import Component
+from afspm.model import Region, names
+from afspm.model.planned_work import PlannedWork
+from afspm.plugins.adaptive.mapping import (
+    MOST_SPECTRA,
+    MapProgress,
+    Measured,
+    Until,
+    optimizer_of,
+    rows,
+)
+from afspm.plugins.adaptive.quantities import evaluation
+from afspm.storage.atomic import OutageLog, write_atomic
+
+MOST_LINES: Final = 20
+"""Limit on log lines about the progress of a map."""
+
+
+class Adaptive(Component):
+    """Maps a quantity over a region: spectra on nested lattices, refined where the map is still uncertain.
+
+    A Gaussian process gives the map and its expected error, and follows drift from the values. Where the map is rough
+    everywhere, the complete lattices are measured, row by row; where it is rough in a few places, mostly these. No
+    spectrum is taken twice, even if processes are killed.
+
+    The table `map.csv` and the picture `map.png` are in the run folder.
+
+    Args:
+        size: (width, height) of the region.
+        quantity: "gap" (I(V) curves, in eV), "adhesion" (force curves, in N), or a function of a spectrum as
+            "module.name".
+        until: the end of the map, at the first that holds: `error`, the expected rms error in the unit of the quantity;
+            `spectra`, their number; `time`, experiment time.
+        center: (x, y) of the middle of the region.
+        angle: of the region, counter-clockwise.
+        unit: of a function of your own.
+        kind: of the spectra; by default the kind of the quantity, or the present one.
+        optimizer: "adaptive", "nested" (complete lattices), or a function of region and quantity as "module.name" that
+            returns an optimiser with `suggest` and `ingest` of bluesky-adaptive, with the parameters `x` and `y`.
+        coarsest: positions along the longer side of the first lattice.
+        levels: number of refinements, each twice as fine.
+        end_when_done: whether to end the whole experiment after the last spectrum.
+        file: name of table and picture.
+    """
+
+    needs_actions = (names.START_SPEC,)
+    longest_step_s = 120.0  # a process with a thousand measurements takes seconds on a busy computer
+    _outage = OutageLog("the table of the map can't be written", logging.getLogger("afspm.records"))
+
+    def __init__(
+        self,
+        size: tuple[Length, Length],
+        quantity: str,
+        until: dict[str, float | str],
+        center: tuple[Length, Length] = (0.0, 0.0),
+        angle: Angle = 0.0,
+        unit: str = "",
+        kind: str | None = None,
+        optimizer: str = "adaptive",
+        coarsest: int = 5,
+        levels: int = 5,
+        end_when_done: bool = False,
+        file: str = "map",
+    ) -> None:
+        for name, value, least in (("coarsest", coarsest, 3), ("levels", levels, 1)):
+            if not least <= value <= 9:
+                raise ConfigError(f"{value} is not between {least} and 9", where=name)
+        self._region = Region((center[0], center[1]), (size[0], size[1]), angle)
+        self._evaluation = evaluation(quantity, unit, kind)
+        self._until = Until.of(until, self._evaluation.unit)
+        own = {"coarsest": coarsest, "levels": levels} if optimizer in ("adaptive", "nested") else {}
+        self._optimizer = optimizer_of(optimizer, self._region, self._evaluation.name, **own)
+        with_kind = (names.SPEC_KIND,) if self._evaluation.kind else ()
+        self.needs_parameters = (names.PROBE_POS_X, names.PROBE_POS_Y, *with_kind)
+        self.positions = tuple((float(x), float(y)) for x, y in self._region.corners_m())
+        self.end_when_done, self.file = end_when_done, file
+        self._progress: MapProgress | None = None
+
+    def planned_work(self, speed_m_s: float | None) -> PlannedWork:
+        most = self._until.spectra or MOST_SPECTRA
+        return PlannedWork(
+            spectra=most, at_most=True, ends_experiment=self.end_when_done, why="the values decide where it measures"
+        )
+
+    def run(self) -> None:
+        found = MapProgress(self._optimizer, self._region, self._evaluation, self._until, self.clock.late)
+        self._progress = found
+        kept = [Measured(**row) for row in self.memory.setdefault("measured", [])]
+        failed = self.memory.setdefault("failed", [])
+        found.restore(kept, failed)
+        if kept:
+            self.log.info("going on after %s", counted(len(kept), "spectrum", "spectra"))
+        while not (why := found.finished()):
+            # saved, so that a restart requests the same spectrum
+            point = self.memory.get("next") or found.suggestion()
+            if point is None:
+                why = "the finest lattice is measured"
+                break
+            number = len(found.measured) + len(failed) + 1
+            if self.memory.get("next") != point:
+                self.memory["next"] = point
+                self.memory.save(synced=False)
+            one = found.measure(self.scope, point, key=f"map-{number}")
+            if one is None:
+                failed.append(point["_id"])
+            else:
+                self.memory["measured"] += rows([one])
+            self.memory["next"] = None
+            if self.memory.save(synced=False):  # if not saved, a restart requests the same spectrum
+                self.scope.forget(f"map-{number}")
+            self._report(found)
+        self.log.info("%s: %s%s", self._state(found), why, self._failures(found))
+        if self.end_when_done:
+            self.scope.end_experiment()
+
+    def on_end(self) -> None:
+        found = self._progress
+        if found is None or len(found.measured) < 3:
+            self.log.warning("fewer than three spectra: there is no map")
+            return
+        folder = Path(self.run_dir)
+        with self._outage.trying():  # on a full disk the error is logged, and the picture is tried
+            write_atomic(folder / f"{self.file}.csv", [self._table(found).encode()])
+        from afspm.plugins.adaptive.map_picture import draw_map  # matplotlib: needed at the end alone
+
+        draw_map(found, self._region, folder / f"{self.file}.png", title=self.name, simulated=self.simulated)
+        self.log.info("the map is drawn: %s", folder / f"{self.file}.png")
+
+    def _table(self, found: MapProgress) -> str:
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        unit = f" [{self._evaluation.unit}]" if self._evaluation.unit else ""
+        writer.writerow(["x [m]", "y [m]", f"{self._evaluation.name}{unit}", "time [s]", "x_start [m]", "y_start [m]"])
+        for one, (x_m, y_m) in zip(found.measured, found.map.model.positions_m, strict=True):
+            places = (f"{place:.9g}" for place in (one.x_m, one.y_m))
+            writer.writerow([*places, f"{one.value:.9g}", f"{one.time_s:.3f}", f"{x_m:.9g}", f"{y_m:.9g}"])
+        return text.getvalue()
+
+    def _report(self, found: MapProgress) -> None:
+        done, until = len(found.measured), self._until
+        most = until.spectra or MOST_SPECTRA
+        self.scope.progress(done, most)
+        every = max(1, most // MOST_LINES)
+        if done and done % every == 0:
+            self.log.info("%s", self._state(found))
+
+    def _state(self, found: MapProgress) -> str:
+        error = "" if found.error is None else f", expected error {quantity(found.error, self._evaluation.unit, 2)}"
+        return f"{counted(len(found.measured), 'spectrum', 'spectra')}{error}"
+
+    @staticmethod
+    def _failures(found: MapProgress) -> str:
+        return f"; {counted(found.failures, 'position')} without a value" if found.failures else ""

@@ -1,0 +1,181 @@
+"""A Gaussian process over the plane that also learns how the sample drifts.
+
+The mean is constant, the covariance Matérn 5/2 with one length. The position of a measurement is corrected by
+`velocity * (time - first time)`, so all times give one map of the sample as it lay at the first measurement. Length,
+noise and velocity are those of the highest marginal likelihood; mean and amplitude follow in closed form.
+
+A map may be even in most places and rough in a few. The amplitude is therefore scaled locally by how well each
+measurement is predicted from the others (leave one out).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+Floats = NDArray[np.float64]
+
+_MOST_FITTED: Final = 240  # measurements for the likelihood, whose time grows with the cube
+_LEAST_NOISE: Final = 1e-4  # variance, as a part of the amplitude: below it the matrix is not solved stably
+_NEAREST: Final = 8  # measurements that give the local scale
+_LEAST_SCALE: Final = 0.04  # of the local variance: a feature may hide between measurements
+_DRIFT_GAIN: Final = 4.0  # in log likelihood: with less, the drift is taken for zero
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Parameters of the process.
+
+    Attributes:
+        length_m: distance over which values are related.
+        noise: variance of a measurement, as a part of the amplitude.
+        velocity_m_s: (x, y) of the sample.
+    """
+
+    length_m: float
+    noise: float
+    velocity_m_s: tuple[float, float] = (0.0, 0.0)
+
+
+class GaussianProcess:
+    """The process after some measurements.
+
+    Args:
+        xy_m: (n, 2), as measured.
+        values: (n,).
+        times_s: (n,).
+        parameters: of the process.
+    """
+
+    def __init__(self, xy_m: Floats, values: Floats, times_s: Floats, parameters: Parameters) -> None:
+        self.parameters = parameters
+        self._at_m: Floats = xy_m - np.outer(times_s - times_s[0], parameters.velocity_m_s)
+        factor: Any = cho_factor(_covariance(self._at_m, parameters), lower=True, overwrite_a=True, check_finite=False)
+        solved = cho_solve(factor, np.stack([values, np.ones(len(values))], axis=1), check_finite=False)
+        self.mean = float(solved[:, 0].sum() / solved[:, 1].sum())
+        self._weights = solved[:, 0] - self.mean * solved[:, 1]
+        square = float((values - self.mean) @ self._weights) / len(values)
+        self.amplitude = math.sqrt(max(square, 1e-300))
+
+    def predict(self, xy_m: Floats) -> Floats:
+        """Return the expected values at positions (m, 2) of the sample at the first time."""
+        return np.asarray(self.mean + self._related(xy_m) @ self._weights)
+
+    def variance(self, xy_m: Floats, also_m: Floats | None = None) -> Floats:
+        """Return the expected square error at positions (m, 2), scaled by the local roughness.
+
+        Args:
+            also_m: positions that will be measured before.
+        """
+        at_m = self._at_m if also_m is None else np.vstack([self._at_m, also_m])
+        inverse = self._inverse if also_m is None else np.linalg.inv(_covariance(at_m, self.parameters))
+        related = matern(distances(xy_m, at_m), self.parameters.length_m)
+        left = 1.0 - ((related @ inverse) * related).sum(axis=1)
+        return np.asarray(self.amplitude**2 * np.maximum(left, 0.0) * self._scale(xy_m))
+
+    @property
+    def positions_m(self) -> Floats:
+        """The measured positions on the sample as it lay at the first time, (n, 2)."""
+        return self._at_m
+
+    @cached_property
+    def _inverse(self) -> Floats:
+        return np.asarray(np.linalg.inv(_covariance(self._at_m, self.parameters)))
+
+    @cached_property
+    def _surprise(self) -> Floats:
+        # squares of the leave-one-out errors, each as a part of its variance: Rasmussen and Williams, eq. 5.12
+        return np.asarray(self._weights**2 / np.diag(self._inverse) / self.amplitude**2)
+
+    def _related(self, xy_m: Floats) -> Floats:
+        return matern(distances(xy_m, self._at_m), self.parameters.length_m)
+
+    def _scale(self, xy_m: Floats) -> Floats:
+        square = distances(xy_m, self._at_m)
+        count = min(_NEAREST, square.shape[1])
+        nearest = np.argpartition(square, count - 1, axis=1)[:, :count]
+        near = np.take_along_axis(square, nearest, axis=1)
+        weights = np.exp(-0.5 * (near / np.maximum(near.mean(axis=1, keepdims=True), 1e-30)) ** 2)
+        local = (weights * self._surprise[nearest]).sum(axis=1) / weights.sum(axis=1)
+        return np.asarray(np.maximum(local, _LEAST_SCALE))
+
+
+def fitted(
+    xy_m: Floats, values: Floats, times_s: Floats, start: Parameters, shortest_m: float, *, drifts: bool, seed: int = 0
+) -> Parameters:
+    """Return the parameters of the highest likelihood, searched from `start`.
+
+    Args:
+        shortest_m: lower bound of the length; the upper one is a hundred times that.
+        drifts: whether to search for a velocity, too; otherwise `start` has the known one.
+        seed: of the choice of measurements where there are many.
+    """
+    if len(values) > _MOST_FITTED:
+        chosen = np.random.default_rng(seed).choice(len(values), _MOST_FITTED, replace=False)
+        xy_m, values, times_s = xy_m[chosen], values[chosen], times_s[chosen]
+    since_s = times_s - times_s.min()
+    unit_s = max(float(since_s.max()), 1e-9)
+
+    def cost(at: Floats) -> float:
+        length_m, noise = shortest_m * math.exp(at[0]), math.exp(at[1])
+        shift_m = np.outer(since_s / unit_s, at[2:] * shortest_m) if len(at) > 2 else 0.0
+        bounds = 50.0 * (max(0.0, -at[0]) ** 2 + max(0.0, at[0] - math.log(100.0)) ** 2)
+        bounds += 50.0 * (max(0.0, math.log(_LEAST_NOISE) - at[1]) ** 2 + max(0.0, at[1]) ** 2)
+        return float(bounds - _log_likelihood(xy_m - shift_m, values, length_m, noise))
+
+    known_m = np.outer(since_s, start.velocity_m_s)
+    if not drifts:
+        xy_m = xy_m - known_m
+    first = np.array([math.log(start.length_m / shortest_m), math.log(max(start.noise, _LEAST_NOISE))])
+    still = _lowest(cost, first, np.array([0.5, 1.0]))
+    best, velocity = still, np.zeros(2) if drifts else np.asarray(start.velocity_m_s)
+    if drifts:
+        before = np.asarray(start.velocity_m_s) * unit_s / shortest_m
+        moved = _lowest(cost, np.concatenate([still, before]), np.array([0.3, 0.5, 0.3, 0.3]))
+        if cost(still) - cost(moved) > _DRIFT_GAIN:
+            best, velocity = moved[:2], moved[2:] * shortest_m / unit_s
+    length_m = shortest_m * float(np.exp(np.clip(best[0], 0.0, math.log(100.0))))
+    noise = float(np.exp(np.clip(best[1], math.log(_LEAST_NOISE), 0.0)))
+    return Parameters(length_m, noise, (float(velocity[0]), float(velocity[1])))
+
+
+def matern(distance_m: Floats, length_m: float) -> Floats:
+    """Return the Matérn 5/2 correlation over distances."""
+    r = distance_m * (math.sqrt(5.0) / length_m)
+    return np.asarray((1.0 + r + r * r / 3.0) * np.exp(-r))
+
+
+def distances(a_m: Floats, b_m: Floats) -> Floats:
+    """Return the distances between two sets of points, shape (len(a), len(b))."""
+    return np.hypot(a_m[:, None, 0] - b_m[None, :, 0], a_m[:, None, 1] - b_m[None, :, 1])
+
+
+def _covariance(at_m: Floats, parameters: Parameters) -> Floats:
+    matrix = matern(distances(at_m, at_m), parameters.length_m)
+    matrix[np.diag_indices(len(at_m))] += parameters.noise
+    return matrix
+
+
+def _lowest(cost: Callable[[Floats], float], first: Floats, steps: Floats) -> Floats:
+    simplex = np.vstack([first, first + np.diag(steps)])
+    options: Any = {"initial_simplex": simplex, "maxfev": 22 * len(first), "xatol": 0.03, "fatol": 0.1}
+    return np.asarray(minimize(cost, first, method="Nelder-Mead", options=options).x)
+
+
+def _log_likelihood(at_m: Floats, values: Floats, length_m: float, noise: float) -> float:
+    n = len(values)
+    matrix = _covariance(at_m, Parameters(length_m, noise))
+    factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+    solved = cho_solve(factor, np.stack([values, np.ones(n)], axis=1), check_finite=False)
+    mean = solved[:, 0].sum() / solved[:, 1].sum()
+    square = float(values @ solved[:, 0] - mean * solved[:, 0].sum())
+    spread = 2.0 * float(np.log(np.diag(factor[0])).sum())
+    return float(-0.5 * n * math.log(max(square, 1e-300) / n) - 0.5 * spread)

@@ -1,0 +1,86 @@
+"""Picture of a map: the values with the measured positions, and beside them the expected error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from afspm.basics.formatting import counted, scale
+from afspm.model import Region
+from afspm.plugins.adaptive.mapping import MapProgress
+from afspm.record.drawing.palette import CATEGORICAL, PROBLEM
+from afspm.record.drawing.raster import value_range
+from afspm.record.plotting import draw_scale_bar, gold
+
+Floats = NDArray[np.float64]
+_LONGER: Final = 120  # pixels along the longer side
+_WIDTH_IN, _TEXT = 9.6, 9.0
+
+
+def draw_map(found: MapProgress, region: Region, path: Path, *, title: str = "", simulated: bool = False) -> None:
+    """Draw the map of some measurements and its expected error.
+
+    Args:
+        region: that was mapped.
+        path: of the picture; its suffix gives the format.
+        simulated: whether to mark the picture, so that it is not taken for a measurement.
+    """
+    values, errors = _pictures(found, region)
+    aspect = region.size_m[1] / region.size_m[0]
+    height_in = 0.6 + 3.9 * aspect
+    figure = Figure(figsize=(_WIDTH_IN, height_in), facecolor="white")
+    FigureCanvasAgg(figure)
+    unit = found.evaluation.unit
+    of = found.evaluation.name
+    left = figure.add_axes((0.015, 0.04, 0.40, 1.0 - 0.55 / height_in - 0.04))
+    right = figure.add_axes((0.515, 0.04, 0.40, 1.0 - 0.55 / height_in - 0.04))
+    size_um = tuple(1e6 * size for size in region.size_m)
+    _panel(left, values, size_um, of, unit, gold())
+    _panel(right, errors, size_um, "expected error", unit, "viridis", low=0.0)
+    x, y = _in_region(found.map.model.positions_m, region).T
+    for axes, colour in ((left, CATEGORICAL[0]), (right, "white")):
+        axes.plot(1e6 * x, 1e6 * y, ".", color=colour, markersize=4.0, markeredgewidth=0.0)
+    draw_scale_bar(left, region.size_m, (-size_um[0] / 2, -size_um[1] / 2), 1e6, font=_TEXT)
+    head = ", ".join(filter(None, (title, of, counted(len(found.measured), "spectrum", "spectra"))))
+    figure.text(0.015, 1.0 - 0.2 / height_in, head, size=10, va="center")
+    if simulated:
+        figure.text(0.985, 1.0 - 0.2 / height_in, "SIMULATED", size=10, weight="bold", color=PROBLEM, ha="right",
+                    va="center")  # fmt: skip
+    figure.savefig(path, dpi=160)
+
+
+def _panel(
+    axes: Any, values: Floats, size_um: tuple[float, ...], name: str, unit: str, colours: Any, low: float | None = None
+) -> None:
+    factor, shown_unit = scale(float(np.abs(values).max()), unit)
+    span = value_range(values * factor)
+    width, height = size_um
+    drawn = axes.imshow(
+        values * factor, origin="lower", cmap=colours, vmin=span.low if low is None else low, vmax=span.high,
+        extent=(-width / 2, width / 2, -height / 2, height / 2), interpolation="nearest",
+    )  # fmt: skip
+    axes.set_axis_off()
+    bar = axes.figure.colorbar(drawn, ax=axes, fraction=0.045, pad=0.02)
+    bar.set_label(f"{name} ({shown_unit})" if shown_unit else name, size=_TEXT)
+    bar.ax.tick_params(labelsize=_TEXT)
+
+
+def _pictures(found: MapProgress, region: Region) -> tuple[Floats, Floats]:
+    # [y, x] over the region, along its own axes
+    longer = max(region.size_m)
+    columns, rows = (max(2, round(_LONGER * size / longer)) for size in region.size_m)
+    x_m, y_m = region.pixels_m((rows, columns))
+    places = np.stack([x_m.ravel(), y_m.ravel()], axis=1)
+    model = found.map.model
+    return model.predict(places).reshape(rows, columns), np.sqrt(model.variance(places)).reshape(rows, columns)
+
+
+def _in_region(xy_m: Floats, region: Region) -> Floats:
+    # positions along the axes of the region, from its middle
+    cos, sin = np.cos(region.angle_rad), np.sin(region.angle_rad)
+    return np.asarray((xy_m - np.asarray(region.center_m)) @ np.array([[cos, -sin], [sin, cos]]))

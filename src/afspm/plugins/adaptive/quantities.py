@@ -1,0 +1,117 @@
+"""From a curve to the number that is mapped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from afspm.basics.errors import ConfigError, InvalidValue
+from afspm.model import Spectrum
+from afspm.transport.process.loading import find_object
+
+Floats = NDArray[np.float64]
+_EDGE: Final = (0.2, 0.65)
+"""Part of the largest conductance of a side, between which it rises as the square root of the energy above its band."""
+_LEAST_POINTS: Final = 4
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A quantity: its name, its unit, the kind of spectrum that shows it, and the function of a spectrum."""
+
+    name: str
+    unit: str
+    kind: str | None
+    function: Callable[[Spectrum], float]
+
+    def of(self, spectrum: Spectrum) -> float:
+        """Return the value.
+
+        Raises:
+            InvalidValue: the curve does not show the quantity.
+        """
+        try:
+            value = float(self.function(spectrum))
+        except InvalidValue:
+            raise
+        except Exception as error:  # a user's function may raise anything for an odd curve, and the map goes on
+            raise InvalidValue(f"{self.name} of the curve: {type(error).__name__}: {error}") from error
+        if not math.isfinite(value):
+            raise InvalidValue(f"{self.name} of the curve is {value}")
+        return value
+
+
+def gap_ev(spectrum: Spectrum) -> float:
+    """Return the band gap in eV: the distance of the band edges in dI/dV.
+
+    At an edge the squared conductance rises linearly, so a line through it meets zero at the edge, also where
+    temperature rounds the edge itself.
+    """
+    bias = spectrum.values[:, 0]
+    order = np.argsort(bias)
+    bias = bias[order]
+    if "dI/dV" in spectrum.names:
+        conductance = spectrum["dI/dV"][order]
+    elif "Current" in spectrum.names:
+        conductance = np.gradient(spectrum["Current"][order], bias)
+    else:
+        raise InvalidValue(f"a gap needs dI/dV or Current; the curve has {', '.join(spectrum.names)}")
+    width = max(1, len(bias) // 50)
+    smoothed = np.convolve(conductance, np.full(width, 1.0 / width), mode="same")
+    lowest = width + int(np.argmin(smoothed[width : len(bias) - width]))
+    right = _edge(bias[lowest:], smoothed[lowest : len(bias) - width])
+    left = _edge(-bias[lowest::-1], smoothed[lowest : width - 1 : -1])
+    return right + left
+
+
+def adhesion_n(spectrum: Spectrum) -> float:
+    """Return the pull-off force in N: the lowest force while the tip withdraws, with its sign turned."""
+    name = "Force Retrace" if "Force Retrace" in spectrum.names else "Force"
+    return -float(spectrum[name].min())
+
+
+QUANTITIES: Final = {
+    "gap": Evaluation("gap", "eV", "IV", gap_ev),
+    "adhesion": Evaluation("adhesion", "N", "force", adhesion_n),
+}
+
+
+def evaluation(quantity: str, unit: str = "", kind: str | None = None) -> Evaluation:
+    """Return the evaluation of a name, or of a function "module.name" with its unit.
+
+    Raises:
+        ConfigError: there is no such function, or a unit is given for a quantity with its own.
+    """
+    if quantity in QUANTITIES:
+        known = QUANTITIES[quantity]
+        if unit:
+            raise ConfigError(f"{quantity} is in {known.unit}", where="unit", hint="leave `unit` out")
+        return Evaluation(known.name, known.unit, kind or known.kind, known.function)
+    if "." not in quantity:
+        hint = f"one of {', '.join(QUANTITIES)}, or a function of a spectrum as module.name"
+        raise ConfigError(f"no quantity is named {quantity!r}", where="quantity", hint=hint)
+    function = find_object(quantity, "quantity")
+    if not callable(function):
+        raise ConfigError(f"{quantity} is not a function", where="quantity", hint="it is given a Spectrum")
+    return Evaluation(quantity.rpartition(".")[2], unit, kind, function)
+
+
+def _edge(outwards: Floats, conductance: Floats) -> float:
+    # `outwards` rises from the middle of the gap; the result is the bias of the edge
+    conductance = conductance[: len(outwards)]
+    outwards = outwards[: len(conductance)]
+    highest = float(conductance.max(initial=0.0))
+    above = np.flatnonzero(conductance > _EDGE[0] * highest)
+    beyond = np.flatnonzero(conductance > _EDGE[1] * highest)
+    if highest <= 0.0 or not len(above) or not len(beyond) or beyond[0] - above[0] < _LEAST_POINTS:
+        raise InvalidValue("the curve has no band edge", hint="sweep the bias farther, with more points")
+    part = slice(int(above[0]), int(beyond[0]))
+    slope, offset = np.polyfit(outwards[part], conductance[part] ** 2, 1)
+    if slope <= 0.0:
+        raise InvalidValue("the curve has no band edge", hint="average more sweeps")
+    return float(-offset / slope)

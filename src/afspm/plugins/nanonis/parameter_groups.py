@@ -1,0 +1,159 @@
+"""Parameters that Nanonis groups, scales or signs in ways that a table can't express; those of geometry: `geometry`.
+
+A group is read by one request and written by one command, by generic names, in SI. Values of a `…Get` are never passed
+to a `…Set` as they are where both count differently (the table of `protocol`, "Traps" in the README).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, Final
+
+from afspm.model import names
+from afspm.plugins.nanonis.protocol import BadReply
+from afspm.translator.parameters import FEEDBACK_ON, Value, refuse_value
+from afspm.translator.setting_groups import SettingsGroup
+
+Ask = Callable[..., tuple[Any, ...]]
+
+DRIFT_RATE_X: Final = "x-drift-rate-x"
+DRIFT_RATE_Y: Final = "x-drift-rate-y"
+
+_ON, _OFF = 1, 2
+"""In `…Set`; `…Get` returns 1 and 0 instead."""
+
+
+class Group(SettingsGroup):
+    """Parameters read by one request and written by one command."""
+
+    def __init__(self, ask: Ask) -> None:
+        self._ask = ask
+
+    def _numbers(self, name: str, *arguments: object) -> tuple[Any, ...]:
+        return numbers(self._ask, name, *arguments)
+
+
+def numbers(ask: Ask, name: str, *arguments: Any) -> tuple[Any, ...]:
+    """Return the numbers that a function replies.
+
+    Raises:
+        BadReply: a number is not finite, so that nothing can be set by it.
+    """
+    found = ask(name, *arguments)
+    for value in found:
+        if isinstance(value, float) and not math.isfinite(value):
+            raise BadReply(f"Nanonis returned {value} in reply to {name}")
+    return found
+
+
+class ScanSpeed(Group):
+    """The scan speed forward. The backward speed keeps its ratio; the speeds are kept when the frame changes."""
+
+    names = (names.SCAN_SPEED,)
+
+    def read(self) -> dict[str, Value]:
+        return {names.SCAN_SPEED: self._numbers("Scan.SpeedGet")[0]}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        forward_m_s = float(values[names.SCAN_SPEED])
+        *_, ratio = self._numbers("Scan.SpeedGet")
+        width_m = self._numbers("Scan.FrameGet")[2]
+        backward_m_s = forward_m_s * ratio
+        if min(forward_m_s, backward_m_s) <= 0.0:
+            raise refuse_value(
+                names.SCAN_SPEED,
+                f"the speeds forward and backward must be above 0, not {forward_m_s:g} and {backward_m_s:g} m/s",
+            )
+        keep_speed = 1  # SpeedGet returns 0 for it
+        times_s = width_m / forward_m_s, width_m / backward_m_s
+        self._ask("Scan.SpeedSet", forward_m_s, backward_m_s, *times_s, keep_speed, ratio)
+
+
+class Gains(Group):
+    """The gains of the z controller: Nanonis has P, the time constant T, and I = P / T."""
+
+    names = (names.ZCTRL_PGAIN, names.ZCTRL_IGAIN)
+
+    def read(self) -> dict[str, Value]:
+        proportional, _, integral = self._ask("ZCtrl.GainGet")  # not `_numbers`: T is infinite without I
+        return {names.ZCTRL_PGAIN: proportional, names.ZCTRL_IGAIN: integral}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        merged = self.merged(values)
+        proportional, integral = float(merged[names.ZCTRL_PGAIN]), float(merged[names.ZCTRL_IGAIN])
+        if proportional <= 0.0 or integral <= 0.0:
+            reason = "both must be above 0: Nanonis sets the time constant T = P / I"
+            raise refuse_value(f"{names.ZCTRL_PGAIN}, {names.ZCTRL_IGAIN}", reason)
+        self._ask("ZCtrl.GainSet", proportional, proportional / integral, integral)
+
+
+class FeedbackOn(Group):
+    """The switch of the z controller, as its real-time part reports it, with a delay.
+
+    Args:
+        wait_for: waits for a condition, up to a time limit.
+    """
+
+    names = (FEEDBACK_ON,)
+
+    def __init__(self, ask: Ask, wait_for: Callable[[Callable[[], bool]], bool]) -> None:
+        super().__init__(ask)
+        self._wait_for = wait_for
+
+    def read(self) -> dict[str, Value]:
+        return {FEEDBACK_ON: self._ask("ZCtrl.OnOffGet")[0] == 1}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        wanted = bool(values[FEEDBACK_ON])
+        self._ask("ZCtrl.OnOffSet", int(wanted))
+        # OnOffGet reports the real-time controller, which follows with a delay.
+        self._wait_for(lambda: self.read()[FEEDBACK_ON] is wanted)
+
+
+class MoveSpeed(Group):
+    """The speed of the tip between scans, independent of the scan speed."""
+
+    names = (names.MOVE_SPEED,)
+
+    def read(self) -> dict[str, Value]:
+        # Without a speed of its own, the tip moves at the scan speed between scans, too.
+        speed_m_s, own = self._numbers("FolMe.SpeedGet")
+        return {names.MOVE_SPEED: speed_m_s if own else self._numbers("Scan.SpeedGet")[0]}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        own = 1
+        self._ask("FolMe.SpeedSet", float(values[names.MOVE_SPEED]), own)
+
+
+class Slope(Group):
+    """The compensation of the sample's tilt, as slopes; Nanonis has angles."""
+
+    names = (names.SAMPLE_SLOPE_X, names.SAMPLE_SLOPE_Y)
+
+    def read(self) -> dict[str, Value]:
+        angles_deg = self._numbers("Piezo.TiltGet")
+        return {name: math.tan(math.radians(deg)) for name, deg in zip(self.names, angles_deg, strict=True)}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        merged = self.merged(values)
+        self._ask("Piezo.TiltSet", *(math.degrees(math.atan(float(merged[name]))) for name in self.names))
+
+
+class DriftRate(Group):
+    """The controller's own drift compensation, off if all velocities are 0. The z velocity is kept."""
+
+    names = (DRIFT_RATE_X, DRIFT_RATE_Y)
+    _usual_limit_percent: ClassVar[float] = 10.0
+
+    def read(self) -> dict[str, Value]:
+        on, *rates_m_s = self._numbers("Piezo.DriftCompGet")[:3]
+        return {name: rate if on else 0.0 for name, rate in zip(self.names, rates_m_s, strict=True)}
+
+    def write(self, values: Mapping[str, Value]) -> None:
+        on, _, _, up_m_s, _, _, _, *limit = self._numbers("Piezo.DriftCompGet")
+        x, y = (float(self.merged(values)[name]) for name in self.names)
+        follows = bool(x or y or (on and up_m_s))
+        # Release 2021 has no limit.
+        limit_percent = limit[0] if limit else self._usual_limit_percent
+        self._ask("Piezo.DriftCompSet", _ON if follows else _OFF, x, y, up_m_s, limit_percent)

@@ -1,0 +1,125 @@
+"""A quantity that varies from place to place: a map with known truth, which the curves of spectra show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from afspm.basics.errors import ConfigError
+from afspm.simulation import chance
+from afspm.simulation.fields import Array, smooth_field
+from afspm.simulation.settings import check, one_of
+from afspm.simulation.spectra import ForceSettings, IVSettings
+from afspm.simulation.surfaces.relief import Sites
+
+KINDS = ("none", "smooth", "spotty")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity of a spectrum: the kind of curve that shows it, its unit and its usual range."""
+
+    spectrum: str
+    unit: str
+    low: float
+    high: float
+
+
+QUANTITIES: Final = {
+    "gap": Quantity("IV", "eV", 0.4, 1.4),
+    "modulus": Quantity("force", "Pa", 1e9, 6e9),
+    "adhesion": Quantity("force", "J/m^2", 0.02, 0.1),
+}
+_STEEPNESS = 1.6  # of the logistic curve that keeps a field within its range: 90 % of it is used
+_REACH = 3.5  # of a spot, in its standard deviations
+
+
+@dataclass(frozen=True)
+class PropertyMapSettings:
+    """A quantity of spectra that varies over the sample, in place of the one of the surface's two materials.
+
+    Attributes:
+        kind: "none", "smooth" (hills and valleys everywhere) or "spotty" (round spots on even ground).
+        quantity: "gap" of I(V) curves in eV, "modulus" of force curves in Pa, or their "adhesion" in J/m^2.
+        low, high: range of the quantity, in its unit; equal: the usual one of the quantity.
+        size_m: width of hills, or mean width of spots at half their height.
+        spacing_m: mean distance of spots.
+    """
+
+    kind: str = "none"
+    quantity: str = "gap"
+    low: float = 0.0
+    high: float = 0.0
+    size_m: float = 150e-9
+    spacing_m: float = 400e-9
+
+    def __post_init__(self) -> None:
+        one_of(self.kind, KINDS, "kind")
+        one_of(self.quantity, QUANTITIES, "quantity")
+        check(self, above_zero="size_m spacing_m", from_zero="low")
+        if self.high < self.low:
+            raise ConfigError(f"{self.high!r} is below low = {self.low!r}", where="high")
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The range of the quantity, in its unit."""
+        usual = QUANTITIES[self.quantity]
+        return (usual.low, usual.high) if self.low == self.high else (self.low, self.high)
+
+
+class PropertyMap:
+    """The map of a seed, without bounds.
+
+    Attributes:
+        is_on: whether there is a map at all; otherwise spectra depend on the two materials.
+        quantity: name of the quantity.
+        unit: of the quantity.
+    """
+
+    def __init__(self, settings: PropertyMapSettings, seed: int) -> None:
+        self._settings = settings
+        self._seed = chance.subseed(seed, "property map") % 2**62
+        self.is_on = settings.kind != "none"
+        self.quantity, self.unit = settings.quantity, QUANTITIES[settings.quantity].unit
+
+    def at(self, x_m: ArrayLike, y_m: ArrayLike) -> Array:
+        """Return the true values at sample coordinates, shaped as x and y broadcast."""
+        x, y = np.broadcast_arrays(np.asarray(x_m, dtype=np.float64), np.asarray(y_m, dtype=np.float64))
+        flat_x, flat_y = x.reshape(-1, 1), y.reshape(-1, 1)
+        share = self._hills(flat_x, flat_y) if self._settings.kind == "smooth" else self._spots(flat_x, flat_y)
+        low, high = self._settings.range
+        return low + (high - low) * share.reshape(x.shape)
+
+    def on_iv(self, settings: IVSettings, material: float, x_m: float, y_m: float) -> tuple[IVSettings, float]:
+        """Return the settings and the material of an I(V) curve at a position of the sample."""
+        if not (self.is_on and self.quantity == "gap"):
+            return settings, material
+        return replace(settings, gap_ev=float(self.at(x_m, y_m))), 0.0  # material 0 is the one with a gap
+
+    def on_force(self, settings: ForceSettings, x_m: float, y_m: float) -> ForceSettings:
+        """Return the settings of a force curve at a position of the sample."""
+        if not (self.is_on and self.quantity in ("modulus", "adhesion")):
+            return settings
+        pair = (float(self.at(x_m, y_m)),) * 2
+        if self.quantity == "modulus":
+            return replace(settings, modulus_pa=pair)
+        return replace(settings, adhesion_j_per_m2=pair)
+
+    def _hills(self, x_m: Array, y_m: Array) -> Array:
+        field = smooth_field(self._seed, x_m, y_m, self._settings.size_m)
+        return np.asarray(1.0 / (1.0 + np.exp(-_STEEPNESS * field)))
+
+    def _spots(self, x_m: Array, y_m: Array) -> Array:
+        # overlapping spots saturate, so that no value leaves the range
+        sigma_m = self._settings.size_m / 2.355
+        sites = Sites.within(self._seed, x_m, y_m, 2.0 * _REACH * sigma_m, self._settings.spacing_m)
+        heights = 0.5 + 0.5 * chance.uniform(self._seed + 5, sites.key)
+        widths_m = sigma_m * np.clip(np.exp(0.2 * chance.normal(self._seed + 6, sites.key)), 0.7, 1.4)
+        left = np.ones(x_m.shape)
+        for site_x_m, site_y_m, height, width_m in zip(sites.x_m, sites.y_m, heights, widths_m, strict=True):
+            square = ((x_m - site_x_m) ** 2 + (y_m - site_y_m) ** 2) / width_m**2
+            left *= 1.0 - height * np.exp(-0.5 * square)
+        return 1.0 - left

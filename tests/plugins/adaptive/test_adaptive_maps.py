@@ -1,0 +1,176 @@
+"""Optimisers of a map, by measuring known maps without processes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from benchmarks.adaptive import GOAL, Case, course
+
+from afspm.basics.errors import InvalidValue
+from afspm.model import Region
+from afspm.plugins.adaptive.gaussian_process import GaussianProcess, Parameters, fitted
+from afspm.plugins.adaptive.refinement import AdaptiveMap, Lattice, LatticeMap, NestedGrid, Optimizer
+from afspm.plugins.adaptive.tours import learnt_cost, short_tour, snake, way_m
+
+REGION = Region((0.0, 0.0), (1e-6, 1e-6))
+SPOT_M = np.array([0.2e-6, -0.1e-6])
+
+
+def spot(xy_m: np.ndarray) -> np.ndarray:
+    """Return the values of one round spot on even ground."""
+    return np.asarray(np.exp(-0.5 * ((xy_m - SPOT_M) ** 2).sum(axis=-1) / 40e-9**2))
+
+
+def measure(planned: LatticeMap, count: int, *, move_s_per_m: float = 0.0) -> list[tuple[float, float]]:
+    """Measure the spot at the suggested positions, one second each."""
+    at, now_s, positions = (0.0, 0.0), 0.0, []
+    for _ in range(count):
+        (point,) = planned.suggest()
+        xy = (point["x"], point["y"])
+        took_s = 1.0 + move_s_per_m * math.dist(at, xy)
+        at, now_s = xy, now_s + took_s
+        planned.ingest([{**point, "height": float(spot(np.array(xy))), "time_s": now_s, "seconds": took_s}])
+        positions.append(xy)
+    return positions
+
+
+def test_refinement_measures_beside_the_spot_and_leaves_even_ground_out() -> None:
+    near = {}
+    for planner in (AdaptiveMap, NestedGrid):
+        positions = np.array(measure(planner(REGION, "height", velocity_m_s=(0.0, 0.0)), 150))
+        near[planner] = int((np.hypot(*(positions - SPOT_M).T) < 0.1e-6).sum())
+    assert near[AdaptiveMap] > 3 * near[NestedGrid] > 0
+
+
+def test_nested_grid_completes_each_lattice_before_the_next() -> None:
+    positions = measure(NestedGrid(REGION, "height", velocity_m_s=(0.0, 0.0)), 81)
+    assert len(set(positions)) == 81
+    axis = np.linspace(-0.5e-6, 0.5e-6, 9)
+    assert np.array(sorted(positions)) == pytest.approx(np.array([(x, y) for x in axis for y in axis]), abs=1e-12)
+
+
+def test_on_a_map_that_is_rough_everywhere_both_take_the_same_positions() -> None:
+    taken = []
+    for planner in (AdaptiveMap, NestedGrid):
+        planned, waves = planner(REGION, "height", velocity_m_s=(0.0, 0.0)), []
+        for _ in range(81):
+            (point,) = planned.suggest()
+            value = math.sin(point["x"] / 60e-9) * math.cos(point["y"] / 55e-9)
+            planned.ingest([{**point, "height": value}])
+            waves.append((point["x"], point["y"]))
+        taken.append(waves)
+    assert taken[0] == taken[1]
+
+
+@pytest.mark.parametrize("moves", ["fast", "slow"])
+def test_a_spotty_map_takes_clearly_less_time_than_a_nested_grid(moves: str) -> None:
+    case = Case("spotty", moves, "off", 20)
+    assert course(AdaptiveMap, case).until(GOAL) < 0.85 * course(NestedGrid, case).until(GOAL)
+
+
+def test_the_expected_error_is_about_the_true_one() -> None:
+    found = course(AdaptiveMap, Case("smooth", "fast", "off", 1), 0.15)
+    assert found.expected == pytest.approx(found.errors[-1], rel=0.6)
+
+
+def test_drift_is_found_from_the_values_alone() -> None:
+    drift = np.array([20e-12, -12e-12])
+    random = np.random.default_rng(1)
+    times_s = np.arange(300.0) * 20.0
+    # every place at several times, in no order
+    tip_m = random.uniform(-0.5e-6, 0.5e-6, (300, 2))
+    on_sample = tip_m - np.outer(times_s - times_s[0], drift)
+    values = np.sin(on_sample[:, 0] / 70e-9) + np.cos(on_sample[:, 1] / 60e-9)
+    found = fitted(tip_m, values, times_s, Parameters(150e-9, 0.01), 20e-9, drifts=True)
+    assert found.velocity_m_s == pytest.approx(tuple(drift), abs=2e-12)
+    still = fitted(tip_m, np.sin(tip_m[:, 0] / 70e-9), times_s, Parameters(150e-9, 0.01), 20e-9, drifts=True)
+    assert np.hypot(*still.velocity_m_s) < 2e-12
+
+
+def test_suggested_positions_follow_the_drift() -> None:
+    planned = AdaptiveMap(REGION, "height", velocity_m_s=(1e-9, 0.0))
+    (first,) = planned.suggest()
+    planned.ingest([{**first, "height": 0.0, "time_s": 100.0}])
+    (second,) = planned.suggest()
+    planned.ingest([{**second, "height": 0.0, "time_s": 150.0, "seconds": 50.0}])
+    (third,) = planned.suggest()
+    home = planned.lattice.xy_m([tuple(map(int, third["_id"].split("-")))])[0]  # type: ignore[list-item]
+    assert third["x"] - home[0] == pytest.approx(100e-9, rel=0.05)  # 50 s have passed, and 50 s it will take
+    assert third["y"] == pytest.approx(home[1])
+
+
+def test_prediction_passes_through_values_and_its_variance_grows_with_the_distance() -> None:
+    xy_m = np.random.default_rng(2).uniform(-0.5e-6, 0.5e-6, (60, 2))
+    model = GaussianProcess(xy_m, spot(xy_m), np.zeros(60), Parameters(100e-9, 1e-4))
+    assert model.predict(xy_m) == pytest.approx(spot(xy_m), abs=0.01)
+    near, far = model.variance(np.array([xy_m[0] + 2e-9, [3e-6, 3e-6]]))
+    assert near < 0.05 * far
+
+
+def test_positions_that_will_be_measured_lower_the_expected_error() -> None:
+    xy_m = np.random.default_rng(2).uniform(-0.5e-6, 0.5e-6, (30, 2))
+    model = GaussianProcess(xy_m, spot(xy_m), np.zeros(30), Parameters(100e-9, 1e-3))
+    place = np.array([[0.31e-6, 0.27e-6]])
+    assert model.variance(place, place + 5e-9)[0] < 0.2 * model.variance(place)[0]
+
+
+def test_cost_is_learnt_from_ways_and_seconds_without_interruptions() -> None:
+    ways_m = [1e-7 * k for k in range(1, 20)]
+    seconds = [2.5 + way / 20e-9 for way in ways_m]
+    seconds[4] += 3000.0  # a person took control
+    cost = learnt_cost(ways_m, seconds)
+    assert cost.fixed_s == pytest.approx(2.5, rel=0.01)
+    assert cost.per_m_s == pytest.approx(1 / 20e-9, rel=0.01)
+
+
+def test_tour_is_shorter_than_rows_where_positions_lie_in_groups() -> None:
+    random = np.random.default_rng(4)
+    cells = [
+        (int(i), int(j))
+        for x, y in ((0, 0), (60, 50), (5, 55))
+        for i, j in {tuple(pair) for pair in random.integers(0, 6, (15, 2)) + np.array([x, y])}
+    ]
+    xy = np.array(cells, dtype=float)
+    tour = short_tour(xy, np.zeros(2))
+    assert sorted(tour) == list(range(len(cells)))
+    assert way_m(xy[tour], np.zeros(2)) < 0.8 * way_m(np.array(snake(cells), dtype=float), np.zeros(2))
+
+
+def test_each_cell_is_new_in_one_level_and_its_parents_are_in_a_coarser_one() -> None:
+    lattice = Lattice(Region((0.0, 0.0), (2e-6, 1e-6), 0.3), coarsest=5, levels=3)
+    cells = [cell for level in range(4) for cell in lattice.new(level)]
+    assert sorted(cells) == sorted(lattice.cells(3))
+    for level in (1, 2, 3):
+        for cell in lattice.new(level):
+            assert set(lattice.parents(cell, level)) <= set(lattice.cells(level - 1))
+    corners = {tuple(np.round(xy, 12)) for xy in lattice.xy_m([(0, 0), (lattice.counts[0] - 1, lattice.counts[1] - 1)])}
+    assert corners <= {tuple(np.round(xy, 12)) for xy in lattice.region.corners_m()}
+
+
+def test_optimisers_fit_the_protocol_and_refuse_incomplete_measurements() -> None:
+    planned = AdaptiveMap(REGION, "height")
+    assert isinstance(planned, Optimizer)
+    (point,) = planned.suggest()
+    with pytest.raises(InvalidValue, match="height"):
+        planned.ingest([point])
+    with pytest.raises(InvalidValue, match="not finite"):
+        planned.ingest([{**point, "height": math.nan}])
+    with pytest.raises(InvalidValue, match="no _id"):
+        planned.ingest([{**point, "_id": "somewhere", "height": 1.0}])
+    assert len(planned.measurements) == 0
+    planned.ingest([{"x": 1e-8, "y": 0.0, "height": 1.0}])  # one of the user's own
+    assert len(planned.measurements) == 1
+    assert planned.get_best_points()[0][2] == {"height": 1.0}
+
+
+def test_a_batch_is_suggested_once_and_a_failed_position_is_left_out() -> None:
+    planned = AdaptiveMap(REGION, "height")
+    batch = planned.suggest(25)
+    assert len({point["_id"] for point in batch}) == 25
+    assert planned.suggest(1) == []  # the next round follows from values, which are not there yet
+    planned.ingest([{**point, "height": float(spot(np.array([point["x"], point["y"]])))} for point in batch[:-1]])
+    planned.register_failures(batch[-1:])
+    later = [planned.suggest(1)[0]["_id"] for _ in range(5)]
+    assert batch[-1]["_id"] not in later
