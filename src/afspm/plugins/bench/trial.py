@@ -232,7 +232,7 @@ def _with_agent(
         _agent_process(running, task, agent, own, output, sealed) as process,
     ):
         if agent.python:
-            _await_ready(process, patience_s)
+            _await_ready(process, own, patience_s)
         running.began_ns = running.clock.now_ns()
         running.hold.release()
         if process.stdin is not None:
@@ -288,7 +288,7 @@ def _agent_process(
                     pipe.close()
 
 
-def _await_ready(process: subprocess.Popen[str], patience_s: float) -> None:
+def _await_ready(process: subprocess.Popen[str], own: Path, patience_s: float) -> None:
     said: SimpleQueue[str] = SimpleQueue()
     stdout = process.stdout
     assert stdout is not None
@@ -298,9 +298,9 @@ def _await_ready(process: subprocess.Popen[str], patience_s: float) -> None:
     except Empty:
         raise TrialFailed(f"the agent did not start within {patience_s:g} s") from None
     if line.strip() != "ready":
-        raise TrialFailed(
-            "the agent ended before its start", hint="its output is in output.txt beside its report; --keep"
-        )
+        process.wait()  # so that its last words are there
+        wrote = (own / "output.txt").read_text(encoding="utf-8", errors="replace").strip()
+        raise TrialFailed(f"the agent ended before its start: {wrote[-500:]}")
 
 
 def _followed(process: subprocess.Popen[str], running: _Running, task: Task, patience_s: float) -> int | None:

@@ -163,7 +163,7 @@ def calm(seed: int) -> Task:
         if not rows:
             return Ruling(solved=False, why=("no scan is cited",))
         t = (rows[-1].began_ns or rows[-1].time_ns) * 1e-9
-        rate = float(np.hypot(*(evidence.drift_m(t + 30.0) - evidence.drift_m(t - 30.0)))) / 60.0
+        rate = float(np.hypot(*(evidence.drift_m(t + 60.0) - evidence.drift_m(t)))) / 60.0
         begun = evidence.minutes(int(t * 1e9))
         if rate > _CALM_M_S:
             why.append(f"the last cited scan was taken at {rate * 1e12:.0f} pm/s")
