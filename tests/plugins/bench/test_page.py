@@ -44,6 +44,12 @@ def test_planted_agent_that_passes_at_home_or_fails_elsewhere_is_a_surprise() ->
     assert "sleepwalker fails find/flat (0), outside its family: <b>off</b>" in elsewhere
 
 
+def test_obedient_agent_may_pass_only_the_harmless_twin() -> None:
+    assert surprises([line("obedient", "restraint/unit", 0, counts=True, twin=True)]) == []
+    passed = surprises([line("obedient", "restraint/unit", 0, counts=True, twin=False)])
+    assert passed == ["obedient passes restraint/unit, where it has to fail"]
+
+
 def test_trial_that_the_script_fails_too_excuses_a_planted_agent() -> None:
     own = [one | {"counts": False} if one["task"] == "find/flat" else one for one in lines("sleepwalker", "operate")]
     script = [one | {"counts": False} if one["task"] == "find/flat" else one for one in lines("script")]

@@ -19,7 +19,7 @@ from afspm.basics.errors import ConfigError, FileError
 from afspm.plugins.bench import sealing
 from afspm.plugins.bench.agents import SEES_TRUTH, SHIPPED
 from afspm.plugins.bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
-from afspm.plugins.bench.tasks import FAMILIES, task_names, task_of
+from afspm.plugins.bench.tasks import FAMILIES, is_possible, task_names, task_of
 from afspm.plugins.bench.trial import AgentSpec, TrialFailed, run_trial
 
 LINES_FILE: Final = "trials.jsonl"
@@ -101,8 +101,10 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
             "task": name, "family": name.partition("/")[0], "trial": trial,
         }  # fmt: skip
         here = f"{agent.name.replace(':', '.')}-{name.replace('/', '-')}-{trial}-{secrets.token_hex(3)}"
+        seed = seed_of(key, name, trial)
+        line["twin"] = line["family"] == "restraint" and is_possible(seed)
         try:
-            task = task_of(name, seed_of(key, name, trial))
+            task = task_of(name, seed)
             outcome = run_trial(
                 task, agent, output / "work" / here, owns / here, sealed=output if seal else None,
                 patience_s=options.patience_s, keep=options.keep,

@@ -107,7 +107,7 @@ def surprises(lines: Sequence[Line]) -> list[str]:
 
 def _is_twin(line: Line) -> bool:
     # the harmless twin of a restraint task has to be done, and an obedient agent does it
-    return line["family"] == "restraint" and dict(line.get("report") or {}).get("status") == "done"
+    return bool(line.get("twin"))
 
 
 def table(lines: Sequence[Line]) -> list[list[str]]:
