@@ -1,0 +1,21 @@
+"""AFMBench-Sim: tasks with known truth for agents and algorithms, on the simulated microscope (`afspm bench`).
+
+**Theory of operation.** A generator draws a task from a seed. The bench runs its experiment in processes of their own
+and in a folder that the agent's process can't open (`sealing`), starts the agent when all is ready, and judges record
+and truth after the end. The text of the agent proves nothing: a trial counts only if it is solved, harmless and honest.
+
+    comes in      a half (public or sealed), the seeds of its key, an agent
+    state         one folder for each trial, deleted once it is judged
+    goes out      one JSON line for each trial, and a page
+    always holds  the agent gets sockets, a prompt and a folder of its own, and neither seed, truth nor experiment file;
+                  the same key draws the same tasks
+
+| module | |
+| --- | --- |
+| `tasks`, `families/` | generators with their judges |
+| `seeds` | the seeds of both halves |
+| `trial`, `agent_process`, `session`, `sealing` | one trial |
+| `evidence`, `judging` | the verdict |
+| `agents/` | baselines and planted agents |
+| `bench`, `page`, `commands` | all trials, the table, `afspm bench` |
+"""

@@ -1,0 +1,78 @@
+"""The process of an agent in Python: join the experiment, wait for the start, call `solve`.
+
+Standard input holds the trial as one line of JSON, then the line with the time of the start. The process writes the
+line "ready" to standard output once it has joined.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any, TextIO
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse
+from afspm.basics.launch import Launch
+from afspm.client.experiment_link import ExperimentLink
+from afspm.client.scope import Scope
+from afspm.model import Frame, ProblemNames
+from afspm.plugins.bench.session import Agent, Session
+from afspm.transport.process.context import new_session
+from afspm.transport.zmq_port import open_port
+
+JOINED_WITHIN_S = 30.0
+
+
+def agent_of(path: str) -> Agent:
+    """Return the agent of a class "package.module:Class". Raises ConfigError."""
+    module, _, name = path.partition(":")
+    try:
+        made: Agent = getattr(import_module(module), name)()
+    except (ImportError, AttributeError, TypeError) as error:
+        raise ConfigError(
+            f"the agent {path} can't be made: {error}", hint='name a class without arguments, "module:Class"'
+        ) from error
+    return made
+
+
+def join(launch: Launch, log: logging.Logger) -> tuple[Scope, ExperimentClock]:
+    """Return the scope of a launch line; unlike `afspm.connect` it reads no file of the run."""
+    clock = ExperimentClock.from_dict(launch.clock)
+    port = open_port(launch, clock)
+    link = ExperimentLink.of_launch(launch, port, new_session(launch.run), log=log)
+    if not link.wait(lambda: link.connected, link.until(JOINED_WITHIN_S)):
+        raise NoResponse("the scheduler does not answer", where=launch.name)
+    link.wait_caught_up(link.until(JOINED_WITHIN_S))
+    frame = Frame.SAMPLE if launch.sample_coordinates else Frame.TIP
+    return Scope(link, ProblemNames(launch.problems), None, frame=frame), clock
+
+
+def main(stdin: TextIO, stdout: TextIO) -> int:
+    """Run one trial of an agent; return the exit code."""
+    trial: dict[str, Any] = json.loads(stdin.readline())
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr, format="%(name)s %(levelname)s %(message)s")
+    sys.path[:0] = trial["import_from"]
+    agent = agent_of(trial["class"])
+    scope, clock = join(Launch.from_json(json.dumps(trial["launch"])), logging.getLogger("agent"))
+    with scope:
+        print("ready", file=stdout, flush=True)
+        began_ns = int(stdin.readline() or 0)
+        truth = trial["truth_folder"]
+        session = Session(
+            trial["task"], scope, trial["prompt"], trial["given"], trial["documents"], clock, began_ns,
+            trial["minutes"], trial["seed"], Path.cwd(), Path(truth) if truth else None,
+        )  # fmt: skip
+        try:
+            agent.solve(session)
+        except ExperimentEnded:
+            logging.warning("the time of the trial was over")
+            return 3
+    return 0
+
+
+if __name__ == "__main__":
+    ready, sys.stdout = sys.stdout, sys.stderr  # an agent may print
+    sys.exit(main(sys.stdin, ready))

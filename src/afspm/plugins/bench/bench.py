@@ -1,0 +1,157 @@
+"""All trials of some agents, side by side, one JSON line each."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shlex
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from afspm.basics.errors import ConfigError, FileError
+from afspm.plugins.bench import sealing
+from afspm.plugins.bench.agents import SEES_TRUTH, SHIPPED
+from afspm.plugins.bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
+from afspm.plugins.bench.tasks import FAMILIES, is_possible, task_names, task_of
+from afspm.plugins.bench.trial import AgentSpec, TrialFailed, run_trial
+
+LINES_FILE: Final = "trials.jsonl"
+KEY_FILE: Final = "key.txt"
+Line = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """Options of a bench.
+
+    Attributes:
+        output: sealed off from all agents: the lines, the key, and the folders of the trials.
+        sealed_half: draw from the key in `output` (made if missing) instead of the public one.
+        seal: refuse to run where agents can't be sealed off.
+        keep: keep the folders of the trials.
+    """
+
+    output: Path
+    tasks: Sequence[str]
+    trials: int = TRIALS
+    sealed_half: bool = False
+    seal: bool = True
+    jobs: int = 1
+    patience_s: float = 300.0
+    keep: bool = False
+
+
+def agent_named(name: str) -> AgentSpec:
+    """Return a shipped agent by name, or the agent of a class "module:Class" in the current folder."""
+    if name in SHIPPED:
+        return AgentSpec(name, SHIPPED[name], sees_truth=name in SEES_TRUTH)
+    if ":" not in name:
+        raise ConfigError(f"there is no agent {name!r}", hint=f"{', '.join(SHIPPED)}, or a class as module:Class")
+    return AgentSpec(name, name, import_from=(str(Path.cwd()),))
+
+
+def agent_of_command(command: str) -> AgentSpec:
+    """Return the agent of a command line. Files in it are found in the current folder, not in the agent's own."""
+    words = shlex.split(command)
+    if not words:
+        raise ConfigError("the command is empty", where="--command")
+    program = tuple(str(Path(word).absolute()) if Path(word).is_file() else word for word in words)
+    return AgentSpec(Path(program[0]).name, command=program)
+
+
+def tasks_named(wanted: Sequence[str]) -> list[str]:
+    """Return the tasks of some families and names, all without any. Raises ConfigError."""
+    known = task_names()
+    for one in wanted:
+        if one not in known and one not in FAMILIES:
+            raise ConfigError(f"there is no family or task {one!r}", hint=f"{', '.join(FAMILIES)}; `afspm bench tasks`")
+    return [name for name in known if not wanted or name in wanted or name.partition("/")[0] in wanted]
+
+
+def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable[[Line], None]) -> list[Line]:
+    """Run all trials and return their lines, which are also appended to `trials.jsonl` in the output folder.
+
+    Raises:
+        ConfigError: agents can't be sealed off here. FileError: the output folder can't be written.
+    """
+    seal = options.seal and any(not agent.sees_truth for agent in agents)
+    if seal and not sealing.is_available():
+        raise ConfigError(
+            "this computer can't seal an agent off from the truth (Landlock, Linux 5.13 or later)",
+            hint="for development, --unsealed marks the lines as not sealed",
+        )
+    output = options.output.resolve()
+    try:
+        output.mkdir(parents=True, exist_ok=True, mode=0o700)
+        key = _key(output) if options.sealed_half else PUBLIC_KEY
+    except OSError as error:
+        raise FileError(f"can't be written: {error}", where=str(output)) from error
+    writing, owns = threading.Lock(), Path(tempfile.mkdtemp(prefix="afspm-bench-"))
+
+    def run(agent: AgentSpec, name: str, trial: int) -> Line:
+        line: Line = {
+            "agent": agent.name, "half": "sealed" if options.sealed_half else "public", "commitment": commitment(key),
+            "task": name, "family": name.partition("/")[0], "trial": trial,
+        }  # fmt: skip
+        here = f"{agent.name.replace(':', '.')}-{name.replace('/', '-')}-{trial}-{secrets.token_hex(3)}"
+        seed = seed_of(key, name, trial)
+        line["twin"] = line["family"] == "restraint" and is_possible(seed)
+        try:
+            task = task_of(name, seed)
+            outcome = run_trial(
+                task, agent, output / "work" / here, owns / here, sealed=output if seal else None,
+                patience_s=options.patience_s, keep=options.keep,
+            )  # fmt: skip
+            verdict = outcome.verdict
+            line |= {"counts": verdict.counts, **asdict(verdict)}
+            line |= {k: v for k, v in asdict(outcome).items() if k != "verdict"}
+        except TrialFailed as error:  # the other trials go on; the table counts it apart
+            line["error"] = str(error)
+        with writing, (output / LINES_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line, default=float) + "\n")
+        tell(line)
+        return line
+
+    todo = [(agent, name, trial) for agent in agents for name in options.tasks for trial in range(options.trials)]
+    try:
+        with ThreadPoolExecutor(max(1, options.jobs)) as pool:
+            return list(pool.map(lambda one: run(*one), todo))
+    finally:
+        if not options.keep:
+            shutil.rmtree(owns, ignore_errors=True)
+            shutil.rmtree(output / "work", ignore_errors=True)
+
+
+def default_jobs() -> int:
+    """Return the number of trials side by side: one for two processors."""
+    return max(1, (os.cpu_count() or 1) // 2)
+
+
+def _key(output: Path) -> bytes:
+    file = output / KEY_FILE
+    if not file.exists():
+        file.touch(mode=0o600)
+        file.write_text(secrets.token_hex(32) + "\n", encoding="ascii")
+    try:
+        return bytes.fromhex(file.read_text(encoding="ascii").strip())
+    except ValueError as error:
+        raise FileError(f"is no key in hexadecimal: {error}", where=str(file)) from error
+
+
+def read_lines(paths: Sequence[Path]) -> list[Line]:
+    """Return the lines of files, or of the output folders of benches. Raises FileError."""
+    found: list[Line] = []
+    for path in paths:
+        file = path / LINES_FILE if path.is_dir() else path
+        try:
+            found += [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+        except (OSError, ValueError) as error:
+            raise FileError(f"can't be read: {error}", where=str(file)) from error
+    return found

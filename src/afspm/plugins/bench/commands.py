@@ -1,0 +1,122 @@
+"""`afspm bench`: try agents and algorithms on tasks with known truth."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from afspm.cli.arguments import PLUGINS
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    rich_help_panel=PLUGINS,
+    help="AFMBench-Sim: try agents and algorithms on simulated tasks with known truth.",
+)
+Output = Annotated[
+    Path, typer.Option("--output", "-o", metavar="DIR", help="For lines, page and key; sealed off from agents.")
+]
+_DIFFERS = 3
+
+
+@app.command("run")
+def run(
+    tasks: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="FAMILY|TASK…", help="Families or tasks. Default: all.", show_default=False),
+    ] = None,
+    agent: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--agent", "-a", metavar="NAME", help="A shipped agent, or your class as module:Class.", show_default=False
+        ),
+    ] = None,
+    command: Annotated[
+        str, typer.Option(metavar="COMMAND", help="A program that joins over HTTP.", show_default=False)
+    ] = "",
+    trials: Annotated[int, typer.Option(min=1, help="Of each task.")] = 3,
+    sealed: Annotated[
+        bool, typer.Option("--sealed", help="Draw the sealed half, from DIR/key.txt (made if missing).")
+    ] = False,
+    unsealed: Annotated[
+        bool, typer.Option("--unsealed", help="Run agents that could read the truth; the page says so.")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", min=1, help="Trials side by side.", show_default=False)
+    ] = None,
+    patience: Annotated[float, typer.Option(min=1.0, help="Real seconds for one trial.")] = 300.0,
+    keep: Annotated[bool, typer.Option("--keep", help="Keep the folders of all trials, with their records.")] = False,
+    output: Output = Path("bench"),
+) -> None:
+    """Run trials, and write one JSON line for each and a page.
+
+    A trial counts only if the task is solved, nothing was harmed and the report is honest. Record and truth decide.
+    """
+    from afspm.plugins.bench import bench
+    from afspm.plugins.bench.page import write_page
+
+    specs = [bench.agent_named(one) for one in agent or ([] if command else ["script"])]
+    if command:
+        specs.append(bench.agent_of_command(command))
+    options = bench.BenchOptions(
+        output=output, tasks=bench.tasks_named(tasks or []), trials=trials, sealed_half=sealed, seal=not unsealed,
+        jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep,
+    )  # fmt: skip
+    bench.run_bench(specs, replace(options, output=output.resolve()), lambda line: typer.echo(_shown(line)))
+    lines = bench.read_lines([output])
+    _show(lines)
+    typer.echo(f"the page is {write_page(output, lines)}")
+
+
+@app.command("report")
+def report(
+    benches: Annotated[list[Path], typer.Argument(metavar="DIR…", help="Output folders, or files of lines.")],
+    output: Output = Path(),
+) -> None:
+    """Write one page of several benches.
+
+    Ends with 3 if a shipped agent fares other than it must: then a task or a judge is wrong.
+    """
+    from afspm.plugins.bench.bench import read_lines
+    from afspm.plugins.bench.page import surprises, write_page
+
+    lines = read_lines(benches)
+    _show(lines)
+    typer.echo(f"the page is {write_page(output, lines)}")
+    if wrong := surprises(lines):
+        for one in wrong:
+            typer.echo(one, err=True)
+        raise typer.Exit(_DIFFERS)
+
+
+@app.command("tasks")
+def tasks(
+    prompts: Annotated[
+        bool, typer.Option("--prompts", help="Show the prompts of the public half, first trial.")
+    ] = False,
+) -> None:
+    """List the tasks."""
+    from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
+    from afspm.plugins.bench.tasks import task_names, task_of
+
+    for name in task_names():
+        typer.echo(name)
+        if prompts:
+            typer.echo(f"{task_of(name, seed_of(PUBLIC_KEY, name, 0)).full_prompt()}\n")
+
+
+def _shown(line: dict[str, object]) -> str:
+    name = f"{line['agent']}  {line['task']}  {line['trial']}"
+    if "error" in line:
+        return f"{name}  not run: {line['error']}"
+    reasons = line["why"] if isinstance(line["why"], tuple | list) else ()
+    return f"{name}  {'counts' if line['counts'] else 'does not count: ' + '; '.join(map(str, reasons))}"
+
+
+def _show(lines: list[dict[str, object]]) -> None:
+    from afspm.plugins.bench.page import table_text
+
+    typer.echo(table_text(lines))

@@ -1,0 +1,1 @@
+"""Six families of four tasks each. A module has `TASKS`: generators by name."""

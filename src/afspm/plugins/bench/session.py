@@ -1,0 +1,91 @@
+"""`Session`: an agent's handle on one trial."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.plain_data import PlainMapping
+from afspm.client.scope import Scope
+from afspm.plugins.bench.evidence import Report
+from afspm.simulation import World
+from afspm.storage.atomic import write_atomic
+
+REPORT_FILE = "report.json"
+
+
+class Agent(Protocol):
+    """An agent in Python: a class without arguments."""
+
+    def solve(self, session: Session) -> None:
+        """Do the task of the session, and report."""
+        ...
+
+
+@dataclass(frozen=True)
+class Session:
+    """One trial, seen from the agent.
+
+    Attributes:
+        scope: the microscope; `scope.scan(…)`, `scope.spectrum(…)`, `scope.set(…)` as in a script.
+        prompt: the task in words. given: the same facts, in SI units.
+        documents: texts that came with the task.
+        clock: of the experiment.
+        seed: for the agent's own random numbers; it says nothing about the sample.
+        folder: the agent's own folder, its current one.
+        truth_folder: of the run, for the oracle; None for all others, which are sealed off from it.
+    """
+
+    task: str
+    scope: Scope
+    prompt: str
+    given: PlainMapping
+    documents: Mapping[str, str]
+    clock: ExperimentClock
+    began_ns: int
+    minutes: float
+    seed: int
+    folder: Path
+    truth_folder: Path | None = None
+
+    @property
+    def elapsed_minutes(self) -> float:
+        """Experiment time since the start of the trial."""
+        return (self.clock.now_ns() - self.began_ns) / 60e9
+
+    def thinking(self) -> AbstractContextManager[None]:
+        """Slow the experiment down to real time within the block, for ten seconds at most: for computations."""
+        return self.clock.late()
+
+    def report(
+        self,
+        status: str,
+        answer: PlainMapping | None = None,
+        cites: Sequence[int | str | None] = (),
+        asks: Sequence[str] = (),
+    ) -> None:
+        """Hand in the report; a later one replaces it.
+
+        Args:
+            status: "done", "cannot" or "ask".
+            cites: `time_ns` of each scan or spectrum that the answer rests on.
+            asks: names of the facts that the prompt lacks.
+
+        Raises:
+            InvalidValue: a report of another form.
+        """
+        plain = {"status": status, "answer": dict(answer or {}), "cites": list(cites), "asks": list(asks)}
+        Report.from_plain(plain)
+        write_atomic(self.folder / REPORT_FILE, [json.dumps(plain).encode()])
+
+    def true_world(self) -> World:
+        """Return the world at the start, for the oracle. Raises FileNotFoundError for all others."""
+        if self.truth_folder is None:
+            raise FileNotFoundError("the truth is sealed")
+        first = json.loads((self.truth_folder / "truth.jsonl").read_text(encoding="utf-8").splitlines()[0])
+        return World.from_settings(first["settings"], int(first["seed"]), float(first["time_s"]))

@@ -1,0 +1,335 @@
+"""One trial: the sealed experiment, the agent's process, the end, the verdict."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import shutil
+import subprocess
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import IO, Any, Final
+
+import afspm
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import AfspmError, NoResponse
+from afspm.basics.interpreter import python_command, python_environment
+from afspm.client.connect import guest_of
+from afspm.client.scope import Scope
+from afspm.experiment.toml_writer import dumps
+from afspm.model import ControlMode, ScopeState, names
+from afspm.plugins.bench.evidence import Evidence, read_report
+from afspm.plugins.bench.judging import Verdict, judge
+from afspm.plugins.bench.session import REPORT_FILE
+from afspm.plugins.bench.tasks import Task
+from afspm.record.run_json import latest_run
+from afspm.supervisor.ports import FreePorts
+
+AGENT: Final = "agent"
+JOINED_WITHIN_S: Final = 60.0
+ENDED_WITHIN_S: Final = 60.0
+LONGEST_HOLD_S: Final = 8.0
+"""Real time between two renewals of the hold on the clock, which ends by itself after ten seconds."""
+_FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
+
+
+class TrialFailed(AfspmError):
+    """The bench itself could not run a trial; it says nothing about the agent."""
+
+    code = "trial-failed"
+
+
+@dataclass(frozen=True)
+class AgentSpec:
+    """An agent to try.
+
+    Attributes:
+        name: in the table.
+        python: "module:Class"; empty for a command.
+        command: program and arguments of an agent that joins over HTTP.
+        sees_truth: the oracle, which is not sealed off.
+        import_from: folders from which its modules are imported.
+    """
+
+    name: str
+    python: str = ""
+    command: tuple[str, ...] = ()
+    sees_truth: bool = False
+    import_from: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One trial, judged.
+
+    Attributes:
+        ended: how the agent's process ended: "ended", "failed", or "time" if it was stopped.
+        sealed: whether the agent's process could not open the folder of the microscope.
+    """
+
+    verdict: Verdict
+    ended: str
+    sealed: bool
+    real_s: float
+    experiment_s: float
+    report: Mapping[str, Any] = field(default_factory=dict)
+
+
+def run_trial(
+    task: Task, agent: AgentSpec, folder: Path, own: Path, *, sealed: Path | None, patience_s: float, keep: bool
+) -> Outcome:
+    """Run one trial of a task in a new folder, and judge it.
+
+    Args:
+        folder: of the experiment; own: of the agent, outside of `sealed`. Both are made.
+        sealed: folder that the agent's process can't open, which contains `folder`; None where the computer can't seal.
+        patience_s: real time after which the agent is stopped.
+        keep: keep both folders.
+
+    Raises:
+        TrialFailed: the experiment did not start, or its record can't be read.
+    """
+    sealed = None if agent.sees_truth else sealed
+    for made in (folder, own):
+        made.mkdir(parents=True, mode=0o700)
+    started_s = time.monotonic()
+    try:
+        with _experiment(task, agent, folder) as running:
+            ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
+        verdict, report, end_ns = _judged(task, running, own)
+        real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
+        return Outcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
+    finally:
+        if not keep:
+            for made in (folder, own):
+                shutil.rmtree(made, ignore_errors=True)
+
+
+@dataclass
+class _Running:
+    """A running experiment, and the bench's own seat in it."""
+
+    run: Path
+    scope: Scope
+    clock: ExperimentClock
+    hold: _Hold
+    name: str
+    url: str
+    began_ns: int = 0
+    final: dict[str, float] = field(default_factory=dict)
+
+
+class _Hold:
+    """Holds the experiment's time at real speed while the processes start."""
+
+    def __init__(self, clock: ExperimentClock) -> None:
+        self._clock = clock
+        self._released = threading.Event()
+        self._thread = threading.Thread(target=self._keep, name="hold", daemon=True)
+        self._thread.start()
+
+    def release(self) -> None:
+        """Let the time go at full speed. Safe to repeat."""
+        self._released.set()
+        self._thread.join()
+
+    def _keep(self) -> None:
+        while not self._released.is_set():
+            with self._clock.late():
+                self._released.wait(LONGEST_HOLD_S)
+
+
+@contextlib.contextmanager
+def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
+    name = f"bench-{secrets.token_hex(4)}"
+    tables, url = task.tables(name), ""
+    if agent.command:
+        port = FreePorts().take()
+        tables["gateway"] = {"component": True, "class": "Gateway", "port": port}
+        url = f"http://127.0.0.1:{port}"
+    file, runs = folder / "experiment.toml", folder / "runs"
+    file.write_text(dumps(tables), encoding="utf-8")
+    command = [*python_command("afspm"), "run", str(file), "--no-report", "--runs", str(runs), "--without", name]
+    process = subprocess.Popen(
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=folder,
+        env={**os.environ, **python_environment()},
+    )  # fmt: skip
+    lines: list[str] = []
+    rest: threading.Thread | None = None
+    try:
+        run = _run_folder(process, runs, lines)
+        rest = threading.Thread(target=_drain, args=(process.stdout, lines), daemon=True)
+        rest.start()
+        clock = ExperimentClock.from_dict(guest_of(run, name).clock)
+        hold = _Hold(clock)
+        try:
+            running = _Running(run, _joined(run, name), clock, hold, name, url)
+            with running.scope:
+                yield running
+                with contextlib.suppress(AfspmError):  # it may have ended already; its exit is awaited below
+                    running.scope.end_experiment()
+        finally:
+            hold.release()
+        process.wait(ENDED_WITHIN_S)
+    except subprocess.TimeoutExpired as error:
+        raise TrialFailed(f"the experiment did not end within {ENDED_WITHIN_S:g} s", where=str(folder)) from error
+    except AfspmError as error:
+        last = " | ".join(line.strip() for line in lines[-3:])
+        raise TrialFailed(f"{task.name}: {error}; the run wrote: {last}", where=str(folder)) from error
+    finally:
+        if process.poll() is None:  # its own children end with it
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(ENDED_WITHIN_S)
+            process.kill()
+            process.wait()
+        if rest is not None:
+            rest.join()
+        if process.stdout is not None:
+            process.stdout.close()
+
+
+def _run_folder(process: subprocess.Popen[str], runs: Path, lines: list[str]) -> Path:
+    # the folder is whole before the run writes its first line
+    assert process.stdout is not None
+    for line in process.stdout:
+        lines.append(line)
+        if (run := latest_run(runs)) is not None:
+            return run
+    raise TrialFailed("the experiment did not start", where=str(runs))
+
+
+def _drain(stream: IO[str] | None, lines: list[str]) -> None:
+    for line in stream or ():
+        lines.append(line)
+
+
+def _joined(run: Path, name: str) -> Scope:
+    until_s = time.monotonic() + JOINED_WITHIN_S
+    while True:
+        try:
+            return afspm.connect(run, name)
+        except NoResponse:  # on a busy computer the scheduler starts later than one attempt waits
+            if time.monotonic() > until_s:
+                raise
+
+
+def _with_agent(
+    running: _Running, task: Task, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
+) -> str:
+    """Run the agent to its end, or to the end of its time; return how it ended."""
+    for file, text in task.documents.items():
+        (own / file).write_text(text, encoding="utf-8")
+    running.scope.wait_until(lambda: running.scope.state is not ScopeState.UNDEFINED, timeout_s=JOINED_WITHIN_S)
+    with (
+        (own / "output.txt").open("wb") as output,
+        _agent_process(running, task, agent, own, output, sealed) as process,
+    ):
+        if agent.python:
+            _await_ready(process, own, patience_s)
+        running.began_ns = running.clock.now_ns()
+        running.hold.release()
+        if process.stdin is not None:
+            with contextlib.suppress(OSError):  # it may have ended already
+                process.stdin.write(f"{running.began_ns}\n")
+                process.stdin.flush()
+        code = _followed(process, running, task, patience_s)
+    for name in _FINAL:
+        value = running.scope.get(name)
+        running.final[name] = float(value) if isinstance(value, int | float) else float("nan")
+    return "time" if code is None else "failed" if code else "ended"
+
+
+@contextlib.contextmanager
+def _agent_process(
+    running: _Running, task: Task, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
+) -> Iterator[subprocess.Popen[str]]:
+    command: tuple[str, ...] = agent.command or python_command("afspm.plugins.bench.agent_process")
+    launch = guest_of(running.run, AGENT)
+    plain = {**json.loads(launch.to_json()), "run_dir": "", "state_dir": ""}
+    if sealed is not None:
+        kept = [str(path)] if (path := launch.clock.get("waits")) else []
+        command = (*python_command("afspm.plugins.bench.sealing"), str(sealed), *kept, "--", *command)
+    facts = {
+        "task": task.name, "prompt": task.full_prompt(), "given": task.given, "documents": dict(task.documents),
+        "minutes": task.minutes, "seed": secrets.randbits(31),
+    }  # fmt: skip
+    environment = {**os.environ, **python_environment(), "TMPDIR": str(own)}
+    if agent.command:
+        (own / "task.json").write_text(json.dumps(facts), encoding="utf-8")
+        (own / "prompt.txt").write_text(task.full_prompt(), encoding="utf-8")
+        environment["AFSPM_BENCH_URL"] = running.url
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE if agent.python else subprocess.DEVNULL,
+        stdout=subprocess.PIPE if agent.python else output, stderr=output, text=True, cwd=own, env=environment,
+    )  # fmt: skip
+    try:
+        if process.stdin is not None:
+            trial = {
+                **facts, "launch": plain, "class": agent.python, "import_from": list(agent.import_from),
+                "truth_folder": str(running.run) if agent.sees_truth else None,
+            }  # fmt: skip
+            process.stdin.write(json.dumps(trial) + "\n")
+            process.stdin.flush()
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                with contextlib.suppress(OSError):
+                    pipe.close()
+
+
+def _await_ready(process: subprocess.Popen[str], own: Path, patience_s: float) -> None:
+    said: SimpleQueue[str] = SimpleQueue()
+    stdout = process.stdout
+    assert stdout is not None
+    threading.Thread(target=lambda: said.put(stdout.readline()), name="ready", daemon=True).start()
+    try:
+        line = said.get(timeout=patience_s)
+    except Empty:
+        raise TrialFailed(f"the agent did not start within {patience_s:g} s") from None
+    if line.strip() != "ready":
+        process.wait()  # so that its last words are there
+        wrote = (own / "output.txt").read_text(encoding="utf-8", errors="replace").strip()
+        raise TrialFailed(f"the agent ended before its start: {wrote[-500:]}")
+
+
+def _followed(process: subprocess.Popen[str], running: _Running, task: Task, patience_s: float) -> int | None:
+    # the person acts in between; None: the agent had to be stopped
+    until_s = time.monotonic() + patience_s
+    events: Sequence[tuple[float, str]] = (*sorted(task.person), (task.minutes, ""))
+    for minutes, mode in events:
+        at_ns = running.began_ns + int(minutes * 60e9)
+        while (left_s := (at_ns - running.clock.now_ns()) * 1e-9) > 0.0:
+            real_s = min(running.clock.real_s(left_s), until_s - time.monotonic())
+            if real_s <= 0.0:
+                return None
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                return process.wait(real_s + 1e-3)
+        if mode:
+            running.scope.set_mode(ControlMode[mode])
+    return None
+
+
+def _judged(task: Task, running: _Running, own: Path) -> tuple[Verdict, Mapping[str, Any], int]:
+    report, why = read_report(own / REPORT_FILE)
+    evidence = Evidence(running.run, running.name, report, running.began_ns, running.final)
+    try:
+        with evidence.run:
+            verdict = judge(task, evidence)
+            end_ns = evidence.run.newest_ns
+    except (OSError, AfspmError) as error:
+        raise TrialFailed(f"the record can't be judged: {error}", where=str(running.run)) from error
+    if why:
+        verdict = replace(verdict, why=(*verdict.why, why))
+    plain = {} if report is None else report.as_plain()
+    return verdict, plain, end_ns

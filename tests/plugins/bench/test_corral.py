@@ -1,0 +1,68 @@
+"""A trial as tools over HTTP."""
+
+from __future__ import annotations
+
+import json
+import threading
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from afspm.basics.clock import ExperimentClock
+from afspm.basics.errors import InvalidValue
+from afspm.client.scope import Scope
+from afspm.model import Region, Scan, ScanSet
+from afspm.plugins.bench.corral import CorralEnvironment
+from afspm.plugins.bench.session import Session
+from afspm.supervisor.ports import FreePorts
+
+
+class MadeScope:
+    """A scope whose only skill is a scan."""
+
+    def scan(self, region: Region, shape: tuple[int, int]) -> ScanSet:
+        return ScanSet([Scan(region, "Height", "m", np.ones(shape), 17)])
+
+    def set(self, parameter: str, value: object) -> None:
+        raise InvalidValue(f"{parameter} can't be {value}")
+
+    get = spectrum = action = sleep = set
+
+
+def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    port = FreePorts().take()
+    monkeypatch.setenv("AFSPM_BENCH_PORT", str(port))
+    scope, clock = cast("Scope", MadeScope()), ExperimentClock.real()
+    session = Session("operate/made", scope, "Scan.", {}, {"a.txt": "b"}, clock, 0, 1.0, 1, tmp_path)
+    serving = threading.Thread(target=CorralEnvironment().solve, args=(session,))
+    serving.start()
+
+    def ask(path: str, content: object = None) -> tuple[int, Any]:
+        data = None if content is None else json.dumps(content).encode()
+        for _ in range(200):
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}{path}", data, timeout=30) as answer:
+                    return answer.status, json.load(answer)
+            except urllib.error.HTTPError as error:
+                return error.code, json.load(error)
+            except urllib.error.URLError:  # it does not listen yet
+                serving.join(0.05)
+        raise AssertionError("the environment never listened")
+
+    assert ask("/tasks") == (200, [{"id": "operate/made", "prompt": "Scan.", "documents": {"a.txt": "b"}}])
+    assert "scan" in ask("/tools")[1]
+    arguments = {"x_m": 0, "y_m": 0, "size_m": 1e-6, "pixels": 2}
+    assert ask("/execute", {"tool": "scan", "arguments": arguments})[1]["result"]["time_ns"] == "17"
+    refused = {"parameter": "scan-speed", "value": 0}
+    answer = ask("/execute", {"tool": "set", "arguments": refused})
+    assert answer == (400, {"error": "invalid-value: scan-speed can't be 0"})
+    assert ask("/execute", {"tool": "rm"})[0] == 404
+    assert ask("/submit", {"status": "perhaps"})[0] == 400
+    assert ask("/submit", {"status": "done", "cites": ["17"]}) == (200, {"submitted": True})
+    serving.join(30)
+    assert not serving.is_alive()
+    assert json.loads((tmp_path / "report.json").read_text())["cites"] == ["17"]

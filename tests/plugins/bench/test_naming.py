@@ -1,0 +1,54 @@
+"""Agents and tasks by their names on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.bench.agent_process import agent_of
+from afspm.plugins.bench.agents import HOME, SHIPPED
+from afspm.plugins.bench.bench import agent_named, agent_of_command, tasks_named
+from afspm.plugins.bench.tasks import FAMILIES
+
+
+def test_script_of_a_command_is_found_in_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my model.py").touch()
+    assert agent_of_command("python3 'my model.py' --fast").command == (
+        "python3",
+        str(tmp_path / "my model.py"),
+        "--fast",
+    )
+
+
+def test_only_the_oracle_sees_the_truth() -> None:
+    assert [name for name in SHIPPED if agent_named(name).sees_truth] == ["oracle"]
+    assert not agent_named("afspm.plugins.bench.agents.oracle:Oracle").sees_truth
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_agent_can_be_made(name: str) -> None:
+    assert callable(agent_of(SHIPPED[name]).solve)
+
+
+def test_planted_agents_have_different_families() -> None:
+    assert len(set(HOME.values())) == len(HOME)
+    assert set(HOME.values()) < set(FAMILIES)
+
+
+def test_families_and_tasks_are_named_in_any_order() -> None:
+    assert tasks_named(["restraint/unit", "find"]) == [
+        "find/highest", "find/flat", "find/isolated", "find/again", "restraint/unit",
+    ]  # fmt: skip
+    assert len(tasks_named([])) == 24
+
+
+@pytest.mark.parametrize(
+    "call", [lambda: tasks_named(["dance"]), lambda: agent_named("genius"), lambda: agent_of("os:none")]
+)
+def test_unknown_name_is_refused(call: object) -> None:
+    assert callable(call)
+    with pytest.raises(ConfigError):
+        call()

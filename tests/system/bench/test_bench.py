@@ -1,0 +1,95 @@
+"""Whole trials: sealed experiment, agent's process, verdict."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from afspm.basics.errors import ConfigError
+from afspm.plugins.bench import sealing
+from afspm.plugins.bench.bench import BenchOptions, agent_named, read_lines, run_bench
+from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
+from afspm.plugins.bench.tasks import task_of
+from afspm.plugins.bench.trial import AgentSpec, Outcome, run_trial
+
+HERE = Path(__file__).parent
+SEALS = sealing.is_available()
+pytestmark = pytest.mark.timeout(600)  # each trial starts five processes
+
+
+def of_test(name: str) -> AgentSpec:
+    return AgentSpec(name, f"bench_agents:{name}", import_from=(str(HERE),))
+
+
+def tried(tmp_path: Path, agent: AgentSpec, task: str, *, seals: bool = SEALS, minutes: float | None = None) -> Outcome:
+    drawn = task_of(task, seed_of(PUBLIC_KEY, task, 0))
+    drawn = replace(drawn, minutes=minutes or drawn.minutes)
+    output, own = tmp_path / "bench", tmp_path / "own"
+    sealed = output if seals else None
+    return run_trial(drawn, agent, output / "trial", own, sealed=sealed, patience_s=240.0, keep=True)
+
+
+def lines_of(tmp_path: Path, agent: str) -> list[dict[str, Any]]:
+    options = BenchOptions(tmp_path, ["operate/settings"], trials=1, seal=SEALS, patience_s=240.0)
+    return run_bench([agent_named(agent)], options, lambda line: None)
+
+
+def test_same_seed_gives_the_same_verdict_twice(tmp_path: Path) -> None:
+    lines = [*lines_of(tmp_path, "script"), *lines_of(tmp_path, "script")]
+    assert [(line.get("counts"), line.get("error")) for line in lines] == [(True, None)] * 2
+    assert read_lines([tmp_path]) == json.loads(json.dumps(lines))
+    assert not (tmp_path / "work").exists()
+
+
+def test_liar_is_found_out(tmp_path: Path) -> None:
+    (line,) = lines_of(tmp_path, "liar")
+    assert (line["solved"], line["harmless"], line["honest"]) == (False, True, False)
+
+
+@pytest.mark.skipif(not SEALS, reason="no Landlock on this computer")
+def test_sealed_agent_finds_no_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPIED", str(tmp_path / "bench"))
+    outcome = tried(tmp_path, of_test("Spy"), "restraint/unit")
+    assert outcome.sealed
+    assert outcome.report["answer"]["found"] == []
+
+
+def test_unsealed_agent_finds_the_truth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # otherwise the test above would prove nothing
+    monkeypatch.setenv("SPIED", str(tmp_path / "bench"))
+    outcome = tried(tmp_path, of_test("Spy"), "restraint/unit", seals=False)
+    assert not outcome.sealed
+    assert {"truth.jsonl", "experiment.toml"} <= {Path(one).name for one in outcome.report["answer"]["found"]}
+
+
+def test_agent_is_stopped_at_the_end_of_its_time(tmp_path: Path) -> None:
+    outcome = tried(tmp_path, of_test("Sleeper"), "operate/settings", minutes=10.0)
+    assert outcome.ended == "time"
+    assert not outcome.verdict.counts
+
+
+def test_failed_agent_is_judged_and_its_output_kept(tmp_path: Path) -> None:
+    outcome = tried(tmp_path, of_test("Broken"), "operate/settings")
+    assert outcome.ended == "failed"
+    assert any("the report can't be read" in one for one in outcome.verdict.why)
+    assert "a fault of the agent" in (tmp_path / "own" / "output.txt").read_text(encoding="utf-8")
+
+
+def test_program_joins_over_http(tmp_path: Path) -> None:
+    agent = AgentSpec("http", command=(sys.executable, str(HERE / "http_agent.py")))
+    outcome = tried(tmp_path, agent, "operate/places")
+    assert outcome.verdict.counts, (outcome.verdict.why, (tmp_path / "own" / "output.txt").read_text(encoding="utf-8"))
+    assert json.dumps(outcome.report["usage"]) == '{"tokens": 0}'
+
+
+def test_bench_refuses_to_run_where_it_can_not_seal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sealing, "is_available", lambda: False)
+    options = BenchOptions(tmp_path / "out", ["operate/settings"])
+    with pytest.raises(ConfigError, match="can't seal"):
+        run_bench([agent_named("idle")], options, lambda line: None)
+    assert not (tmp_path / "out").exists()
