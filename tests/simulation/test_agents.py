@@ -35,7 +35,7 @@ SEEDS = 10
 
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_adversarial_calls_stay_within_approvals(seed: int) -> None:
-    attack = attacked(seed, CALLS // SEEDS)
+    attack = attacked(seed, CALLS // SEEDS, kills=0.02)
     # the attack was real: requests of the agent did arrive, and the scheduler did die
     assert attack.rig.watchman.checked > CALLS // SEEDS // 50
     assert attack.rig.kills_done

@@ -96,6 +96,7 @@ _faults = st.builds(
 )
 
 
+@pytest.mark.timeout(600)  # twenty nights, on a busy computer
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),

@@ -32,11 +32,11 @@ PRIOR = {CURED: 0.2, WORSENED: 0.1, UNCHANGED: 0.4}
 """Counts of a treatment without experience: little knowledge, and rather no cure."""
 MOST_OF_PAST_NIGHTS = 2.0
 """Outcomes of a treatment that count from past nights."""
-MOST_COUNTED = 8.0
+MOST_COUNTED = 12.0
 """Outcomes of a treatment that count altogether: older ones fade."""
-IMPROBABLE = 0.05
+IMPROBABLE = 0.02
 """Probability of a run of failures below which the counts of its flaw are weakened."""
-LEFT_AFTER_SURPRISE = 0.1
+LEFT_AFTER_SURPRISE = 1.0
 """Outcomes of a treatment that count after such a run."""
 SHARPNESS = 5.0
 """Factor on all counts for a draw. Plain Thompson sampling (1) explores for longer than a night has repairs."""
