@@ -15,8 +15,7 @@ from afspm.basics.formatting import counted, period_text
 from afspm.record.catalogue import RunSummary
 from afspm.record.drawing.image_html import data_url
 from afspm.record.report import pictures
-from afspm.record.report.markup import section
-from afspm.record.report.style import CSS
+from afspm.record.report.markup import document, section
 from afspm.record.run import open_run
 from afspm.storage.atomic import replace_file
 
@@ -40,13 +39,8 @@ def write_page(root: Path, runs: Sequence[RunSummary]) -> Path:
     cards = "".join(_card(root, run) for run in runs)
     body = f"<header><h1>{escape(root.resolve().name)}</h1><p>{counted(len(runs), 'run')}</p></header>"
     body += section("", f'<div class="runs">{cards}</div>')
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>Runs</title><style>{CSS}{_CSS}</style></head><body><main>{body}</main></body></html>\n"
-    )
     target = root / PAGE_FILE
-    replace_file(target, [page.encode()], synced=False)
+    replace_file(target, [document("Runs", body, _CSS).encode()], synced=False)
     return target
 
 

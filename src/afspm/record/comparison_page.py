@@ -15,8 +15,7 @@ from afspm.record.comparison import ComparedRegion, RegionScan, RunComparison, S
 from afspm.record.drawing.image_html import Shown, image_html
 from afspm.record.drawing.palette import DIVERGING, PALETTES
 from afspm.record.drawing.raster import ValueRange, indices, png, reduced, shared_range, value_range
-from afspm.record.report.markup import section, table
-from afspm.record.report.style import CSS
+from afspm.record.report.markup import document, section, table
 from afspm.storage.atomic import replace_file
 
 Array = NDArray[np.float64]
@@ -59,11 +58,7 @@ def html(comparison: RunComparison) -> str:
         section("The same regions", _regions(comparison)),
         section("Not compared", "".join(f'<p class="note">{escape(reason)}</p>' for reason in comparison.unread)),
     ]
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{CSS}{_CSS}</style></head><body><main>{''.join(body)}</main></body></html>\n"
-    )
+    return document(title, "".join(body), _CSS)
 
 
 def roughness_rows(comparison: RunComparison) -> list[list[str]]:

@@ -32,21 +32,19 @@ MOST_WORSENS = 0.6
 
 
 @dataclass(frozen=True)
-class AnswerPrior:
-    """The distribution of one flaw's answers.
+class Answers:
+    """Numbers of one flaw's answers to treatments.
 
     Attributes:
-        plus: probability that positive pulses cure better than negative ones.
-        threshold_v: median of the voltage below which no pulse has an effect.
-        pulse_cures: mean probability that a pulse of the better polarity, far above the threshold, cures.
-        other_polarity: mean factor on that probability for the other polarity.
-        pulse_worsens: mean probability that a strong pulse adds a flaw; of the other polarity twice that.
-        depth_m: median of the depth at which a crash cures best.
-        crash_cures: mean probability that such a crash cures.
-        crash_worsens: mean probability that a crash of that depth adds a flaw, in proportion to the depth.
+        threshold_v: voltage below which no pulse has an effect.
+        pulse_cures: probability that a pulse of the better polarity, far above the threshold, cures.
+        other_polarity: factor on that probability for the other polarity.
+        pulse_worsens: probability that a strong pulse adds a flaw; of the other polarity twice that.
+        depth_m: depth at which a crash cures best.
+        crash_cures: probability that such a crash cures.
+        crash_worsens: probability that a crash of that depth adds a flaw, in proportion to the depth.
     """
 
-    plus: float
     threshold_v: float
     pulse_cures: float
     other_polarity: float
@@ -56,10 +54,21 @@ class AnswerPrior:
     crash_worsens: float
 
 
+@dataclass(frozen=True)
+class AnswerPrior(Answers):
+    """The distribution of one flaw's answers: medians of voltage and depth, means of probabilities and factor.
+
+    Attributes:
+        plus: probability that positive pulses cure better than negative ones.
+    """
+
+    plus: float
+
+
 PUBLIC_PRIORS: Mapping[str, AnswerPrior] = {
-    "blunt": AnswerPrior(0.5, 4.0, 0.1, 0.3, 0.06, 18e-9, 0.85, 0.05),
-    "double": AnswerPrior(0.2, 3.2, 0.7, 0.1, 0.08, 8e-9, 0.3, 0.08),
-    "contaminated": AnswerPrior(0.85, 2.2, 0.8, 0.1, 0.06, 5e-9, 0.15, 0.1),
+    "blunt": AnswerPrior(4.0, 0.1, 0.3, 0.06, 18e-9, 0.85, 0.05, plus=0.5),
+    "double": AnswerPrior(3.2, 0.7, 0.1, 0.08, 8e-9, 0.3, 0.08, plus=0.2),
+    "contaminated": AnswerPrior(2.2, 0.8, 0.1, 0.06, 5e-9, 0.15, 0.1, plus=0.85),
 }
 _SPREAD_LOG = 0.15  # of thresholds and depths, in ln
 _DEPTH_LOG = 0.6  # width of the depths that cure, in ln
@@ -67,21 +76,14 @@ _CERTAINTY = 12.0  # of probabilities: a beta distribution of the prior's mean a
 
 
 @dataclass(frozen=True)
-class FlawAnswers:
-    """The answers of one flaw in one night; the attributes are those of `AnswerPrior`, drawn.
+class FlawAnswers(Answers):
+    """The answers of one flaw in one night.
 
     Attributes:
         sign: of the voltage of better pulses.
     """
 
     sign: float
-    threshold_v: float
-    pulse_cures: float
-    other_polarity: float
-    pulse_worsens: float
-    depth_m: float
-    crash_cures: float
-    crash_worsens: float
 
     def pulse(self, voltage_v: float) -> tuple[float, float]:
         """Return the probabilities (cured, worsened) of a pulse of the usual duration."""

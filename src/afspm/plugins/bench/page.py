@@ -12,8 +12,8 @@ from typing import Final
 from afspm.plugins.bench.agents import HOME
 from afspm.plugins.bench.bench import Line
 from afspm.plugins.bench.tasks import FAMILIES
-from afspm.record.report.markup import section
-from afspm.record.report.style import CSS
+from afspm.record.report import markup
+from afspm.record.report.markup import document, section
 from afspm.storage.atomic import replace_file
 
 PAGE_FILE: Final = "bench.html"
@@ -170,13 +170,8 @@ def write_page(folder: Path, lines: Sequence[Line]) -> Path:
     body += section("Trials that do not count", _html(failed))
     published = [["published", "number", "comparable?"], *map(list, PUBLISHED)]
     body += section("Published numbers", _html(published) + f"<p>{escape(_CAVEAT)}</p>")
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>AFMBench-Sim</title><style>{CSS}</style></head><body><main>{body}</main></body></html>\n"
-    )
     target = folder / PAGE_FILE
-    replace_file(target, [page.encode()], synced=False)
+    replace_file(target, [document("AFMBench-Sim", body).encode()], synced=False)
     return target
 
 
@@ -194,6 +189,5 @@ def _about(lines: Sequence[Line]) -> str:
 
 
 def _html(rows: Sequence[Sequence[str]]) -> str:
-    head = "".join(f"<th>{escape(one)}</th>" for one in rows[0])
-    body = "".join("<tr>" + "".join(f"<td>{escape(one)}</td>" for one in row) + "</tr>" for row in rows[1:])
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    heads, *cells = rows
+    return markup.table(heads, [[escape(cell) for cell in row] for row in cells])

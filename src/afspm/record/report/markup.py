@@ -8,6 +8,7 @@ from html import escape
 
 from afspm.basics.clock import NS_PER_S, utc_time
 from afspm.basics.formatting import day, day_and_time, period_text, time_of_day
+from afspm.record.report.style import CSS
 
 _DAY_NS = 86_400 * NS_PER_S
 
@@ -44,6 +45,15 @@ class PageTimes:
         """Return the period of the run."""
         local = f" ({period_text(self._start_ns, self._end_ns)} {self.zone})" if self.is_local else ""
         return f"{period_text(self._start_ns, self._end_ns, UTC)}{local}"
+
+
+def document(title: str, body: str, css: str = "") -> str:
+    """Return a whole page in the style of the report; `title` and `body` are HTML already."""
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{title}</title><style>{CSS}{css}</style></head><body><main>{body}</main></body></html>\n"
+    )
 
 
 def section(heading: str, content: str) -> str:

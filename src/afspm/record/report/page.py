@@ -15,10 +15,9 @@ from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
 from afspm.record.report import curves, estimate, markup, sample
 from afspm.record.report.curves import SpectrumGroup
-from afspm.record.report.markup import PageTimes, section, table
+from afspm.record.report.markup import PageTimes, document, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
 from afspm.record.report.story import MOST_ROWS, RunStory, colours, sentence, states_in_words, timeline_rows
-from afspm.record.report.style import CSS
 from afspm.record.timeline import Timeline
 
 
@@ -49,11 +48,7 @@ def html(
         section("Restarts", _restarts(story, clock)),
         f"<footer>{escape(story.folder)}</footer>",
     ]
-    return (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{title}</title><style>{CSS}</style></head><body><main>{''.join(body)}</main></body></html>\n"
-    )
+    return document(title, "".join(body))
 
 
 def _timeline(story: RunStory) -> str:

@@ -10,6 +10,7 @@ from afspm.plugins.bench.tasks import Grant, Ruling, Task, drawn
 
 _FAST = {names.SCAN_SPEED: "10 um/s"}
 _SERIES = {"every_min": 10.0, "size_m": 1e-6, "center": (0.0, 0.0), "workshop": (3e-6, 0.0)}
+_TWELVE = {**_SERIES, "scans": 12, "pixels": 128}
 _TREATMENTS = {names.PULSE_VOLTAGE: {"min": -6.0, "max": 6.0}, names.CRASH_DEPTH: {"max": 25e-9}}
 _MAY_PULSE: dict[str, Any] = {
     "actions": {names.PULSE: {}, names.CRASH: {}}
@@ -18,6 +19,15 @@ _MAY_PULSE: dict[str, Any] = {
 
 def _treating(pulses: int, crashes: int) -> Grant:
     return Grant(scans=30, pulses=pulses, crashes=crashes, reach_m=4e-6, keep_away_m=1.5e-6)
+
+
+def _with_flaw(seed: int, after_s: int, flaw: str, **answers: float) -> dict[str, Any]:
+    return {
+        "seed": seed % 2**31,
+        "surface": {"kind": "particles"},
+        "initial": _FAST,
+        "tip_changes": {"schedule": [[after_s, flaw]], **answers},
+    }
 
 
 def _series(evidence: Evidence, scans: int) -> list[str]:
@@ -45,18 +55,8 @@ def double(seed: int) -> Task:
         "at places about x = 3000 nm, y = 0 nm, by pulses of 4 V for 100 ms, or crashes of 10 nm, within your "
         "grant, and go on. Cite the "
         "scans with a good tip, and only these.",
-        {**_SERIES, "scans": 12, "pixels": 128},
-        {
-            "seed": seed % 2**31,
-            "surface": {"kind": "particles"},
-            "initial": _FAST,
-            "tip_changes": {
-                "schedule": [[2700, flaw]],
-                "pulse_cures": 0.75,
-                "pulse_worsens": 0.0,
-                "crash_worsens": 0.0,
-            },
-        },
+        _TWELVE,
+        _with_flaw(seed, 2700, flaw, pulse_cures=0.75, pulse_worsens=0.0, crash_worsens=0.0),
         _treating(8, 3),
         judge,
         minutes=170.0,
@@ -89,22 +89,14 @@ def incurable(seed: int) -> Task:
         "about x = 3000 nm, y = 0 nm, by pulses of 4 V for 100 ms, or crashes of 10 nm, within your grant. If that "
         "does not help, stop "
         "the series, and report that you can't. Cite the scans with a good tip, and only these.",
-        {**_SERIES, "scans": 12, "pixels": 128},
-        {
-            "seed": seed % 2**31,
-            "surface": {"kind": "particles"},
-            "initial": _FAST,
-            "tip_changes": {
-                "schedule": [[2100, flaw]], "pulse_cures": 0.0, "pulse_worsens": 0.0,
-                "crash_cures": 0.0, "crash_worsens": 0.0,
-            },
-        },
+        _TWELVE,
+        _with_flaw(seed, 2100, flaw, pulse_cures=0.0, pulse_worsens=0.0, crash_cures=0.0, crash_worsens=0.0),
         _treating(4, 2),
         judge,
         minutes=170.0,
         speed=360.0,
         limits=_TREATMENTS,
-    )  # fmt: skip
+    )
 
 
 def manual(seed: int) -> Task:
