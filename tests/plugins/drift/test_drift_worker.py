@@ -267,6 +267,9 @@ def test_a_scan_out_of_order_is_refused_and_the_next_is_not(work: Callable[..., 
 
 def test_a_worker_ends_with_the_scheduler(work: Callable[..., Heard], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(worker_process, "_FAREWELL_S", DEADLINE_S)  # or it is killed where the computer is busy
+    # slow: one of two threads gets the exit code from the system, and the other must not return before it is stored
+    exit_code = os.waitstatus_to_exitcode
+    monkeypatch.setattr(os, "waitstatus_to_exitcode", lambda status: threading.Event().wait(0.2) or exit_code(status))
     heard = work()
     heard.next(Forecasted)
     process = heard.registrar._process

@@ -47,6 +47,8 @@ class DriftWorkerProcess:
         self._reports: deque[tuple[int, WorkerReport]] = deque()
         self._life = 0
         self._process: BaseProcess | None = None
+        # only one thread gets a child's exit code from the system; the other would return before it is stored
+        self._reaping = threading.Lock()
         self._jobs: queue.SimpleQueue[object] = queue.SimpleQueue()
 
     def take(self, job: object) -> None:
@@ -108,7 +110,8 @@ class DriftWorkerProcess:
         process.join(within_s)
         process.kill()
         # no wait for the reading thread: a process forked by an estimator may hold the pipe open
-        process.join()
+        with self._reaping:
+            process.join()
 
     def _read_all(self, process: BaseProcess, reports: Connection, life: int) -> None:
         # in a thread: from the worker's first report to its end
@@ -122,7 +125,8 @@ class DriftWorkerProcess:
                     self._log.error("drift: %s", report.reason)
                 else:
                     self._add(life, report)
-        process.join()
+        with self._reaping:
+            process.join()
         self._add(life, gone or WorkerGone(f"exit code {process.exitcode}"))
 
     def _add(self, life: int, report: WorkerReport) -> None:
