@@ -60,13 +60,13 @@ class _Finished:
 
 
 class LineWatch(Component):
-    """Flags `tip-shape-changed` while a scan is running, as soon as its lines show that the tip has changed.
+    """A watch on running scans: publishes the row from which their lines show that the tip has changed.
 
-    The scheduler then stops the scan, so its remaining time is saved. Each line is compared with an earlier scan of the
-    place at the predicted drift; where there is none, nothing is judged. It learns
-    from the first scans of each size, number of pixels and setting of the feedback, so the tip must be good then: scans
-    are judged from the fourth of a place on. It learns nothing from a scan with an alarm, from one during which a
-    problem was flagged or the feedback was changed, or from one that a `TipClassifier` calls bad.
+    With `action = "stop"` it also flags `tip-shape-changed`: the scheduler stops the scan, so its remaining time is
+    saved. Each line is compared with an earlier scan of the place at the predicted drift; where there is none, nothing
+    is judged. It learns from the first scans of each size, number of pixels and setting of the feedback, so the tip
+    must be good then: scans are judged from the fourth of a place on. It learns nothing from a scan with an alarm, from
+    one during which a problem was flagged or the feedback was changed, or from one that a `TipClassifier` calls bad.
 
     It publishes a `TipVerdict` with the row of the alarm and the first row with the change. A `ScanSeries` with
     `missed = "rest"` then measures only the rest of the scan. The microscope must publish lines of running scans. After
