@@ -49,3 +49,9 @@ def test_curve_lies_below_the_rows_with_a_gap_where_it_is_unknown() -> None:
     assert lines == ["0.0,96.0 180.0,4.0", "540.0,50.0 720.0,96.0"]
     assert "4 K to 5 K, now 4 K" in drawn
     assert drawn.index("control") < drawn.index("cryo.t") < drawn.index("lane-axis")
+
+
+def test_curve_whose_newest_value_is_unknown_says_so() -> None:
+    row = TimelineRow("control", (Span("series", 0, 60 * S),), lambda _: "")
+    curve = TimelineCurve("cryo.t", "K", [0, 15 * S, 30 * S], [4.0, 5.0, float("nan")])
+    assert "4 K to 5 K, now unknown" in timeline_html([row], 0, 60 * S, UTC, curves=[curve])

@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from afspm.basics.errors import InvalidValue
+from afspm.basics.formatting import duration_text, quantity
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import si
 from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, names
 from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
+from afspm.plugins.agent.untrusted import escaped
 
 PLAN_LASTS_S = 3600.0
 DRIFT_PART = 0.1
@@ -18,6 +20,21 @@ DRIFT_PART = 0.1
 DRIFT_M = 10e-9
 """The same for plans without a scan."""
 _FIELDS = ("agent", "for", "region", "parameters", "counts")
+
+
+def simulated(proposal: Proposal) -> str:
+    """Return the result of a preflight in words, for the person who decides."""
+    found = json.loads(proposal.preflight)
+    harm, seconds = found.get("harm"), found.get("seconds")
+    if harm is None or seconds is None:
+        text = f"Not simulated: {escaped(str(found.get('error') or 'no result'))}."
+    else:
+        pressed_m = float(harm.get("pressed_m") or 0.0)
+        tip = f", the tip changes {harm['tip_changes']} times" if harm.get("tip_changes") else ""
+        pressed = quantity(pressed_m, "m", 3)
+        text = f"Simulated: {duration_text(seconds)}; pressed at most {pressed} into the sample{tip}."
+    refusals = [escaped(str(one)) for one in found.get("refusals") or ()]
+    return f"{text} The limits will refuse: {'; '.join(refusals)}" if refusals else text
 
 
 def of_plan(proposal: Proposal, frame: Frame) -> tuple[Grant, Plan]:

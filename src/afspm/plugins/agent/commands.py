@@ -97,18 +97,15 @@ def grant_lines(grant: Grant) -> list[str]:
 
 def _approve(where: Path, proposal: Proposal, *, sample: bool, yes: bool) -> None:
     from afspm.model import Frame
-    from afspm.plugins.agent.approval import of_plan
+    from afspm.plugins.agent.approval import of_plan, simulated
     from afspm.plugins.agent.untrusted import escaped
 
     frame = Frame.SAMPLE if sample else Frame.TIP
     grant, plan = of_plan(proposal, frame)
-    preflight = json.loads(proposal.preflight)
     typer.echo(f"{proposal.who} proposes, in its own words: {_title(proposal)}")
     for number, request in enumerate(plan.requests(frame), 1):
         typer.echo(f"  {number}. {escaped(request.text)}")
-    typer.echo(f"simulated: {preflight.get('seconds')} s, harm {preflight.get('harm')}")
-    for reason in preflight.get("refusals") or ():
-        typer.echo(f"  the limits will refuse {escaped(reason)}")
+    typer.echo(simulated(proposal))
     _confirm(yes)
     with acting(where) as scope:
         scope.approve(grant)

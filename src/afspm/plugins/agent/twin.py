@@ -99,10 +99,12 @@ def simulate(plan: Plan, sample: Plain, speed_m_s: float, pictures: Path) -> Pla
                     _draw(scan, pictures / f"{drawn}.png")
                     drawn += 1
     damage = instrument.world.truth(now_s)
-    changes = damage.get("tip_changes")
+    happened = damage.get("tip_changes")
+    # the first entry is the tip at the start
+    changes = [one for one in happened if one["cause"] != "start"] if isinstance(happened, list) else []
     return {
         "seconds": round(now_s, 1),
-        "harm": {"pressed_m": pressed_m, "tip_changes": len(changes) if isinstance(changes, list) else 0},
+        "harm": {"pressed_m": pressed_m, "tip_changes": len(changes)},
         "pictures": drawn,
     }
 

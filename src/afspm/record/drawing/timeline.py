@@ -209,7 +209,8 @@ def _curve(curve: TimelineCurve, begin_ns: int, end_ns: int) -> str:
             y = 50.0 if high == low else 96.0 - 92.0 * (value - low) / (high - low)
             line.append(f"{x:.1f},{y:.1f}")
     drawn = "".join(f'<polyline points="{points}"/>' for points in (*lines, " ".join(line)) if points)
-    text = f"{quantity(low, curve.unit)} to {quantity(high, curve.unit)}, now {quantity(known[-1][1], curve.unit)}"
+    now = quantity(curve.values[-1], curve.unit) if math.isfinite(curve.values[-1]) else "unknown"
+    text = f"{quantity(low, curve.unit)} to {quantity(high, curve.unit)}, now {now}"
     return (
         f'<div class="lane curve" title="{escape(f"{curve.name}: {text}")}"><b>{escape(curve.name)}</b><div>'
         f'<svg viewBox="0 0 {COLUMNS} 100" preserveAspectRatio="none">{drawn}</svg><em>{escape(text)}</em></div></div>'

@@ -9,8 +9,10 @@ from html import escape
 from nicegui import background_tasks, ui
 
 from afspm.basics.errors import AfspmError
+from afspm.basics.formatting import day_and_time
 from afspm.model import Approval, Frame, Grant, Proposal
-from afspm.plugins.agent.approval import of_plan
+from afspm.model.events import PERSON
+from afspm.plugins.agent.approval import of_plan, simulated
 from afspm.plugins.agent.untrusted import escaped
 from afspm.plugins.web.dashboard.actions import ActionResult
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, ask_in_dialog, button
@@ -45,10 +47,8 @@ class ApprovalBar:
                 self._add_proposal(proposal)
 
     def _add_approval(self, approval: Approval) -> None:
-        left = ", ".join(f"{one.count} {one.action}" for one in approval.left)
-        what = f"plan {approval.plan}, {approval.steps_left} requests left" if approval.plan else f"a grant: {left}"
         with ui.element("div").classes("flag"):
-            ui.label(f"{approval.agent} has {what} (by {approval.by})")
+            ui.label(in_force(approval))
             if self._session.may_steer:
                 button("Revoke", partial(self._revoke, approval.agent))
 
@@ -81,6 +81,18 @@ class ApprovalBar:
                 self._session.do(lambda a: a.approve(grant))
 
 
+def in_force(approval: Approval) -> str:
+    """Return an approval in words."""
+    left = ", ".join(f"{one.action}: {one.count}" for one in approval.left) or "no action"
+    what = (
+        f"may carry out plan {approval.plan}, {approval.steps_left} requests left"
+        if approval.plan
+        else f"may measure by itself, left: {left}"
+    )
+    until = day_and_time(approval.until_ns, seconds=False)
+    return f"{approval.agent} {what}; approved by {approval.by.partition(PERSON)[2] or approval.by} until {until}"
+
+
 def title(proposal: Proposal) -> str:
     """Return the agent's own words for its plan, escaped."""
     try:
@@ -94,12 +106,3 @@ def reviewed(proposal: Proposal) -> tuple[Grant, list[str]]:
     # requests have the same bytes in each frame
     grant, plan = of_plan(proposal, Frame.TIP)
     return grant, [escaped(one.text) for one in plan.requests(Frame.TIP)]
-
-
-def simulated(proposal: Proposal) -> str:
-    """Return the result of the simulated run in words."""
-    found = json.loads(proposal.preflight)
-    refusals = [escaped(str(one)) for one in found.get("refusals") or ()]
-    pressed_m = float((found.get("harm") or {}).get("pressed_m") or 0.0)
-    text = f"Simulated: {found.get('seconds')} s; pressed at most {pressed_m * 1e9:.3g} nm into the sample."
-    return f"{text} The limits will refuse: {'; '.join(refusals)}" if refusals else text
