@@ -7,6 +7,7 @@ import json
 import os
 import secrets
 import shutil
+import socket
 import subprocess
 import threading
 import time
@@ -15,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO, Any, Final
+from urllib.parse import urlsplit
 
 import afspm
 from afspm.basics.clock import ExperimentClock
@@ -33,6 +35,7 @@ from afspm.supervisor.ports import FreePorts
 
 AGENT: Final = "agent"
 JOINED_WITHIN_S: Final = 60.0
+RETRY_S: Final = 0.05
 ENDED_WITHIN_S: Final = 60.0
 LONGEST_HOLD_S: Final = 8.0
 """Real time between two renewals of the hold on the clock, which ends by itself after ten seconds."""
@@ -220,6 +223,24 @@ def _joined(run: Path, name: str) -> Scope:
                 raise
 
 
+def await_listener(url: str, within_s: float) -> None:
+    """Return once a server accepts connections at the host and port of a URL.
+
+    Raises:
+        TrialFailed: it does not within this real time.
+    """
+    at, until_s = urlsplit(url), time.monotonic() + within_s
+    while True:
+        try:
+            socket.create_connection((at.hostname or "", at.port or 0), timeout=within_s).close()
+        except OSError as error:  # the process of the gateway starts
+            if time.monotonic() > until_s:
+                raise TrialFailed(f"nothing listens at {url} after {within_s:g} s: {error}") from error
+            threading.Event().wait(RETRY_S)
+        else:
+            return
+
+
 def _with_agent(
     running: _Running, task: Task, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
 ) -> str:
@@ -227,6 +248,8 @@ def _with_agent(
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
     running.scope.wait_until(lambda: running.scope.state is not ScopeState.UNDEFINED, timeout_s=JOINED_WITHIN_S)
+    if running.url:
+        await_listener(running.url, JOINED_WITHIN_S)
     with (
         (own / "output.txt").open("wb") as output,
         _agent_process(running, task, agent, own, output, sealed) as process,
