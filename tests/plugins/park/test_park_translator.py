@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from threading import Event
 from typing import Any
 
 import numpy as np
@@ -190,6 +191,9 @@ def test_stop_that_overtakes_the_start_of_its_curve_is_repeated(bench: Make) -> 
     made.at_panel(replace_stop)
     assert peer.act(names.START_SPEC).ok
     peer.until(ScopeState.SPEC)
+    pace = Event()
+    while made.emulator.rig.spectrum is None:  # SPEC is published during the move, too, after which no curve begins
+        pace.wait(0.005)
     assert peer.act(names.STOP_SPEC).ok
     assert not any(isinstance(one, Spectrum) for one in peer.until(FREE))
     assert len(stops) > 1
