@@ -120,6 +120,10 @@ class PublishedHistory:
         while len(self._last) > self._most_packets:
             del self._last[next(iter(self._last))]
 
+    def last(self, prefixes: tuple[str, ...]) -> list[Packet]:
+        """Return the last packet of every envelope under `prefixes`, oldest first."""
+        return [packet for envelope, packet in self._last.items() if envelope.startswith(prefixes)]
+
     def __call__(self, _who: Hashable, prefixes: tuple[str, ...], since_ns: int) -> list[Packet]:
         """Return the kept packets under `prefixes` after `since_ns`, oldest first."""
         kept = {packet.time_ns or 0: packet for packet in (*self._last.values(), *self._packets)}

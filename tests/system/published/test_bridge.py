@@ -61,6 +61,27 @@ def test_channels_of_a_scan_arrive_a_poll_apart_and_a_move_lasts_one(rig: Bridge
         assert arrived_s[after] - arrived_s[before] > PAUSE_S * 0.8
 
 
+def test_a_late_peer_receives_the_last_packet_of_each_envelope(rig: BridgedRig, plain: Any) -> None:
+    rig.start()
+    rig.linked(rig.component("Ours"))
+    early = Subscriber(plain(zmq.SUB), rig.publish)
+    rig.peers.append(early)
+    rig.until(lambda: early.cache)
+    for size_m in (1e-6, 2e-6):
+        for value in (1.0, 2.0):
+            region = Region((0.0, 0.0), (size_m, size_m))
+            rig.publish_packet(*wire.encode(Scan(region, "Height", "m", np.full((2, 2), value), 1)))
+    rig.until(lambda: "Scan2d_2000.0_Height" in early.cache and early.cache["Scan2d_2000.0_Height"].values[0] == 2.0)
+    late = plain(zmq.SUB)
+    late.setsockopt(zmq.SUBSCRIBE, b"Scan2d")
+    late.connect(rig.publish)
+    rig.until(lambda: late.poll(0))
+    arrived = [late.recv_multipart()[0]]
+    while late.poll(int(2e3 * PAUSE_S)):
+        arrived.append(late.recv_multipart()[0])
+    assert arrived == [b"Scan2d_1000.0_Height", b"Scan2d_2000.0_Height"]
+
+
 def test_flagging_and_clearing_no_problem_is_a_success(rig: BridgedRig, plain: Any) -> None:
     rig.start()
     rig.linked(rig.component("Ours"))

@@ -378,7 +378,8 @@ class _Outlet:
         now_s = self._clock.monotonic_s()
         if now_s >= self._replay_s:
             prefixes, self._joined, self._replay_s = tuple(self._joined), set(), math.inf
-            for packet in self._history(None, prefixes, -1):
+            # like the published cache, the last of each: a peer that asserts one packet fails at two
+            for packet in self._history.last(prefixes):
                 self._send(packet)
         for packet in self.pacing.take(now_s):
             self._publish(packet)
