@@ -16,7 +16,6 @@ from afspm.cli import (
     doctor,
     experiment_file,
     new,
-    probes,
     run,
     runs,
     status,
@@ -84,7 +83,7 @@ app.command("restart", rich_help_panel=MEANWHILE)(steer.restart)
 app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
 app.command("note", rich_help_panel=MEANWHILE)(steer.note)
 app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
-app.command("probes", rich_help_panel=AFTERWARDS)(probes.probes)
+app.command("probes", rich_help_panel=AFTERWARDS)(runs.probes)
 app.command("report", rich_help_panel=AFTERWARDS)(runs.report)
 app.command("export", rich_help_panel=AFTERWARDS)(runs.export)
 app.command("replay", rich_help_panel=AFTERWARDS)(runs.replay)

@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 from afspm.cli.arguments import RUNS, OptionalFiles, Runs, opt
 
 if TYPE_CHECKING:
-    from afspm.supervisor.doctor import Examination
+    from afspm.cli.examination import Examination
 
 _COLOURS = {"fine": "green", "warning": "yellow", "error": "bold red"}
 
@@ -32,8 +32,8 @@ def doctor(
     installed packages, with the reason where one can't be loaded. Without a file it checks this computer alone. Ends
     with 1 if something keeps the experiment from working.
     """
+    from afspm.cli.examination import examine
     from afspm.experiment import load
-    from afspm.supervisor.doctor import examine
 
     examined = examine(load(*files) if files else None, runs, listen, _commands(context))
     if as_json:

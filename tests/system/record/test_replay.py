@@ -17,7 +17,7 @@ import afspm
 from afspm import wire
 from afspm.basics.errors import ConfigError, RequestError, TransportError
 from afspm.basics.launch import Launch
-from afspm.client.follower import Follower
+from afspm.cli.follower import Follower
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.supervisor import replay as replay_module
