@@ -1,4 +1,4 @@
-"""`afspm runs`, `probes`, `report`, `export` and `replay`: list recorded runs, and use one."""
+"""`afspm runs`, `probes`, `report` and `export`: list recorded runs, and use one."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import typer
 
 from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import counted, day_and_time, duration_text, quantity
-from afspm.cli.arguments import RUNS, RecordedRun, Where, names_in, opt
+from afspm.cli.arguments import RUNS, RecordedRun, Where, opt
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from afspm.record.catalogue import RunSummary
-    from afspm.record.probes import ProbeHistory
+    from afspm.record.catalogue import ProbeHistory, RunSummary
 
 
 _DAYS = ["%Y-%m-%d"]
@@ -135,35 +134,6 @@ def export(
     typer.echo(f"{len(written)} file{'s' if len(written) != 1 else ''} in {folder}")
 
 
-def replay(
-    run: RecordedRun = RUNS,
-    speed: Annotated[
-        float | None, opt("Experiment seconds in a real second. Default: as it was recorded.", min=1e-6)
-    ] = None,
-    only: Annotated[
-        list[str] | None, opt("Publish only these, e.g. Scan2d,ControlState.", "--only", metavar="MESSAGE[,…]")
-    ] = None,
-    publish: Annotated[
-        str | None, opt("Where. Default: as the experiment file says, else a free port.", metavar="ADDRESS")
-    ] = None,
-    serve: Annotated[str | None, opt("Where requests are answered.", metavar="ADDRESS")] = None,
-    stay: Annotated[
-        bool, typer.Option("--stay", help="Serve late joiners when all is published, until Ctrl-C.")
-    ] = False,
-    runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the replay's folder.")] = RUNS,
-) -> None:
-    """Publish a recorded run again, with its timing at any speed, as its scheduler did.
-
-    It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Late
-    joiners get the cached packets. Requests are refused, since nothing is measured.
-    """
-    from afspm.supervisor import replay as replaying
-
-    options = replaying.ReplayOptions(speed, names_in(only), publish, serve, stay=stay, runs=runs)
-    count = replaying.replay(run, options, typer.echo)
-    typer.echo(f"published {counted(count, 'packet')}")
-
-
 def probes(
     words: Annotated[
         list[str] | None,
@@ -178,8 +148,7 @@ def probes(
 
     The name of a probe is `probe` in [metadata] of the experiment file.
     """
-    from afspm.record.catalogue import find_runs
-    from afspm.record.probes import probe_histories
+    from afspm.record.catalogue import find_runs, probe_histories
 
     found = probe_histories(find_runs(folder, words or ()))
     if as_json:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -12,18 +13,23 @@ from afspm import wire
 from afspm.basics.clock import Clock
 from afspm.basics.errors import ConfigError, ExperimentEnded, Interrupted, NoResponse, WireError
 from afspm.basics.launch import Launch
-from afspm.client.published_state import PublishedState
 from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     ControlRequest,
+    ControlState,
+    Feedback,
     Packet,
+    ProbePosition,
     RelayedMessage,
     Request,
     Response,
     ResponseDetail,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
     request_name,
 )
 from afspm.model.sessions import run_of
@@ -41,6 +47,37 @@ from afspm.transport.port import (
 from afspm.transport.process import signals
 from afspm.transport.process.context import ProcessActivity
 from afspm.transport.process.parent import StopRequested
+
+
+class PublishedState:
+    """The newest published states, and the number of publications of each, so that a caller can wait for the next."""
+
+    def __init__(self) -> None:
+        self.status: ScopeStatus | None = None
+        self.control: ControlState | None = None
+        self.scan_parameters: ScanParameters | None = None
+        self.feedback: Feedback | None = None
+        self.probe_position: ProbePosition | None = None
+        self.newest_ns: int | None = None
+        self._published: Counter[str] = Counter()
+
+    @property
+    def state(self) -> ScopeState:
+        return self.status.state if self.status else ScopeState.UNDEFINED
+
+    def take(self, message: str, thing: object) -> None:
+        """Take `thing`, published as the message `message`."""
+        setattr(self, wire.declaration(message).attribute, thing)
+        self._published[message] += 1
+
+    def take_time(self, time_ns: int | None) -> None:
+        """Take the time of a packet of the scheduler."""
+        if time_ns is not None and (self.newest_ns is None or time_ns > self.newest_ns):
+            self.newest_ns = time_ns
+
+    def count(self, message: str) -> int:
+        """Return the number of publications of `message`."""
+        return self._published[message]
 
 
 class Interrupts:
