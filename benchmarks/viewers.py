@@ -16,7 +16,7 @@ from typing import Any
 import aiohttp
 import socketio
 
-from afspm.transport.process.priority import step_back
+from afspm.transport.process.context import step_back
 
 
 async def view(url: str, seen: asyncio.Semaphore) -> None:

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 import python_api
+import state_diagram
 
 from afspm import Component, wire
 from afspm.basics import entry_points
 from afspm.basics.units import Unit
 from afspm.model import Role
-from afspm.scheduler.control import arbitration, diagram
+from afspm.scheduler.control import arbitration
 from afspm.scheduler.control.arbitration import RoleTable
 from afspm.scheduler.publishing.envelopes import CacheRule, CacheSettings
 from afspm.scheduler.safety.limits import Limit
@@ -39,8 +40,8 @@ SET_BY_AFSPM = ("unit", "source")  # of a limit: no keys of the file
 BLOCK = re.compile(r"(<!-- from the code: ([\w-]+) -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
-def state_diagram() -> str:
-    return f"```mermaid\n{diagram.mermaid()}```\n"
+def control_diagram() -> str:
+    return f"```mermaid\n{state_diagram.mermaid()}```\n"
 
 
 def transition_table() -> str:
@@ -309,7 +310,7 @@ def example_maker() -> str:
 
 
 PARTS: dict[str, Callable[[], str]] = {
-    "state-diagram": state_diagram,
+    "state-diagram": control_diagram,
     "transition-table": transition_table,
     "instruments": instruments,
     "controllers": controllers,

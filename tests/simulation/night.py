@@ -13,9 +13,8 @@ from afspm.scheduler.publishing.envelopes import Envelopes
 from afspm.scheduler.safety.limits import ExperimentLimits, Limit
 from afspm.scheduler.safety.watchdog import WatchdogSettings
 from afspm.scheduler.settings import ControlSettings, SchedulerSettings
-from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
-from afspm.supervisor.supervision.restart import RestartPolicy
 from afspm.testing.components.memory_network import Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
 from afspm.testing.components.simulated_process import Process

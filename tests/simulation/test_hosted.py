@@ -19,9 +19,8 @@ from afspm.client.component import Component
 from afspm.model import Problem, Region
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
-from afspm.supervisor.supervision.restart import RestartPolicy
 from afspm.testing.components.hosted_processes import ComponentProcess, TranslatorProcess
 from afspm.testing.components.memory_network import Weather
 from afspm.testing.components.scheduler_host import SchedulerHost

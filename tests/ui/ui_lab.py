@@ -12,7 +12,7 @@ from typing import Any
 from afspm_process import AfspmProcess
 
 from afspm import wire
-from afspm.client.follower import Follower
+from afspm.cli.follower import Follower
 from afspm.model import ControlState, JournalEntry, Role, ScopeState
 
 DEADLINE_S = 30.0

@@ -13,10 +13,7 @@ from afspm.basics.errors import ConfigError
 from afspm.cli import (
     commission,
     developing,
-    doctor,
     experiment_file,
-    new,
-    probes,
     run,
     runs,
     status,
@@ -69,9 +66,9 @@ def _afspm(
 
 app.command("demo")(run.demo)
 app.command("run")(run.run)
-app.add_typer(new.app, name="new", rich_help_panel=BEFORE)
+app.add_typer(developing.new_app, name="new", rich_help_panel=BEFORE)
 app.command("check", rich_help_panel=BEFORE)(experiment_file.check)
-app.command("doctor", rich_help_panel=BEFORE)(doctor.doctor)
+app.command("doctor", rich_help_panel=BEFORE)(experiment_file.doctor)
 app.command("graph", rich_help_panel=BEFORE)(experiment_file.graph)
 app.command("keys", rich_help_panel=BEFORE)(experiment_file.keys)
 app.command("notify", rich_help_panel=BEFORE)(experiment_file.notify)
@@ -84,10 +81,9 @@ app.command("restart", rich_help_panel=MEANWHILE)(steer.restart)
 app.command("problems", rich_help_panel=MEANWHILE)(steer.problems)
 app.command("note", rich_help_panel=MEANWHILE)(steer.note)
 app.command("runs", rich_help_panel=AFTERWARDS)(runs.runs)
-app.command("probes", rich_help_panel=AFTERWARDS)(probes.probes)
+app.command("probes", rich_help_panel=AFTERWARDS)(runs.probes)
 app.command("report", rich_help_panel=AFTERWARDS)(runs.report)
 app.command("export", rich_help_panel=AFTERWARDS)(runs.export)
-app.command("replay", rich_help_panel=AFTERWARDS)(runs.replay)
 app.command("test-client", rich_help_panel=MICROSCOPES)(developing.check_client)
 app.command("test-translator", rich_help_panel=MICROSCOPES)(developing.check_translator)
 app.command("commission", rich_help_panel=MICROSCOPES)(commission.commission)

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
+    from afspm.cli.follower import Follower
     from afspm.cli.status_text import RunDescription
-    from afspm.client.follower import Follower
     from afspm.client.scope import Scope
 
 NOT_RUNNING = 3
@@ -43,7 +43,7 @@ def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
         lines: whether to follow lines of unfinished scans, too.
     """
     from afspm import wire
-    from afspm.client.follower import Follower
+    from afspm.cli.follower import Follower
     from afspm.wire.messages import SCAN_LINES
 
     folder = _running(where)

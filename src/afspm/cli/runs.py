@@ -1,4 +1,4 @@
-"""`afspm runs`, `report`, `export` and `replay`: list recorded runs, and use one."""
+"""`afspm runs`, `probes`, `report` and `export`: list recorded runs, and use one."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from afspm.basics.clock import NS_PER_S
-from afspm.basics.formatting import counted, day_and_time, duration_text
-from afspm.cli.arguments import RUNS, RecordedRun, Where, names_in, opt
+from afspm.basics.formatting import counted, day_and_time, duration_text, quantity
+from afspm.cli.arguments import RUNS, RecordedRun, Where, opt
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from afspm.record.catalogue import RunSummary
+    from afspm.record.catalogue import ProbeHistory, RunSummary
+
 
 _DAYS = ["%Y-%m-%d"]
 
@@ -133,30 +134,53 @@ def export(
     typer.echo(f"{len(written)} file{'s' if len(written) != 1 else ''} in {folder}")
 
 
-def replay(
-    run: RecordedRun = RUNS,
-    speed: Annotated[
-        float | None, opt("Experiment seconds in a real second. Default: as it was recorded.", min=1e-6)
+def probes(
+    words: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[WORD…]", help="Only runs with all of these, as for `afspm runs`; probe:NAME.", show_default=False
+        ),
     ] = None,
-    only: Annotated[
-        list[str] | None, opt("Publish only these, e.g. Scan2d,ControlState.", "--only", metavar="MESSAGE[,…]")
-    ] = None,
-    publish: Annotated[
-        str | None, opt("Where. Default: as the experiment file says, else a free port.", metavar="ADDRESS")
-    ] = None,
-    serve: Annotated[str | None, opt("Where requests are answered.", metavar="ADDRESS")] = None,
-    stay: Annotated[
-        bool, typer.Option("--stay", help="Serve late joiners when all is published, until Ctrl-C.")
-    ] = False,
-    runs: Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make the replay's folder.")] = RUNS,
+    folder: Annotated[Path, typer.Option("--in", metavar="DIR", help="The folder to look in.")] = RUNS,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    """Publish a recorded run again, with its timing at any speed, as its scheduler did.
+    """List probes with the metres that they have scanned, their treatments and the verdicts on them.
 
-    It can be joined like a running experiment: afspm.connect, afspm dashboard, afspm run FILE --only COMPONENT. Late
-    joiners get the cached packets. Requests are refused, since nothing is measured.
+    The name of a probe is `probe` in [metadata] of the experiment file.
     """
-    from afspm.supervisor import replay as replaying
+    from afspm.record.catalogue import find_runs, probe_histories
 
-    options = replaying.ReplayOptions(speed, names_in(only), publish, serve, stay=stay, runs=runs)
-    count = replaying.replay(run, options, typer.echo)
-    typer.echo(f"published {counted(count, 'packet')}")
+    found = probe_histories(find_runs(folder, words or ()))
+    if as_json:
+        import json
+        from dataclasses import asdict
+
+        typer.echo(json.dumps([asdict(probe) for probe in found], indent=2, ensure_ascii=False))
+    elif not found:
+        typer.echo("no run was found")
+    else:
+        from afspm.cli.joining import plain_console, plain_table
+
+        rows = ([text(probe) for text in _PROBE_COLUMNS.values()] for probe in found)
+        plain_console().print(plain_table(_PROBE_COLUMNS, rows))
+
+
+def _day(time_ns: int | None) -> str:
+    return "" if time_ns is None else day_and_time(time_ns, UTC, seconds=False).removesuffix(" UTC")
+
+
+def _name(probe: ProbeHistory) -> str:
+    return (probe.name or "(not named)") + (" SIMULATED" if probe.simulated else "")
+
+
+_PROBE_COLUMNS: Final[dict[str, Callable[[ProbeHistory], str]]] = {
+    "probe": _name,
+    "first used (UTC)": lambda probe: _day(probe.first_ns),
+    "last used (UTC)": lambda probe: _day(probe.last_ns),
+    "runs": lambda probe: str(len(probe.runs)),
+    "scanned": lambda probe: f"{quantity(probe.scanned_m, 'm', 3)} in {counted(probe.scans, 'scan')}",
+    "spectra": lambda probe: str(probe.spectra),
+    "treatments": lambda probe: ", ".join(f"{count} × {name}" for name, count in probe.treatments.items()),
+    "runs with a problem": lambda probe: str(probe.flagged),
+    "good scans": lambda probe: f"{probe.good} of {probe.judged} judged" if probe.judged else "",
+}

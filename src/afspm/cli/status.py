@@ -14,8 +14,8 @@ from afspm.cli.joining import can_show_blocks, describe, looking, plain_console,
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from afspm.cli.follower import Follower
     from afspm.cli.status_text import StatusText
-    from afspm.client.follower import Follower
 
 REFRESH_S = 0.25
 LOOK_S = 2.0

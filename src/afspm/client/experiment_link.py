@@ -3,26 +3,33 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import signal
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import Clock
-from afspm.basics.errors import ConfigError, ExperimentEnded, NoResponse, WireError
+from afspm.basics.errors import ConfigError, ExperimentEnded, Interrupted, NoResponse, WireError
 from afspm.basics.launch import Launch
-from afspm.client.interrupts import Interrupts
-from afspm.client.published_state import PublishedState
 from afspm.model import (
     CLOCK_REQUEST,
     HAS_ENDED,
     OTHER_RUN_RESPONSE,
     RELAY_REQUEST,
     ControlRequest,
+    ControlState,
+    Feedback,
     Packet,
+    ProbePosition,
     RelayedMessage,
     Request,
     Response,
     ResponseDetail,
+    ScanParameters,
+    ScopeState,
+    ScopeStatus,
     request_name,
 )
 from afspm.model.sessions import run_of
@@ -37,8 +44,88 @@ from afspm.transport.port import (
     Port,
     ReplyReceived,
 )
+from afspm.transport.process import signals
 from afspm.transport.process.context import ProcessActivity
 from afspm.transport.process.parent import StopRequested
+
+
+class PublishedState:
+    """The newest published states, and the number of publications of each, so that a caller can wait for the next."""
+
+    def __init__(self) -> None:
+        self.status: ScopeStatus | None = None
+        self.control: ControlState | None = None
+        self.scan_parameters: ScanParameters | None = None
+        self.feedback: Feedback | None = None
+        self.probe_position: ProbePosition | None = None
+        self.newest_ns: int | None = None
+        self._published: Counter[str] = Counter()
+
+    @property
+    def state(self) -> ScopeState:
+        return self.status.state if self.status else ScopeState.UNDEFINED
+
+    def take(self, message: str, thing: object) -> None:
+        """Take `thing`, published as the message `message`."""
+        setattr(self, wire.declaration(message).attribute, thing)
+        self._published[message] += 1
+
+    def take_time(self, time_ns: int | None) -> None:
+        """Take the time of a packet of the scheduler."""
+        if time_ns is not None and (self.newest_ns is None or time_ns > self.newest_ns):
+            self.newest_ns = time_ns
+
+    def count(self, message: str) -> int:
+        """Return the number of publications of `message`."""
+        return self._published[message]
+
+
+class Interrupts:
+    """The interrupts (Ctrl-C, the stop button of a notebook) during calls over one port.
+
+    An interrupt is raised where a call waits, so that no request or answer is left half done. A program that handles or
+    ignores SIGINT itself, as components do, is left alone.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._is_deferred = False
+        self._has_come = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt in this block only where `heed` is called, and at its end."""
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield  # components handle SIGINT themselves, as does an outer block of this kind
+            return
+        self._has_come = False
+        with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+            yield
+            self.heed()
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Finish this block, which must be short; further interrupts during it are dropped."""
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = self._has_come = False
+
+    def heed(self) -> None:
+        """Raise KeyboardInterrupt after an interrupt."""
+        if self._has_come and not self._is_deferred:
+            self._has_come = False
+            raise Interrupted
+
+    def interrupt(self) -> None:
+        """Interrupt the present or next call, as Ctrl-C does. From any thread."""
+        self._has_come = True
+        self._port.wake_up()
+
+    def _come(self, _number: int) -> None:
+        self._has_come = True
+
 
 LONGER_THAN_THE_SCHEDULER = 1.2
 """Factor on the time that the scheduler waits for the microscope, so that its NO_RESPONSE arrives before the timeout: a

@@ -23,7 +23,7 @@ from afspm.model import Frame, Packet, Problem
 from afspm.storage.memory import Memory
 from afspm.transport.process import failure
 from afspm.transport.process.context import ProcessContext
-from afspm.transport.process.fault_file import write_fault
+from afspm.transport.process.failure import write_fault
 from afspm.transport.process.parent import StopRequested
 
 AFTER_THE_END_S = 30.0  # to handle packets from before the end

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from afspm.client.command_retry import CommandRetry
-from afspm.client.published_state import PublishedState
+from afspm.client.experiment_link import PublishedState
 from afspm.client.targets import FITS, SAME, XY, ScanTarget, Target, is_set
 from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePosition, Region, ScanParameters, names
 

@@ -15,7 +15,7 @@ from afspm.record.run_json import EXPERIMENT_FILE, METADATA, experiment_name, ru
 from afspm.storage.packet_log import log_folder
 from afspm.storage.segment import segments
 from afspm.transport.port import Killed, PacketReceived, ParentGone
-from afspm.transport.process.priority import step_back
+from afspm.transport.process.context import step_back
 
 if TYPE_CHECKING:
     from afspm.record.store import RecordSettings

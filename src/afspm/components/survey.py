@@ -20,9 +20,9 @@ from afspm.components.scan_plan import ScanPlan
 from afspm.components.surveying.record import Outcome, SurveyRecord, Visit
 from afspm.components.surveying.targets import Target, find_particles, lowest_beside, nearest
 from afspm.model import Region, RegistrationOutcome, Scan, ScanSet, names, registration_summary
-from afspm.model.drift_mapping import drift_knowledge
 from afspm.model.geometry import XY
 from afspm.model.planned_work import PlannedWork, planned_rounds
+from afspm.record.drift_mapping import drift_knowledge
 from afspm.storage.atomic import OutageLog
 from afspm.transport.process.loading import find_object
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     import xarray
 
     from afspm.model import Scan
-    from afspm.model.spectrum_stack import Quantity, SpectrumStack
+    from afspm.record.spectrum_stack import Quantity, SpectrumStack
 
 R = TypeVar("R", ScanRow, SpectrumRow)
 Row = tuple[Any, ...]
@@ -120,12 +120,12 @@ class SpectrumTable(KeyedTable[SpectrumRow]):
             InvalidValue: these spectra do not form a grid of at least two by two, or there is no such quantity.
             FileError: a file is missing or damaged.
         """
-        from afspm.model.spectrum_stack import map_of
+        from afspm.record.spectrum_stack import map_of
 
         return map_of([self._read(row) for row in self._rows], quantity, at, unit, direction, name)
 
     def _stacked(self, *, interpolate: bool) -> SpectrumStack:
-        from afspm.model.spectrum_stack import stacked
+        from afspm.record.spectrum_stack import stacked
 
         return stacked([self._read(row) for row in self._rows], interpolate=interpolate)
 
@@ -179,7 +179,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
     if not mappings:
         return {}
     found, after_ns = {}, -1
-    from afspm.model.drift_mapping import drift_knowledge  # imports numpy, which the supervisor avoids
+    from afspm.record.drift_mapping import drift_knowledge  # imports numpy, which the supervisor avoids
 
     for number, published_ns in sorted(query(_PUBLISHED["scans"]), key=itemgetter(1)):
         payload = None

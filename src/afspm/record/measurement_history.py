@@ -13,8 +13,8 @@ import numpy as np
 
 from afspm.basics.units import convert, same_kind
 from afspm.model import Frame, Region, RegistrationOutcome, Scan, Spectrum
-from afspm.model.drift_mapping import drift_at, drift_knowledge
 from afspm.model.geometry import XY
+from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.running_scan import DoneScan, RunningScan
 
 MOST_MEASURED = 100_000

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from afspm.basics.errors import FileError
 from afspm.basics.plain_data import Plain
 from afspm.model import Frame, Region, Scan, Spectrum
-from afspm.model.spectrum_grid import PointGrid
+from afspm.record.spectrum_grid import PointGrid
 from afspm.storage.formats import hdf5
 from afspm.storage.formats.content import FileContent, OtherFormat
 

@@ -6,7 +6,7 @@ import math
 import sys
 from collections import defaultdict, deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from afspm import wire
@@ -51,9 +51,37 @@ from afspm.record.measurement_history import (
     ScanSummary,
     SpectrumSummary,
 )
-from afspm.record.reading_curves import ReadingCurve
 from afspm.record.running_scan import RunningScan
 from afspm.record.timeline import Span, Timeline, Timelines
+
+MOST_POINTS = 4000
+
+
+@dataclass(slots=True)
+class ReadingCurve:
+    """Values over time; NaN where the value was unknown.
+
+    Attributes:
+        step_ns: a point nearer to the last one replaces it; it grows with the length of the run.
+    """
+
+    unit: str = ""
+    times_ns: list[int] = field(default_factory=list)
+    values: list[float] = field(default_factory=list)
+    step_ns: int = 0
+
+    def add(self, time_ns: int, value: float) -> None:
+        """Add a value; of a long run every second point is kept, again and again."""
+        is_near = len(self.times_ns) > 1 and time_ns - self.times_ns[-2] < self.step_ns
+        if is_near and (value != value) == (self.values[-1] != self.values[-1]):
+            self.times_ns[-1], self.values[-1] = time_ns, value
+            return
+        self.times_ns.append(time_ns)
+        self.values.append(value)
+        if len(self.times_ns) > MOST_POINTS:
+            self.times_ns, self.values = self.times_ns[::2], self.values[::2]
+            self.step_ns = 2 * max(self.step_ns, (self.times_ns[-1] - self.times_ns[0]) // MOST_POINTS)
+
 
 __all__ = [
     "ROUTINE",

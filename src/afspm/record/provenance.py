@@ -19,7 +19,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.model.drift_mapping import drift_knowledge
+from afspm.record.drift_mapping import drift_knowledge
 
 _BACK = 20
 """The number of earlier states that are searched for the start of a measurement."""

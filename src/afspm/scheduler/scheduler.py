@@ -20,10 +20,9 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import ControlSettings, RunFacts, SchedulerSettings
 from afspm.scheduler.shell import FrameWorker, SchedulerShell
-from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.step_log import RecordedCore, StepLog
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.scheduler.write_ahead import WriteAhead
+from afspm.scheduler.write_ahead import StateFile, WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, log_folder
 from afspm.transport.probe import versions_here
 from afspm.transport.process.context import ProcessContext

@@ -23,7 +23,7 @@ from afspm.scheduler import events
 from afspm.transport.polling import milliseconds
 from afspm.transport.port import CaughtUp, PacketReceived
 from afspm.transport.router import PeerAsked, PeerConnected, RouterEvent
-from afspm.transport.translator_link import LinkReply, LinkUp
+from afspm.transport.scheduler_sockets import LinkReply, LinkUp
 
 if TYPE_CHECKING:
     from afspm.basics.clock import Clock

@@ -30,9 +30,8 @@ from afspm.supervisor.post_run import EndedRun
 from afspm.supervisor.process import from_start
 from afspm.supervisor.reporter import reporter_of
 from afspm.supervisor.run_identity import RunIdentity
-from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
-from afspm.supervisor.supervision.restart import RestartPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.transport.heartbeat import HeartbeatListener
 

@@ -56,7 +56,7 @@ from afspm.transport import keys
 from afspm.transport.heartbeat import HeartbeatListener
 from afspm.transport.polling import WakeUp
 from afspm.transport.process import signals
-from afspm.transport.process.fault_file import take_fault
+from afspm.transport.process.failure import take_fault
 
 REPORT_PERIOD_S = 0.1
 """Real time between two updates of the reporter's process states."""

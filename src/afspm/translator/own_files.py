@@ -1,20 +1,28 @@
 """Files that afspm writes where a controller saves none: one per scan with all its channels, one per spectrum.
 
-The simulated microscope saves them, and drivers save the data that they fetched. `afspm.storage.formats.simulator`
-reads them.
+NetCDF with a variable for each channel. The simulated microscope saves such files, and drivers save the data that they
+fetched; `read_netcdf` reads them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import tzinfo
+from pathlib import Path
 
 import numpy as np
 
-from afspm.basics.clock import utc_time
-from afspm.model import Region, Spectrum
-from afspm.storage.formats import netcdf, simulator
-from afspm.storage.formats.netcdf import Attributes, Variable
+from afspm.basics.clock import NS_PER_S, utc_time
+from afspm.basics.errors import FileError
+from afspm.model import Region, Scan, Spectrum, names
+from afspm.storage.formats import hdf5, netcdf
+from afspm.storage.formats.content import FileContent, OtherFormat
+from afspm.storage.formats.netcdf import Attributes, File, Variable
+
+CONTROLLER = "afspm simulator"
+CONVENTIONS = "afspm simulator 1"
+_AXES = ("x", "y")
 
 
 @dataclass(frozen=True)
@@ -66,9 +74,89 @@ def encode_spectrum(spectrum: Spectrum, facts: FileFacts) -> bytes:
 def _header(content: str, facts: FileFacts) -> dict[str, str | float]:
     # as text: a float64 has no room for nanoseconds since 1970
     when = utc_time(facts.time_ns).isoformat()
-    return {"Conventions": simulator.CONVENTIONS, "content": content, "time": when, "time_ns": str(facts.time_ns)}
+    return {"Conventions": CONVENTIONS, "content": content, "time": when, "time_ns": str(facts.time_ns)}
 
 
 def _identifier(name: str) -> str:
     # not every reader of NetCDF takes spaces or non-ASCII characters; the attribute `long_name` has the real name
     return "".join(c if c.isascii() and c.isalnum() else "_" for c in name).lower()
+
+
+def read_netcdf(path: Path, zone: tzinfo | None) -> FileContent:
+    """Return the scan or spectrum of a file.
+
+    Raises:
+        OtherFormat: another program wrote the file.
+        FileError: a part of it is missing.
+    """
+    if hdf5.is_hdf5(path):
+        raise OtherFormat("is NetCDF-4, which the simulated microscope does not write")
+    file = netcdf.read(path)
+    if file.attributes.get("Conventions") != CONVENTIONS:
+        raise OtherFormat("the simulated microscope did not write it")
+    header: dict[str, object] = dict(file.attributes)
+    try:
+        end_ns = int(str(file.attributes["time_ns"]))
+        if header.get("content") == "spectrum":
+            return FileContent(CONTROLLER, spectra=(_spectrum(file, end_ns, path),), header=header, end_ns=end_ns)
+        scans = _scans(file, end_ns, path)
+    except KeyError as error:
+        raise FileError(f"lacks {error}", where=str(path)) from error
+    if not scans:
+        raise FileError("holds no channel", where=str(path))
+    direction = header.get(names.SCAN_DIRECTION)
+    return FileContent(
+        CONTROLLER,
+        scans,
+        header=header,
+        start_ns=_start_ns(header, scans[0], end_ns),
+        end_ns=end_ns,
+        upwards=None if direction is None else direction == names.UP,
+    )
+
+
+def _start_ns(header: dict[str, object], scan: Scan, end_ns: int) -> int | None:
+    # the simulated microscope scans every line forward and backward
+    speed_m_s = header.get(f"{names.SCAN_SPEED} [m/s]")
+    if not isinstance(speed_m_s, float) or not speed_m_s > 0.0:
+        return None
+    return end_ns - round(scan.shape[0] * 2.0 * scan.region.size_m[0] / speed_m_s * NS_PER_S)
+
+
+def _scans(file: File, end_ns: int, path: Path) -> tuple[Scan, ...]:
+    def number(name: str) -> float:
+        return float(file.attributes[f"region_{name}"])
+
+    region = Region(
+        (number("center_x_m"), number("center_y_m")),
+        (number("size_x_m"), number("size_y_m")),
+        number("angle_rad"),
+    )
+    return tuple(
+        Scan(
+            region,
+            str(variable.attributes["long_name"]),
+            str(variable.attributes["units"]),
+            variable.values,
+            end_ns,
+            str(path),
+        )
+        for name, variable in file.variables.items()
+        if name not in _AXES
+    )
+
+
+def _spectrum(file: File, end_ns: int, path: Path) -> Spectrum:
+    position = None
+    if "position_x_m" in file.attributes:
+        position = (float(file.attributes["position_x_m"]), float(file.attributes["position_y_m"]))
+    variables = list(file.variables.values())
+    return Spectrum(
+        position,
+        str(file.attributes["kind"]),
+        tuple(str(variable.attributes["long_name"]) for variable in variables),
+        tuple(str(variable.attributes["units"]) for variable in variables),
+        np.stack([variable.values for variable in variables], axis=1),
+        end_ns,
+        str(path),
+    )

@@ -10,8 +10,8 @@ import pytest
 
 from afspm.basics.errors import FileError
 from afspm.model import RegistrationOutcome
-from afspm.model.drift_mapping import drift_at
 from afspm.plugins.drift.record import DriftRecord
+from afspm.record.drift_mapping import drift_at
 
 
 def record(n: int = 20, seed: int = 1) -> DriftRecord:

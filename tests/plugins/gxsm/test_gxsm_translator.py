@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import numpy as np
@@ -524,6 +524,7 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
 
     def begin(emulator: Any) -> None:
         emulator.program.panel.repeats = True
+        hold_scan(emulator.program, 4)
         emulator.program.start_scan()
 
     made.at_panel(begin)
@@ -535,19 +536,39 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
         found += [scan.channel for scan in scans(received)]
     assert len(found) == 3 * len(set(found)), "each channel of each scan, once"
     peer.until(ScopeState.SCANNING)
-    until_line(made, 8)
-    made.strike("panel-stop")
+
+    def stop(emulator: Any) -> None:
+        scan_until_line(emulator.program, 8)
+        emulator.program.stop_scan()
+
+    made.at_panel(stop)
     received = peer.until(FREE)
     assert states(received) == ["INTERRUPTED", "FREE"]
     assert not scans(received)
 
 
-def until_line(made: Bench, line: int) -> None:
-    """Wait until some lines of the running scan are complete."""
-    last, pace = made.emulator.program.scan.activity, Event()
-    assert last is not None
-    while last.lines_done(made.clock.now_s()) < line:
-        pace.wait(0.005)
+HELD = 1e4
+"""Factor of a held scan's line time: the scan outlasts the test on however busy a computer."""
+
+
+def hold_scan(program: Any, number: int) -> None:
+    """Let the n-th scan from now on take so long per line that it is at its first line until `scan_until_line`."""
+    start, begun = program.start_scan, itertools.count(1)
+
+    def start_scan() -> None:
+        before = program.scan.activity
+        start()
+        if program.scan.activity is not before and next(begun) == number:
+            program.scan.activity.line_s *= HELD
+
+    program.start_scan = start_scan
+
+
+def scan_until_line(program: Any, line: int) -> None:
+    """Complete these lines of a held scan."""
+    scan = program.scan.activity
+    scan.line_s /= HELD
+    scan.start_s = program.clock.now_s() - (line + 0.5) * scan.line_s
 
 
 def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
@@ -556,12 +577,17 @@ def test_scan_restarted_at_once_is_published_as_two(bench: Make) -> None:
     peer = made.start()
     ready(peer, shape=(24, 32))
     scanned(peer)
-    made.at_panel(lambda emulator: emulator.program.start_scan())
+
+    def begin(emulator: Any) -> None:
+        hold_scan(emulator.program, 1)
+        emulator.program.start_scan()
+
+    made.at_panel(begin)
     peer.until(ScopeState.SCANNING)
-    until_line(made, 8)
 
     def again(emulator: Any) -> None:
         program = emulator.program
+        scan_until_line(program, 8)
         program.stop_scan()
         program.advance(made.clock.now_s())
         program.saving.advance(made.clock.now_s() + 1.0)

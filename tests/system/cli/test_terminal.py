@@ -17,9 +17,9 @@ from systems import can_interrupt, interrupt, kill
 from typer.testing import CliRunner
 
 from afspm.cli.app import app
+from afspm.cli.follower import Follower
 from afspm.cli.joining import NOT_RUNNING, person
 from afspm.client.connect import find_run
-from afspm.client.follower import Follower
 from afspm.record.run import open_run
 from afspm.record.run_json import latest_run
 

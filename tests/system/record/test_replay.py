@@ -17,12 +17,12 @@ import afspm
 from afspm import wire
 from afspm.basics.errors import ConfigError, RequestError, TransportError
 from afspm.basics.launch import Launch
-from afspm.client.follower import Follower
+from afspm.cli.follower import Follower
 from afspm.model import ControlMode, ControlState, Packet, Region, Scan, ScopeState, ScopeStatus
+from afspm.plugins.replay import replay as replay_module
+from afspm.plugins.replay.replay import ReplayOptions, _addresses, replay
 from afspm.record.store import RecordSettings, RecordStore
-from afspm.supervisor import replay as replay_module
 from afspm.supervisor import resume
-from afspm.supervisor.replay import ReplayOptions, _addresses, replay
 
 START_NS = 1_773_518_400_000_000_000
 STEP_NS = 60_000_000_000  # experiment time between two packets

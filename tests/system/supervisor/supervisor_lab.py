@@ -15,9 +15,8 @@ from systems import PATIENCE
 from afspm.basics.launch import Launch
 from afspm.experiment import Role
 from afspm.supervisor.process import Task
-from afspm.supervisor.supervision.child import ChildPolicy
+from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
-from afspm.supervisor.supervision.restart import RestartPolicy
 from afspm.supervisor.supervisor import RunOutcome, Supervisor
 
 DEADLINE_S = 20.0 * PATIENCE

@@ -9,12 +9,14 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from queue import Queue
+from typing import Any
 
 import pytest
 from systems import KILLED, PATIENCE, freeze, not_on_wine
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.launch import Launch
+from afspm.supervisor import reaper
 from afspm.supervisor.child_output import OutputDropped, OutputLine
 from afspm.supervisor.process import ChildEvent, ChildProcess, Task
 from afspm.supervisor.supervision.supervisor_events import Exited
@@ -192,3 +194,21 @@ def test_nothing_outlives_a_supervisor_that_was_killed(what: str) -> None:
         for connection in connections:
             with connection, contextlib.suppress(ConnectionResetError):
                 assert connection.recv(1) == b""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has job objects instead of the reaper process")
+def test_reaper_that_does_not_end_by_itself_is_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[subprocess.Popen[bytes]] = []
+    popen = subprocess.Popen
+
+    def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        begun.append(popen(*arguments, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", start)
+    monkeypatch.setattr(reaper, "CLOSED_WITHIN_S", 0.01)
+    one = reaper.Reaper()
+    one.begin()
+    freeze(begun[0].pid)
+    one.close()
+    assert begun[0].returncode is not None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from afspm.cli.estimate_text import estimate_lines
+from afspm.cli.experiment_file import estimate_lines
 from afspm.experiment import load
 from afspm.model.planned_work import PlannedWork
 

@@ -25,7 +25,7 @@ from afspm.model import (
     ScopeState,
     ScopeStatus,
 )
-from afspm.transport.process.fault_file import take_fault
+from afspm.transport.process.failure import take_fault
 from afspm.wire.generated.analysis_pb2 import SpatialPointWithScoreList
 from afspm.wire.generated.feedback_pb2 import FeedbackAnalysis
 

@@ -19,8 +19,7 @@ from afspm.model import (
     RescanKind,
     ScopeState,
 )
-from afspm.record.overview import MOST_LINES, Overview
-from afspm.record.reading_curves import MOST_POINTS
+from afspm.record.overview import MOST_LINES, MOST_POINTS, Overview
 
 S = 1_000_000_000
 REGION = model.Region((0.0, 0.0), (1e-6, 1e-6))

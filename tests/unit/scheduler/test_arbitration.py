@@ -27,7 +27,6 @@ from afspm.scheduler.control.arbitration import (
     row_for,
 )
 from afspm.scheduler.control.descriptions import is_routine
-from afspm.scheduler.control.diagram import edges, kind, mermaid
 
 TIP, MALFUNCTION, FEEDBACK, NAMED = 1, 2, 3, 40
 RULES = Rules(problems=ProblemNames({"lost-molecule": NAMED}))
@@ -296,17 +295,6 @@ def test_no_sequence_of_events_breaks_the_invariants(story: list[ControlInput]) 
             assert control.holder in (None, before.holder)
         assert set(control.problems) <= set(RULES.problems.values())
         assert from_plain(ArbitrationState, json.loads(json.dumps(to_plain(control)))) == control
-
-
-def test_the_diagram_is_drawn_from_the_table() -> None:
-    drawn = edges()
-    assert ("free", "asks for control", "in control") in drawn
-    assert ("in control", "flags a problem", "flagged, no component in control") in drawn
-    assert ("flagged, no component in control", "asks for control", "solver in control") in drawn
-    assert ("solver in control", "the last flag is removed", "free") in drawn
-    assert not any(before == "manual" and after == "in control" for before, _, after in drawn)
-    assert mermaid().startswith("stateDiagram-v2")
-    assert kind(ArbitrationState()) == "free"
 
 
 def _states() -> list[ArbitrationState]:

@@ -23,9 +23,8 @@ from afspm.model import (
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.shell import SchedulerShell
-from afspm.scheduler.state_file import StateFile
 from afspm.scheduler.wire_codec import WireCodec
-from afspm.scheduler.write_ahead import WriteAhead
+from afspm.scheduler.write_ahead import StateFile, WriteAhead
 from afspm.storage.packet_log import PacketLog, cached_packets, logged_packets
 from afspm.transport.rate_limited_log import RateLimitedLog
 from afspm.transport.router import PeerAsked, PeerConnected

@@ -14,8 +14,7 @@ import pytest
 from afspm.basics.clock import ExperimentClock
 from afspm.model import LoggedPacket, Packet
 from afspm.scheduler.saved_state import SavedState
-from afspm.scheduler.state_file import StateFile
-from afspm.scheduler.write_ahead import WriteAhead
+from afspm.scheduler.write_ahead import StateFile, WriteAhead
 from afspm.storage import atomic, disk, packet_log
 from afspm.storage.packet_log import PacketLog, cached_packets, commit, expect_recorder, logged_packets
 

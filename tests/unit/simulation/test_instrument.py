@@ -14,9 +14,9 @@ import pytest
 from afspm.basics.errors import InvalidValue
 from afspm.model import Region
 from afspm.simulation import World
+from afspm.simulation.background import in_background
 from afspm.simulation.instrument import Instrument, InstrumentBusy
 from afspm.simulation.scan_drawing import run_at_once
-from afspm.transport.process.background import in_background
 
 
 def test_scan_takes_its_time_and_its_lines_appear_one_by_one(rig: Instrument, clock: Any) -> None:

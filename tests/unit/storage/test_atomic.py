@@ -15,7 +15,7 @@ from afspm.basics.errors import FileError
 from afspm.model import ControlMode
 from afspm.scheduler.control.arbitration import ArbitrationState
 from afspm.scheduler.saved_state import SavedState
-from afspm.scheduler.state_file import StateFile
+from afspm.scheduler.write_ahead import StateFile
 from afspm.storage import atomic
 from afspm.storage.atomic import SLOW_S, CheckpointFile, OutageLog, load_checkpoint, previous_generation
 from afspm.storage.disk import SYNCER, DiskBacklogFull, DiskTimeout

@@ -17,10 +17,11 @@ from afspm.supervisor.supervision.child import (
     ChildWatch,
     GiveUpChild,
     KillChild,
+    RestartBudget,
+    RestartPolicy,
     StartChild,
 )
 from afspm.supervisor.supervision.liveness import Liveness, LivenessPolicy, ProcessHealth
-from afspm.supervisor.supervision.restart import RestartBudget, RestartPolicy
 
 
 @dataclass(frozen=True)

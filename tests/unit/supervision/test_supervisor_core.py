@@ -9,11 +9,9 @@ import pytest
 
 from afspm.basics.exit_codes import ExitCode
 from afspm.model import Role
-from afspm.supervisor.supervision.child import ChildPolicy
-from afspm.supervisor.supervision.idle import ASK_AGAIN_S, IDLE_AFTER_S
+from afspm.supervisor.supervision.child import ChildPolicy, RestartPolicy
 from afspm.supervisor.supervision.liveness import LivenessPolicy
-from afspm.supervisor.supervision.restart import RestartPolicy
-from afspm.supervisor.supervision.run_end import KILL_AFTER_S, OWN_PACE_S, TIP_S, EndReason
+from afspm.supervisor.supervision.run_end import ASK_AGAIN_S, IDLE_AFTER_S, KILL_AFTER_S, OWN_PACE_S, TIP_S, EndReason
 from afspm.supervisor.supervision.supervised_child import CLOSES_WITHIN_S, ChildSpec
 from afspm.supervisor.supervision.supervisor_core import SCHEDULER_ANSWERS_WITHIN_S, SupervisorCore
 from afspm.supervisor.supervision.supervisor_events import (

@@ -10,7 +10,7 @@ import pytest
 
 TOLD = """
 import os, threading
-from afspm.transport.process.priority import step_back
+from afspm.transport.process.context import step_back
 
 before, told = threading.Event(), []
 early = threading.Thread(target=lambda: (before.wait(), told.append(os.nice(0))))
@@ -27,7 +27,7 @@ print(*told)
 
 CLASS_TOLD = """
 import psutil
-from afspm.transport.process.priority import step_back
+from afspm.transport.process.context import step_back
 step_back()
 print(psutil.Process().nice() == psutil.BELOW_NORMAL_PRIORITY_CLASS)
 """

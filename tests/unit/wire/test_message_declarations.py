@@ -18,7 +18,7 @@ from afspm import wire
 from afspm.basics.errors import ConfigError, InvalidValue
 from afspm.client.component import Component
 from afspm.client.dispatch import MessageDispatcher
-from afspm.client.published_state import PublishedState
+from afspm.client.experiment_link import PublishedState
 from afspm.model import Packet, PacketHeader, ProblemNames, Role
 from afspm.plugins.web.gateway.events import EventHistory
 from afspm.plugins.web.gateway.models import event_kinds

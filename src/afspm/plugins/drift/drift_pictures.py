@@ -19,8 +19,8 @@ from afspm.basics.formatting import counted
 from afspm.client.component import Component
 from afspm.components.line_file import LineFile, csv_line
 from afspm.model import RegistrationOutcome
-from afspm.model.drift_mapping import drift_at
 from afspm.plugins.drift.record import COLUMNS as RECORD
+from afspm.record.drift_mapping import drift_at
 
 if TYPE_CHECKING:
     from afspm.plugins.drift.figures.album import RunPart

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afspm import wire
-from afspm.model.drift_mapping import drift_at, drift_knowledge
 from afspm.plugins.drift.record import DriftRecord
+from afspm.record.drift_mapping import drift_at, drift_knowledge
 from afspm.record.report.pictures import OFFSET, OWN_OFFSET, is_ours
 from afspm.record.run import Run
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from afspm.basics.errors import FileError
 from afspm.model import RegistrationOutcome, registration_summary
-from afspm.model.drift_mapping import drift_at
 from afspm.plugins.drift.registration import DriftScan
 from afspm.plugins.drift.tracking import Update
+from afspm.record.drift_mapping import drift_at
 
 Array = NDArray[np.float64]
 

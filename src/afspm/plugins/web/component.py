@@ -14,7 +14,7 @@ from afspm.plugins.web.watch import Watch
 from afspm.record.expected_end import plans_of
 from afspm.record.run_json import run_json_or_empty
 from afspm.record.run_lock import cut_off_message
-from afspm.transport.process.priority import step_back
+from afspm.transport.process.context import step_back
 
 if TYPE_CHECKING:
     import socket

@@ -17,9 +17,9 @@ from pathlib import Path
 from afspm.basics import entry_points
 from afspm.basics.errors import FileError, InvalidValue
 from afspm.model import Spectrum
-from afspm.model.spectrum_stack import SpectrumStack, stacked
 from afspm.record.measured_files import write_synced
 from afspm.record.run import Run
+from afspm.record.spectrum_stack import SpectrumStack, stacked
 from afspm.record.tables import ScanRow, SpectrumRow
 
 __all__ = ["chosen", "export"]

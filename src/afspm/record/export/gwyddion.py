@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from afspm.basics.plain_data import PlainMapping
 from afspm.model import Scan, Spectrum
-from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.run import Run
+from afspm.record.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.tables import ScanRow, SpectrumRow
 
 _MAGIC = b"GWYP"

@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from afspm.basics.clock import iso_utc
-from afspm.model.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.journal import measured_file
 from afspm.record.nexus_reader import ABOUT, GRID
 from afspm.record.nexus_writer import field_names
 from afspm.record.nxspm import group, values
 from afspm.record.run import Run
+from afspm.record.spectrum_stack import SpectrumStack, mean_over_repeats
 from afspm.record.tables import ScanRow, SpectrumRow
 
 

@@ -14,11 +14,11 @@ from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import typeset_position
 from afspm.model import Spectrum
 from afspm.model.geometry import XY
-from afspm.model.spectrum_grid import at, common_sweep, grid, ways
 from afspm.record.drawing.chart import BACKWARD, Axis, Band, Curve, chart
 from afspm.record.report import markup
 from afspm.record.report.markup import PageTimes
 from afspm.record.run import Run
+from afspm.record.spectrum_grid import at, common_sweep, grid, ways
 from afspm.record.tables import SpectrumRow
 
 MOST_READ = 400

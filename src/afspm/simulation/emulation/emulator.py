@@ -23,13 +23,13 @@ from afspm.basics.errors import AfspmError, ConfigError, ErrorCollector, Transpo
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.plain_data import PlainMapping
 from afspm.basics.requirements import require
+from afspm.simulation.background import in_background
 from afspm.simulation.faults import Fault, Faults
 from afspm.simulation.instrument import Instrument
 from afspm.simulation.truth import Truth
 from afspm.translator.emulated_controller import AddressNotice, notice_file
 from afspm.transport.polling import WakeUp
 from afspm.transport.port import Killed
-from afspm.transport.process.background import in_background
 from afspm.transport.zmq_port import open_port
 
 if TYPE_CHECKING:

@@ -17,6 +17,7 @@ from afspm.basics.plain_data import PlainMapping
 from afspm.basics.units import Duration, PollPeriod
 from afspm.model import ControlResponse, Scan, ScanLines, ScopeState, ScopeStatus, Spectrum, names
 from afspm.simulation import World
+from afspm.simulation.background import in_background
 from afspm.simulation.faults import INSTRUMENT_FAULTS, Fault, Faults
 from afspm.simulation.feedback import FeedbackSettings
 from afspm.simulation.instrument import Instrument
@@ -28,7 +29,6 @@ from afspm.storage.formats import read
 from afspm.translator.driver import Driver
 from afspm.translator.driver_base import Action, ControllerLost, action
 from afspm.translator.parameters import FEEDBACK_ON, Value
-from afspm.transport.process.background import in_background
 
 if TYPE_CHECKING:
     from afspm.transport.process.context import ProcessContext

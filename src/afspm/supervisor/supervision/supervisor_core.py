@@ -19,8 +19,15 @@ from afspm.supervisor.supervision.child import (
     KillChild,
     StartChild,
 )
-from afspm.supervisor.supervision.idle import IDLE_AFTER_S, IdleWatch, describe_idle
-from afspm.supervisor.supervision.run_end import EndReason, EndStep, RunEnd, unfinished
+from afspm.supervisor.supervision.run_end import (
+    IDLE_AFTER_S,
+    EndReason,
+    EndStep,
+    IdleWatch,
+    RunEnd,
+    describe_idle,
+    unfinished,
+)
 from afspm.supervisor.supervision.supervised_child import ChildLife, ChildSpec, ProcessReport, SupervisedChild
 from afspm.supervisor.supervision.supervisor_events import (
     ActivitySeen,

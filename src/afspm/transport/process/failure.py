@@ -1,15 +1,40 @@
-"""Exceptions as text: what happened, and the place in the user's own code."""
+"""Exceptions as text, with the place in the user's own code; and the file that reports a fault to the supervisor."""
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
 import traceback
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 
 from afspm.basics.errors import AfspmError, FileError, Refused, RequestError, TransportError
+from afspm.basics.own_fault import OwnFault
 from afspm.model import ControlResponse
+from afspm.storage.atomic import write_atomic
+
+
+def write_fault(state_dir: Path, name: str, fault: OwnFault) -> None:
+    with suppress(FileError):  # on a full disk the fault counts as an ordinary crash
+        write_atomic(_path(state_dir, name), [json.dumps(asdict(fault)).encode()])
+
+
+def take_fault(state_dir: Path, name: str) -> OwnFault | None:
+    """Return the reported fault, and remove its file; None without a readable file."""
+    try:
+        fault = OwnFault(**json.loads(_path(state_dir, name).read_bytes()))
+        _path(state_dir, name).unlink()
+    except (OSError, ValueError, TypeError):
+        return None
+    return fault
+
+
+def _path(state_dir: Path, name: str) -> Path:
+    return state_dir / f"{name}.fault.json"
+
 
 PACKAGE = Path(__file__).parents[2]  # not resolved, since tracebacks have unresolved paths
 _BELOW_START = 2  # frames of runpy below a module run by `python -m`

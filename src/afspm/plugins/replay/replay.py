@@ -17,11 +17,11 @@ from afspm.basics.errors import ConfigError, FileError
 from afspm.basics.launch import Launch, Sockets
 from afspm.client.connect import GUEST
 from afspm.model import Frame
+from afspm.plugins.replay.replayer import Replayer
 from afspm.record.packets import RecordPlayback
 from afspm.record.run import Run, open_run
 from afspm.record.run_json import ENDED, EXPERIMENT_FILE, REPLAY_OF, STATE_DIR
 from afspm.record.run_lock import lock_run
-from afspm.scheduler.replayer import Replayer
 from afspm.supervisor import run_folder
 from afspm.supervisor.ports import FreePorts
 from afspm.supervisor.run import now

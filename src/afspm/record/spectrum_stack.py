@@ -14,7 +14,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.model.geometry import Frame, Region
 from afspm.model.scan import Scan
 from afspm.model.spectrum import Spectrum
-from afspm.model.spectrum_grid import (
+from afspm.record.spectrum_grid import (
     DIRECTIONS,
     Floats,
     PointGrid,
