@@ -23,7 +23,7 @@ class SchedulerSockets:
     """Publisher and router for the components, subscriber and link for the translator.
 
     Args:
-        since_ns: time up to which the translator's packets are known.
+        since_ns: time up to which the scheduler has all packets of the translator.
         epoch: epoch before each request to the translator; empty: none.
 
     Raises:

@@ -32,8 +32,8 @@ class LinkReply(NamedTuple):
 class TranslatorLink:
     """A client that sends requests to the translator.
 
-    A REP socket returns the frames before the empty frame: a number, so that a late answer is never taken for another
-    one, and the scheduler's epoch, which the translator checks.
+    A REP socket returns the frames before the empty frame: a number, so that a late answer is never taken for the
+    answer to another request, and the scheduler's epoch, which the translator checks.
 
     Args:
         epoch: epoch of the scheduler; empty: none.

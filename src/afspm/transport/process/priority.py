@@ -1,4 +1,4 @@
-"""Low priority for processes that only observe, so that those of the experiment run first."""
+"""Low priority for observing processes, so that processes of the experiment run first."""
 
 from __future__ import annotations
 
