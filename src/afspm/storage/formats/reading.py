@@ -1,8 +1,8 @@
-"""`read`: reading any controller's file.
+"""`read`: the scans and spectra of any controller's file.
 
 A reader is declared by the suffix of its files ("sxm"). If several controllers write files with one suffix, each
-further reader adds its own name ("nc.gxsm"): the readers of a suffix are tried in the order of their names until one
-does not raise `OtherFormat`.
+further reader adds its own name ("nc.gxsm"): the readers of a suffix are tried in the order of their names until a
+reader does not raise `OtherFormat`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def read(path: str | Path, *, zone: tzinfo | None = None) -> FileContent:
     """Return the scans and spectra of a file.
 
     The suffix of the file selects the reader: of a maker's format, of Gwyddion's simple fields (.gsf), of afspm's
-    record or of an exported grid of spectra (.h5). `afspm doctor` lists the suffixes. If two channels have one name,
-    the second becomes "name #2".
+    record or of an exported grid of spectra (.h5). `afspm doctor` lists the suffixes. If two channels have the same
+    name, the second becomes "name #2".
 
     Args:
         zone: time zone of the controller's clock, which most files do not state; None: the zone of this computer.
