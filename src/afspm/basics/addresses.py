@@ -44,7 +44,7 @@ def reaches(connect: str, bind: str) -> bool:
 
 
 def connectable(bind: str) -> str:
-    """Return the address for peers on this computer of a bound socket: a wildcard becomes loopback."""
+    """Return the address at which processes on this computer reach a bound socket: a wildcard becomes loopback."""
     return re.sub(r"^tcp://(\*|0\.0\.0\.0)(?=:)", f"tcp://{LOOPBACK}", bind)
 
 
@@ -56,14 +56,14 @@ class Listens:
 
     Attributes:
         host: for a port, the setting that names the host; empty: this computer only.
-        keyed: whether the keys of the experiment protect the address; a page has passwords instead.
+        keyed: whether the experiment's keys protect the address; False for web pages, which have passwords.
     """
 
     host: str = ""
     keyed: bool = True
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> object:
-        """Have pydantic refuse anything but an address or a port. Only pydantic calls it, so pydantic is not loaded
+        """Validate the setting with pydantic: an address or a port. Only pydantic calls it, so pydantic is not loaded
         here.
         """
         from pydantic_core import core_schema

@@ -38,7 +38,7 @@ def utc_time(time_ns: int) -> datetime:
 
 
 def iso_utc(time_ns: int | None) -> str:
-    """Return a time, ns since the Unix epoch, as ISO 8601 in UTC, to the microsecond; empty for none."""
+    """Return a time in ns since the Unix epoch as ISO 8601 in UTC, to the microsecond; "" for None."""
     if time_ns is None:
         return ""
     return f"{utc_time(time_ns):%Y-%m-%dT%H:%M:%S.%f}Z"
@@ -78,11 +78,11 @@ _BOOT = Path("/proc/sys/kernel/random/boot_id")
 
 @cache
 def monotonic_id() -> str:
-    """Return an id of the origin of time.monotonic(): this computer, this boot, and the clock that Python reads.
+    """Return an id for the origin of `time.monotonic()`: this computer, its boot, and the clock that Python reads.
 
     In one boot all processes share one origin: the function is "system-wide" by Python's documentation (since 3.5;
     on macOS since 3.10), but which of Windows' clocks it reads depends on the version of Python. Only Linux gives a
-    boot an identity. Elsewhere the computer's name must do: no run hands times on to a run after it.
+    boot an identity. Elsewhere the computer's name is enough, as no run passes such times to the next one.
     """
     boot = ""
     if sys.platform == "linux":  # Wine shows the file only to processes on its drive Z:
@@ -106,8 +106,8 @@ _CHECKSUM = struct.Struct("<I")
 class SharedSimulationTime:
     """Time of a simulated run that slows down for late processes; all processes share it in a small file.
 
-    From a moment of real time the experiment goes at real speed until another moment, and at full speed afterwards. A
-    late process writes both moments.
+    Between two moments of real time the experiment runs at real speed, and afterwards at full speed. A late process
+    writes both moments.
 
     Args:
         path: an existing file.
@@ -200,13 +200,13 @@ class ExperimentClock:
 
     @classmethod
     def starting_now(cls, start_s: float | None = None, speed: float = 1.0) -> ExperimentClock:
-        """Return a clock that shows `start_s` (default: the real time) now and goes at `speed` from here."""
+        """Return a clock that shows `start_s` (default: the real time) now and runs at `speed` from then on."""
         origin_s = time.time()
         return cls(origin_s, origin_s if start_s is None else start_s, speed)
 
     @classmethod
     def from_dict(cls, values: PlainMapping) -> ExperimentClock:
-        """Return the clock that `as_dict` described; the real time for an empty table."""
+        """Return the clock of an `as_dict` table; the real time for an empty table."""
         if not values:
             return cls.real()
         times = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
@@ -233,7 +233,7 @@ class ExperimentClock:
         }
 
     def waiting_in(self, path: Path) -> ExperimentClock:
-        """Return this clock with late processes shared in a file, if it goes faster than real time.
+        """Return a clock that waits for late processes through a shared file; unchanged at real speed.
 
         Args:
             path: file that the processes of the run share.
@@ -252,9 +252,7 @@ class ExperimentClock:
         return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
 
     def wall_ahead_s(self) -> float:
-        """Return by how many seconds the system clock is ahead: it was set since the start, or the computer was
-        suspended.
-        """
+        """Return the lead of the system clock in s, after it was set or the computer was suspended."""
         return _anchor_s() - self._wall_at_zero_s
 
     def now_s(self) -> float:

@@ -1,7 +1,7 @@
-"""The door: entry points, with which installed packages add to afspm.
+"""Entry points: installed packages extend afspm through them.
 
 afspm's own drivers, emulators, components, readers, … are declared in the same groups of its `pyproject.toml` as those
-of any other package, and are found in the same way. A package declares a line for each, and is installed::
+of any other package, and are found in the same way. A package declares one line for each of its classes::
 
     [project.entry-points."afspm.components"]
     Ridges = "my_lab.ridges:Ridges"
@@ -51,7 +51,7 @@ class DeclaredName:
 
     Attributes:
         package: name and version of the package.
-        problem: why the name can't be used; empty: the name can be used, or was not tried.
+        problem: why the name can't be used; empty if it can be used or was not tried.
     """
 
     group: str
@@ -127,7 +127,7 @@ def required(group: str, name: str) -> Any:
 
 
 def folder(group: str, name: str) -> Path | None:
-    """Return the folder of the module that a name is declared in, without importing the module; None: not found."""
+    """Return the folder of the module that declares a name, without importing it; None if not found."""
     point = find(name, group)
     spec = None if point is None else find_spec(point.module)
     return None if spec is None or spec.origin is None else Path(spec.origin).parent

@@ -47,7 +47,7 @@ class Interrupted(KeyboardInterrupt):
 
 
 def rendered(error: BaseException, text: str) -> list[str]:
-    """Return an error and the caller's own lines, without the lines of afspm and of libraries."""
+    """Return an error's text with the caller's lines of the traceback, without those of afspm and libraries."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
     own = [one for one in own if one.line]
@@ -188,18 +188,18 @@ class NoResponse(RequestError):
 
 
 class MeasurementFailed(NoResponse):
-    """A scan or spectrum that failed again and again without a known reason: a person has to look."""
+    """A scan or spectrum that failed repeatedly for an unknown reason, so that a person must look."""
 
     code = "measurement-failed"
 
 
 class ControlLost(RequestError):
-    """The error that control was taken away from a caller that does not wait for its return."""
+    """Loss of control, raised for a caller that does not wait to regain control."""
 
     code = "control-lost"
 
 
 class ExperimentEnded(AfspmError):
-    """The error that the experiment has ended: the microscope takes no more requests."""
+    """End of the experiment: the microscope takes no more requests."""
 
     code = "ended"

@@ -6,7 +6,7 @@ from enum import IntEnum
 
 
 class ExitCode(IntEnum):
-    """Exit codes of afspm's processes. Every other code, and every signal, is a crash that a restart follows."""
+    """Exit codes of afspm's processes. Any other code or a signal is a crash: the process is restarted."""
 
     DONE = 0
     """Finished on purpose: there is nothing more to do."""

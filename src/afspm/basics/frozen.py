@@ -1,4 +1,4 @@
-"""`replace` for the frozen parts of the scheduler's state: as `dataclasses.replace`, but many times as fast."""
+"""`replace` for the frozen parts of the scheduler's state: as `dataclasses.replace`, but many times faster."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ The same line goes to Python components (`python -m afspm.supervisor.host`) and 
 language. Standard input then stays open: its end means that the parent is gone or stops the process.
 
 On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
-for how many seconds the current step has been running (ASCII; 0 when idle), how long a step may take (ASCII), and
+the age of the current step in s (ASCII; 0 when idle), the longest duration of a step in s (ASCII), and
 `beat_token`. All but the first are optional. The second and third distinguish a busy process from a frozen one. After
 the first beat with a token, beats without it are ignored: no other process can beat in its place.
 """

@@ -1,4 +1,4 @@
-"""Faults of a component's own code, which come again after a restart."""
+"""Faults of a component's own code, which recur after a restart."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class OwnFault:
     """An error of a component's own code that ended the component.
 
     A restart begins with the component's memory and keyed measurements. If a life ends with both unchanged, it has made
-    no progress. So two equal faults in a row will come again after every restart, with every request to the microscope
+    no progress. So two equal faults in a row will recur after every restart, and repeat every request to the microscope
     before them.
 
     Attributes:

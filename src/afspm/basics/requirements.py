@@ -27,7 +27,7 @@ def require(class_: object) -> None:
 
 
 def require_installed(what: str, *requirements: str) -> None:
-    """Check that the packages `what` requires are installed. Raises ConfigError as `require` does."""
+    """Check that the packages required by `what` are installed. Raises ConfigError as `require` does."""
     lacking = {one: missing for one in requirements if (missing := list(_missing(one)))}
     if lacking:
         packages = ", ".join(dict.fromkeys(package for missing in lacking.values() for package in missing))

@@ -1,6 +1,6 @@
 """Units at the edges: everything inside afspm is in SI (metres, seconds, volts, amperes, radians …).
 
-The units of scanning probe microscopy are in a small exact table; any other goes to pint, which is only loaded then.
+A small exact table holds the units of scanning probe microscopy; pint, loaded on demand, converts all others.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Unit:
 
     Attributes:
         si: the SI unit that the component gets, e.g. "m".
-        is_written: the file must write a unit, since a plain number could mean several (seconds, minutes).
+        is_written: the file must give a unit, since a plain number is ambiguous (seconds or minutes).
         least: the smallest value, in the SI unit.
         above: exclusive lower bound of the values.
     """
@@ -106,7 +106,7 @@ class Unit:
     above: float = -math.inf
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
-        """Have pydantic read text with a unit. Only pydantic calls it, so pydantic is not loaded here."""
+        """Make pydantic read text with a unit. Only pydantic calls it, so pydantic is not loaded here."""
         from pydantic_core import core_schema
 
         return core_schema.no_info_before_validator_function(self.read, handler(source))
@@ -231,7 +231,7 @@ def si_unit(unit: str) -> str:
 
 
 def same_kind(unit_a: str, unit_b: str) -> bool:
-    """Return whether one unit can be converted to the other; False for unknown ones."""
+    """Return whether one unit can be converted to the other; False for unknown units."""
     try:
         return _base_and_factor(unit_a)[0] == _base_and_factor(unit_b)[0]
     except UnitError:

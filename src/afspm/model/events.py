@@ -86,16 +86,16 @@ class JournalEntry:
         who: the component; "component:person" if it acts for a person.
         what: in words, with units.
         response: the number of a ControlResponse; None for an event without a request.
-        reason: why a request was refused, or the cause of the event.
+        reason: reason for the refusal of a request, or the cause of the event.
         took_s: real time from request to answer; None for an event without a request.
         event: the change, for entries of the kind "control".
         request: the number of the ControlRequest; None without a request, or for an unreadable one.
-        problem: the number of the problem that was flagged or cleared, or that the request names to solve.
+        problem: the number of the flagged or cleared problem, or of the problem that the request is to solve.
         mode: the new mode, for a MODE_CHANGED.
         late: the answer came after the client had received a NO_RESPONSE.
         sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
         key: key of a measurement that is taken exactly once.
-        subject: the action, or the parameter that was to be set; empty for other requests.
+        subject: the action, or the parameter to set; empty for other requests.
         value, unit: of that parameter, as requested.
     """
 
@@ -121,7 +121,7 @@ class JournalEntry:
     def refused(self) -> bool:
         """Return whether a request was refused.
 
-        Waiting for control or for a busy microscope, and a missing answer, are no refusals.
+        A wait for control or for a busy microscope and a missing answer are not refusals.
         """
         waits = self.request == ControlRequest.REQUEST_CTRL and self.response in WAIT_FOR_CONTROL
         return not waits and self.response not in _NOT_REFUSED
@@ -189,7 +189,7 @@ class Progress:
 
     Attributes:
         done, of: number of finished parts, and of all parts.
-        left_s: experiment time that the rest will take at the present rate; None if unknown.
+        left_s: experiment time until the end at the present rate; None if unknown.
     """
 
     time_ns: int
@@ -245,7 +245,7 @@ class MeasurementSettings:
 
     Attributes:
         who: the component.
-        parameters: none: its next measurements are not part of a sweep.
+        parameters: empty if its next measurements are not part of a sweep.
         key: of the measurement, if it is taken exactly once.
     """
 

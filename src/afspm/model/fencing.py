@@ -30,7 +30,7 @@ class Epoch:
     simulated: bool = False
 
     def is_followed_by(self, epoch: Epoch | None, run: str) -> bool:
-        """Return whether a sender is this scheduler, a later life of it, or a component of its run."""
+        """Return whether a sender is this scheduler, its later life, or a component of its run."""
         return run == self.run and (epoch is None or epoch.life >= self.life)
 
     def encode(self) -> bytes:
@@ -57,7 +57,7 @@ class SchedulerFence:
         self._obeyed: Epoch | None = None
 
     def refusal(self, epoch: Epoch | None, run: str, is_connected: Callable[[], bool]) -> str:
-        """Return why a sender is refused; empty if the translator obeys it.
+        """Return the reason for refusing a sender; empty if the translator obeys it.
 
         Args:
             epoch: epoch in the request; None without one.

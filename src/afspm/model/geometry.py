@@ -1,4 +1,4 @@
-"""One geometry inside: regions are centre, size and angle in SI units in a named frame.
+"""The one geometry of afspm: a region is centre, size and angle in SI units, in a named frame.
 
 x grows to the right, y upwards; angles are counter-clockwise in radians. Arrays are [y, x], both ascending, and the
 first and last pixel of a row or column lie on the border of the region (wire format, "Geometry").

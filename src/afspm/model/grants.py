@@ -1,4 +1,4 @@
-"""Approvals of persons for agents: one plan, or a grant within which an agent measures by itself."""
+"""Approvals of persons for agents: of one plan, or a grant within whose bounds an agent measures by itself."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class GrantedCount:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """A person's approval of one plan, or a grant, for one agent.
+    """A person's approval for one agent: of one plan, or a grant.
 
     Attributes:
         agent: "component:name".
@@ -55,7 +55,7 @@ class Grant:
         region_m: of a grant: x and y of the centre, width, height; empty: no place may be set.
         ranges, counts: of a grant: the parameters and actions allowed; all others are refused.
         lasts_s: experiment time; 0: all approvals of the agent end.
-        run: the run that it is valid for.
+        run: the run for which the approval is valid.
         limits: digest of the limits that the plan was checked against.
         since_ns: the time of that check. A flagged problem, or MANUAL, since then makes the approval stale.
         offset_m: the microscope's coordinates of the components' origin at that check.
@@ -144,7 +144,7 @@ class Proposal:
         who: "component:name".
         id: the hash of the plan.
         plan: JSON in its canonical form.
-        preflight: JSON; empty: there was none.
+        preflight: result of the preflight as JSON; empty without a preflight.
     """
 
     time_ns: int

@@ -79,9 +79,9 @@ class IdempotencyCache:
     Attributes:
         per_client: maximum number of ids for each client, separately for ids with and without numbers.
         clients: maximum number of clients.
-        sent_actions: actions that were sent to the translator, kept over a restart. The translator would not repeat
-            them, but the scheduler must not move the microscope in preparation for an action that is already done.
-        floors: kept over a restart, as far as they were saved.
+        sent_actions: actions sent to the translator, kept over a restart. The translator would not repeat such an
+            action, but the scheduler must not move the microscope in preparation for it again.
+        floors: the saved ones are kept over a restart.
         table: the older and the latest ids of each client.
     """
 
@@ -92,7 +92,7 @@ class IdempotencyCache:
     table: Mapping[_Shelf, tuple[_Outcomes, _Outcomes]] = field(default_factory=dict)
 
     def look_up(self, client: str, request: Request) -> RequestStatus | Response | None:
-        """Return the status or answer of an id; None for a new id, or without one."""
+        """Return the status or answer of an id; None for a new or empty id."""
         older, latest = self.table.get(_shelf(client, request.id), _NONE)
         entry = latest.get(request.id) or older.get(request.id) if request.id else None
         # an id at or below its floor may have been executed, so it is not new
@@ -107,7 +107,7 @@ class IdempotencyCache:
         return self._with(client, request.id, fingerprint(request), outcome) if request.id else self
 
     def forgotten(self, client: str, request: Request) -> IdempotencyCache:
-        """Forget a request that was not carried out, so that it may be tried again."""
+        """Forget a request that was not carried out, so that the client may repeat it."""
         shelf = _shelf(client, request.id)
         parts = self.table.get(shelf, _NONE)
         older, latest = ({id_: one for id_, one in part.items() if id_ != request.id} for part in parts)
@@ -131,7 +131,7 @@ class IdempotencyCache:
         return any(one[:2] == (client, request.id) for one in self.sent_actions)
 
     def restored(self, sent_actions: Iterable[SentAction], floors: Mapping[str, int]) -> IdempotencyCache:
-        """Take up the actions that were sent before a restart, whose outcome is unknown."""
+        """Restore the actions sent before a restart; their outcome is unknown."""
         cache = replace(self, sent_actions=tuple(sent_actions), floors=replace(self.floors, numbers=dict(floors)))
         for client, request_id, print_ in cache.sent_actions:
             cache = cache._with(client, request_id, print_, RequestStatus.UNKNOWN)

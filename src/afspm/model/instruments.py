@@ -1,4 +1,4 @@
-"""Other instruments of an experiment: their readings, and the orders that they get from the scheduler."""
+"""Other instruments of an experiment: their readings, and their orders from the scheduler."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PARTS = ("target", "busy")
 
 
 def instrument_of(parameter: str) -> str:
-    """Return the component that a parameter belongs to; empty: it belongs to the microscope."""
+    """Return the component that owns a parameter; empty for a parameter of the microscope."""
     owner, separator, _ = parameter.partition(SEPARATOR)
     return owner if separator else ""
 
@@ -25,7 +25,7 @@ class InstrumentReading:
 
     Attributes:
         name: of the parameter, such as "cryo.temperature".
-        value: in `unit`; None: unknown, for `reason`.
+        value: in `unit`; None if unknown, then `reason` gives the cause.
         age_s: real time since the instrument measured it; None: never.
         target: in `unit`; None: it can't be set.
         busy: whether the value is on its way to the target.
@@ -41,7 +41,7 @@ class InstrumentReading:
 
     @property
     def is_number(self) -> bool:
-        """Whether the value is a finite number."""
+        """Return whether the value is a finite number."""
         return self.value is not None and math.isfinite(self.value)
 
 

@@ -29,7 +29,7 @@ class Levelling(Enum):
 
 
 def levelled(values: Array, how: Levelling) -> Array:
-    """Return values [y, x] without their background; values that are not finite stay and are left out of the fit."""
+    """Return values [y, x] without their background; non-finite values stay and are left out of the fit."""
     if how is Levelling.NONE or not values.size:
         return values
     finite = np.isfinite(values)
@@ -39,7 +39,7 @@ def levelled(values: Array, how: Levelling) -> Array:
 
 
 def flattened(values: Array) -> Array:
-    """Return values with all lines at one height and without a plane, as for small pictures.
+    """Return values with all lines at one height and without a plane, for small pictures.
 
     Outliers are masked: neither a scar nor a high particle tilts its neighbours.
     """

@@ -22,9 +22,9 @@ class TipRisk:
     """The part of the status that endangers the tip; it survives a restart.
 
     Attributes:
-        state: the last known state; a microscope whose controller is lost goes on with it.
+        state: the last known state; a microscope continues in it after the loss of its controller.
         feedback_on: None if unknown.
-        tip_away: the tip is withdrawn: neither the coarse motor nor a feedback that is off does harm.
+        tip_away: the tip is withdrawn, so neither the coarse motor nor a feedback switched off does harm.
     """
 
     state: ScopeState = ScopeState.UNDEFINED
@@ -34,17 +34,17 @@ class TipRisk:
 
 @dataclass(frozen=True)
 class MicroscopeStatus:
-    """Everything that is known of the microscope's activity.
+    """The known activity of the microscope.
 
     Attributes:
         dangerous: names of ScopeState, and "feedback-off".
-        patience_s: real time that the controller may be lost before that is a problem. A controller that returns within
-            this time costs nothing: its scan goes on.
-        state: the last published state; UNDEFINED for a controller that is gone or answers nonsense.
+        patience_s: real time after which the loss of the controller becomes a problem. If the controller returns
+            before, its scan continues.
+        state: the last published state; UNDEFINED for a lost controller or invalid answers.
         states_seen: number of states received.
-        lost_since_s: real time since when nothing is known of the microscope.
+        lost_since_s: real time of the loss of the controller.
         feedback_before: the feedback before a request of unknown outcome.
-        in_doubt: there is such a request.
+        in_doubt: whether there is such a request.
         logged: the danger that was logged last.
     """
 
@@ -60,7 +60,7 @@ class MicroscopeStatus:
 
     @property
     def is_free(self) -> bool:
-        """Return whether the microscope is free, as far as is known."""
+        """Return whether the microscope is free; true before its first state."""
         return self.state is ScopeState.FREE or not self.states_seen
 
     @property
@@ -69,14 +69,14 @@ class MicroscopeStatus:
         return None if self.lost_since_s is None else self.lost_since_s + self.patience_s
 
     def with_state(self, state: ScopeState, now_s: float) -> MicroscopeStatus:
-        """Take a state that the translator published."""
+        """Return the status after a state that the translator published."""
         changed = replace(self, state=state, states_seen=self.states_seen + 1)
         if state is ScopeState.UNDEFINED:
             return replace(changed, lost_since_s=now_s) if self.lost_since_s is None else changed
         return replace(changed, lost_since_s=None)._with_risk(replace(self.risk, state=state))
 
     def with_feedback(self, feedback: Feedback) -> MicroscopeStatus:
-        """Take the present feedback."""
+        """Return the status with the present feedback."""
         if feedback.on is None:
             return self
         certain = replace(self, in_doubt=False)
@@ -86,14 +86,14 @@ class MicroscopeStatus:
         return certain._with_risk(replace(self.risk, feedback_on=feedback.on, tip_away=away))
 
     def feedback_may_be_off(self) -> MicroscopeStatus:
-        """Assume that the feedback is off: a request switches it off, or may have done so."""
+        """Return the status with the feedback assumed off: a request switches it off, or may have done so."""
         changed = self.with_feedback(Feedback(on=False))
         if changed.risk.feedback_on is self.risk.feedback_on:
             return changed
         return replace(changed, feedback_before=self.risk.feedback_on, in_doubt=True)
 
     def feedback_was_left(self) -> MicroscopeStatus:
-        """Undo `feedback_may_be_off` after a refusal of the request."""
+        """Return the status before `feedback_may_be_off`, after a refusal of the request."""
         if not self.in_doubt:
             return self
         return replace(self, in_doubt=False)._with_risk(replace(self.risk, feedback_on=self.feedback_before))
@@ -102,7 +102,7 @@ class MicroscopeStatus:
         return self._with_risk(replace(self.risk, tip_away=away))
 
     def after_action(self, action: str, *, is_away: bool) -> MicroscopeStatus:
-        """Take an action that was, or may have been, carried out: all but starts and stops may move the tip."""
+        """Return the status after a possibly executed action; all but starts and stops may move the tip."""
         # to start or stop a scan or spectrum neither engages nor withdraws the tip
         only_runs = action in STARTS or action in STOPS.values()
         return self if only_runs else self.with_tip(away=is_away)
@@ -123,7 +123,7 @@ class MicroscopeStatus:
         return f"the microscope is in {name}" if name in self.dangerous else None
 
     def telling(self) -> tuple[MicroscopeStatus, str | None]:
-        """Return the danger if it was not logged yet, so that each is logged once."""
+        """Return the danger if it was not logged yet, so that each danger is logged once."""
         danger = self.danger
         return replace(self, logged=danger), None if danger == self.logged else danger
 

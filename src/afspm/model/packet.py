@@ -13,7 +13,7 @@ class Packet:
     Attributes:
         envelope: the topic of the packet, to which receivers subscribe.
         payload: the serialised message.
-        time_ns: time of its first publication, ns since the Unix epoch; None from peers that give none.
+        time_ns: time of its first publication, ns since the Unix epoch; None for packets of peers without times.
     """
 
     envelope: str

@@ -18,7 +18,7 @@ SPEED_UNKNOWN = "the file sets no scan-speed"
 
 @dataclass(frozen=True)
 class PlannedWork:
-    """The work of one component, as far as it is known before the run.
+    """The work of one component, as known before the run.
 
     Attributes:
         scans, spectra: number of measurements; scans is None without an end.
@@ -27,7 +27,7 @@ class PlannedWork:
         duration_s: from the first scan to the end of the last, pauses included, spectra left out; None if unknown.
         at_most: whether the numbers are upper bounds.
         ends_experiment: whether the experiment ends when the work is done.
-        why: reason for an unknown or bounded number.
+        why: the reason for an unknown or bounded number.
     """
 
     scans: int | None = 0
@@ -50,7 +50,7 @@ class PlannedWork:
         return None if self.spectra else self.duration_s
 
     def __add__(self, other: PlannedWork) -> PlannedWork:
-        """Return the work of both, one after the other."""
+        """Return the sum of two works that follow each other."""
         return PlannedWork(
             _sum(self.scans, other.scans),
             self.spectra + other.spectra,
@@ -67,7 +67,7 @@ class PlannedWork:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, object]) -> PlannedWork:
-        """Return the work of `as_dict`; fields of later versions are ignored."""
+        """Return the work in an `as_dict` table; fields of later versions are ignored."""
         known = {field.name for field in fields(cls)}
         return cls(**{name: value for name, value in data.items() if name in known})  # type: ignore[arg-type]
 
@@ -92,7 +92,7 @@ def planned_rounds(
 ) -> PlannedWork:
     """Return the work of regions that are scanned in rounds.
 
-    A round that is longer than its period delays the next one to a later multiple of the period.
+    A round longer than its period delays the next round to a later multiple of the period.
 
     Args:
         shape: (rows, columns) of each scan.

@@ -1,4 +1,4 @@
-"""Position of scan and probe in tip coordinates, and the parameters that are parts of it."""
+"""Positions of scan and probe in tip coordinates, and the parameters that make them up."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _ANYWHERE = Region((0.0, 0.0), (1.0, 1.0))
 
 @dataclass(frozen=True, slots=True)
 class KnownPosition:
-    """The position of scan and probe, as far as it was set or published.
+    """The last set or published position of scan and probe.
 
     Attributes:
         region, shape: of the scan; the shape as (rows, columns).
@@ -46,13 +46,13 @@ class KnownPosition:
     probe_m: XY | None = None
 
     def learn(self, subject: object) -> KnownPosition:
-        """Take a position, or a part of one, that was set or published."""
+        """Return the positions after a position, complete or in part, was set or published."""
         with suppress(InvalidValue):  # a part of an unknown region
             return self.onto(subject)
         return self
 
     def onto(self, subject: object) -> KnownPosition:
-        """Return the positions after a position, or a part of one, was set.
+        """Return the positions after a request that sets a position, complete or in part.
 
         Raises:
             InvalidValue: a part of an unknown region, or an invalid region.
@@ -68,7 +68,7 @@ class KnownPosition:
         return self
 
     def learn_values(self, values: Iterable[tuple[str, float]]) -> KnownPosition:
-        """Take single parameters by name, in SI; parameters that are no position are ignored."""
+        """Return the positions after single parameters in SI; parameters without a position are ignored."""
         known = self
         with suppress(InvalidValue):
             for change in changes_by(values):
@@ -76,12 +76,12 @@ class KnownPosition:
         return known
 
     def was_read(self, values: Mapping[str, float | None]) -> KnownPosition:
-        """Take the values of single parameters, read together; a parameter that is missing keeps its value.
+        """Return the positions after single parameters read together; a missing parameter keeps its value.
 
         On a microscope without an angle parameter a frame counts as unrotated.
 
         Args:
-            values: None for a parameter that the microscope answered with no number.
+            values: None for a parameter without a number in the answer.
         """
         wrong = [name for name, value in values.items() if value is None]
         known = self.without(wrong)

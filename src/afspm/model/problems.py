@@ -1,4 +1,4 @@
-"""Problems by name: the problems of the wire, and further ones of an experiment file."""
+"""Problems by name: those on the wire, and those that an experiment file adds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ STOPPED_BY_AGENT = "stopped-by-agent"
 
 
 class Problem(IntEnum):
-    """Problems of every experiment. Experiment files name more, with higher numbers."""
+    """Problems of every experiment; experiment files add more, with higher numbers."""
 
     NONE = 0
     TIP_SHAPE_CHANGED = 1

@@ -1,4 +1,4 @@
-"""The outcome of registering a scan with earlier ones: how its position on the sample is known."""
+"""The outcome of registering a scan with earlier scans, which determines its position on the sample."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class RegistrationOutcome(IntEnum):
     COARSE = 2
     """The estimator failed, and a coarse estimate took its place."""
     REFUSED = 3
-    """Matched with none of the earlier scans of its place: the position is dead reckoning."""
+    """Matched none of the earlier scans of its place: the position is dead reckoning."""
     FAILED = 4
     """Not registered because of an error, a time limit or a missing channel: the position is dead reckoning."""
     NEW = 5
@@ -23,9 +23,7 @@ class RegistrationOutcome(IntEnum):
 
     @classmethod
     def of(cls, number: int, *, matched: bool) -> RegistrationOutcome:
-        """Return the outcome for a number of the wire. A peer without outcomes publishes only whether the scan was
-        matched.
-        """
+        """Return the outcome for a number on the wire; `matched` decides for peers without outcomes."""
         known = {one.value for one in cls}
         return cls(number) if number in known else cls.REGISTERED if matched else cls.REFUSED
 

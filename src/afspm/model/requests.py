@@ -102,7 +102,7 @@ class Parameter:
 
     Attributes:
         value: as text, in `unit`; None to read it.
-        unit: None if none was given; then SI.
+        unit: unit of `value`; None for SI.
     """
 
     name: str
@@ -119,7 +119,7 @@ class Request:
         subject: a ScanParameters, Feedback, ProbePosition or Parameter, the name of an action, or the number of a
             problem or control mode; None for requests without a subject.
         payload: the subject in bytes, as received.
-        id: the same for every repetition of one request; empty if the request may not be repeated.
+        id: equal for all repetitions of one request; empty if the request may not be repeated.
     """
 
     kind: int
@@ -129,7 +129,7 @@ class Request:
 
 
 class ResponseDetail(IntEnum):
-    """The detail of a response that a program needs beside its code; numbers as on the wire."""
+    """A detail for programs beside the code of a response; numbers as on the wire."""
 
     NONE = 0
     NOT_SENT = 1
@@ -145,7 +145,7 @@ class Response:
 
     Attributes:
         code: the number of a ControlResponse.
-        payload: an object in bytes (a parameter's value), mostly empty.
+        payload: an object in bytes, such as a parameter; mostly empty.
         reason: why the request failed, for people.
         id: id of the answered request, if it had one.
         detail: further facts for programs.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ShapeChange:
-    """Rows, columns or both of a shape, as a request may give them; None stays unchanged."""
+    """Rows, columns or both in a request to change a shape; None stays unchanged."""
 
     rows: int | None = None
     columns: int | None = None
@@ -100,7 +100,7 @@ class Scan:
         unit: unit of the values.
         values: [y, x], both ascending, float64; empty if only the parameters arrived.
         time_ns: time of its end, ns since the Unix epoch; None if unknown.
-        filename: the controller's own file; empty if there is none.
+        filename: the controller's own file; empty without a file.
         pixels: (rows, columns) of a scan without values; None if unknown.
     """
 
@@ -140,9 +140,7 @@ class Scan:
 
     @property
     def lines_missing(self) -> int:
-        """Return the number of lines without any value, as in a scan that was broken off; all lines if no values
-        arrived.
-        """
+        """Return the number of lines without any value, as in an interrupted scan; all lines without values."""
         if not self.values.size:
             return self.shape[0]
         import numpy as np
@@ -151,11 +149,11 @@ class Scan:
 
     @property
     def is_blank(self) -> bool:
-        """Return whether all values are NaN: nothing was measured. False if no values arrived."""
+        """Return whether all values are NaN, so that nothing was measured; False without values."""
         return bool(self.values.size) and self.lines_missing == self.shape[0]
 
     def undistorted(self, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Scan:
-        """Return the scan as at the middle of its acquisition, without the drift during it.
+        """Return the scan without the drift during its acquisition, as at the middle of that time.
 
         Args:
             velocity_m_s: (x, y) of the sample under the tip, e.g. from an up frame followed by a down frame
@@ -184,8 +182,8 @@ class Scan:
             fit: "least-squares", or a fit that is robust against particles and steps: "huber", "theil-sen", "ransac" or
                 "quantile".
             quantile: for the fit "quantile": the part of the pixels below the surface.
-            rows: levelling of each row before the fit: by its "median", by the median "difference" from the row below
-                it, which long features do not mislead, or by a straight "line"; None: not at all.
+            rows: levelling of each row before the fit: by its "median", by the median "difference" from the row below,
+                robust against long features, or by a straight "line"; None: not at all.
 
         Raises:
             InvalidValue: there is no such fit or order, or too few pixels were measured.
@@ -214,8 +212,8 @@ class Scan:
                 scan, 1 to 99 %. Give both to compare scans.
 
         Returns:
-            The axes. Their coordinates are in m, with ticks in a suitable unit: anything drawn into them next,
-            another scan or `axes.plot(*spectrum.position_m, "o")`, lies where it was measured.
+            The axes. Their coordinates are in m, with ticks in a suitable unit: another scan, or
+            `axes.plot(*spectrum.position_m, "o")`, appears at its measured position.
 
         Raises:
             InvalidValue: there is no such kind, or nothing was measured.
@@ -276,7 +274,7 @@ class ScanSet(Mapping[str, Scan]):
     """All channels of one scan: `scans["Height"]`, or `.first` for any channel.
 
     Attributes:
-        interruptions: the interruptions before the scan could be taken, oldest first, for people.
+        interruptions: texts about the interruptions before the scan succeeded, oldest first.
     """
 
     def __init__(self, scans: Iterable[Scan], interruptions: Iterable[str] = ()) -> None:
@@ -333,7 +331,7 @@ class ScanSet(Mapping[str, Scan]):
 
 @dataclass(frozen=True, eq=False)
 class ScanLines:
-    """Some neighbouring rows of one channel, published while the scan is running.
+    """Neighbouring rows of one channel, published while the scan is running.
 
     Attributes:
         region: of the whole scan.

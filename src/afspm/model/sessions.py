@@ -1,4 +1,4 @@
-"""Sessions: the connection that may speak for a name, over restarts, and with two processes under one name.
+"""Sessions: the one connection that owns a name, over restarts, and with two processes under one name.
 
 A name belongs to one session at a time: one life of one process. Its first connection binds the name. Later
 connections show the session's token in their request ids ("<name>/<token>/<n>"). For peers without ids, the connection
@@ -7,8 +7,8 @@ is the session.
 A ROUTER socket hands an identity over to its newest connection. The owner then gets no more answers and connects
 again. So when a second process takes a name in use, the first is disconnected *after* the second was accepted, while a
 restarted process connects after its former life was disconnected. This order distinguishes an impostor, which is
-refused, from a restart, which is the same client. A former life that speaks again was alive all the time: it was first,
-and gets its name back.
+refused, from a restart, which is the same client. A presumed dead process that sends again was alive all the time: it
+was first, and regains its name.
 
 Peers without ids close their connection and open another when an answer is late; the order of these two events is
 chance. Such a connection has to wait a moment (`Hearing.UNCLEAR`), and gets the name if the older connection closes.
@@ -70,8 +70,8 @@ def token_of(name: str, request_id: str) -> str | None:
 def number_of(request_id: str) -> tuple[str, int] | None:
     """Return session and number of an id "<name>/<token>/<n>"; None for other forms.
 
-    Numbers rise within a session. The ids of a measurement have two numbers more, or a key, and never count here: its
-    attempts come hours apart.
+    Numbers rise within a session. The ids of a measurement have two more numbers, or a key, and never count here: its
+    attempts are hours apart.
     """
     session, _, number = request_id.rpartition("/")
     name, _, token = session.partition("/")
@@ -97,8 +97,8 @@ class SessionTable:
     """The names in use.
 
     Attributes:
-        takeover_s: real time for which a name that was handed over is kept for its owner. A peer whose connection died
-            unnoticed can be restarted under its name after this time at the latest.
+        takeover_s: real time for which a transferred name is reserved for its owner. A peer with an unnoticed loss of
+            its connection can restart under its name after this time at the latest.
         keep: maximum number of names without a connection.
         opened: open connections, with the order of their opening.
         lost: names without a connection, oldest first.
@@ -119,7 +119,7 @@ class SessionTable:
         return replace(self, order=order, opened={**self.opened, connection: order}, highest=highest)
 
     def disconnected(self, connection: int, now_s: float) -> tuple[SessionTable, str | None]:
-        """Drop a connection; return also the name whose session lost its connection, if any."""
+        """Drop a connection; also return the name of the session that used it, if any."""
         table = replace(self, order=self.order + 1, opened=_without(self.opened, connection))
         name = self.name_of.get(connection)
         if name is None:
@@ -134,7 +134,7 @@ class SessionTable:
         """Judge a message from `name` by `connection`, and bind the name if it is accepted.
 
         Args:
-            request_id: id of the request, empty without one; None for a message that only carries the name.
+            request_id: id of the request, empty without an id; None for a message with a name only.
         """
         session = self.names.get(name)
         has_ids, token = request_id != "", token_of(name, request_id or "")
@@ -160,7 +160,7 @@ class SessionTable:
         return session.connection if session is not None else None
 
     def lost_since_s(self, name: str) -> float | None:
-        """Return the real time since when a known name has no connection; None if it has one, or is unknown."""
+        """Return the real time at which a known name lost its connection; None if connected or unknown."""
         session = self.names.get(name)
         if session is None or session.connection is not None or session.lost_s == -math.inf:
             return None
@@ -176,7 +176,7 @@ class SessionTable:
         return {name: s.token for name, s in self.names.items() if s.token is not None and s.connection is not None}
 
     def restored(self, tokens: Mapping[str, str]) -> SessionTable:
-        """Add the sessions that were connected before a restart; they may have ended since."""
+        """Restore the sessions connected before a restart; some may have ended since."""
         restored = {name: _Session(token, None, lost_s=-math.inf) for name, token in tokens.items()}
         return replace(self, names={**self.names, **restored})
 

@@ -25,11 +25,11 @@ class Spectrum:
     Attributes:
         position_m: (x, y) of the probe in m; None if unknown.
         kind: kind of spectroscopy, e.g. "IV" or "force".
-        names: names of the variables; by custom the first was swept.
+        names: names of the variables; by convention the swept variable is first.
         units: units of the variables.
         values: shape (points, variables), float64.
         time_ns: time of measurement, ns since the Unix epoch; None if unknown.
-        filename: the controller's own file; empty if there is none.
+        filename: the controller's own file; empty without a file.
         frame: coordinate system of the position.
 
     Raises:

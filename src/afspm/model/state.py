@@ -29,7 +29,7 @@ class ScopeState(_NamedEnum):
 
 
 class ControlMode(_NamedEnum):
-    """Who may control the microscope: components (AUTOMATED), or only the person at it (MANUAL)."""
+    """The source of commands: components (AUTOMATED), or only the person at the microscope (MANUAL)."""
 
     UNDEFINED = 0
     MANUAL = 1
@@ -80,7 +80,7 @@ class PositionChange:
 
 @dataclass(frozen=True)
 class ControlState:
-    """The holder of control, and the problems that withhold it.
+    """The holder of control, and the flagged problems.
 
     Attributes:
         mode: automated or manual.

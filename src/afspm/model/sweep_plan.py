@@ -43,7 +43,7 @@ class SweepAxis:
         """Read the values of a parameter from a list or a range.
 
         Raises:
-            InvalidValue, UnitError: there are no values, or they make no sense for this parameter.
+            InvalidValue, UnitError: there are no values, or values that this parameter can't have.
         """
         if isinstance(given, Mapping):
             unit, values = (
@@ -73,7 +73,7 @@ class SweepAxis:
         return Parameter(self.name, text, self.unit)
 
     def in_steps(self) -> SweepAxis:
-        """Return the axis with its numbers sorted, rising or falling as the first and last of them were listed."""
+        """Return the axis with its numbers sorted; the first and last listed number give the direction."""
         numbers = [value for value in self.values if not isinstance(value, str | bool)]
         if len(numbers) < len(self.values):
             return self
@@ -86,8 +86,8 @@ class SweepPlan:
     """All combinations of the values of some parameters, each once.
 
     Attributes:
-        axes: the first changes least often.
-        order: "snake": from one point to the next one parameter changes, to a neighbouring value. "listed": nested
+        axes: the first parameter changes least often.
+        order: "snake": between points one parameter changes, to a neighbouring value. "listed": nested
             loops over the values as listed. "random": shuffled by `seed`.
     """
 
@@ -108,18 +108,18 @@ class SweepPlan:
         """Read a plan from the values of each parameter.
 
         Raises:
-            InvalidValue, UnitError: see `SweepAxis.of`; there is no parameter, no such order, or too many points.
+            InvalidValue, UnitError: see `SweepAxis.of`; no parameter, an unknown order, or too many points.
         """
         axes = tuple(SweepAxis.of(name, given) for name, given in parameters.items())
         return cls(tuple(axis.in_steps() for axis in axes) if order == "snake" else axes, order, seed)
 
     @property
     def total(self) -> int:
-        """The number of points."""
+        """Return the number of points."""
         return math.prod(len(axis.values) for axis in self.axes)
 
     def places(self) -> list[tuple[int, ...]]:
-        """Return the points in their order: for each parameter the place of its value in its axis."""
+        """Return the points in their order, each as one index per axis."""
         if self.order == "snake":
             return [self._snake(index) for index in range(self.total)]
         listed = [self._listed(index) for index in range(self.total)]

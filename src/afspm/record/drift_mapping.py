@@ -23,14 +23,14 @@ class OutcomeFields(Protocol):
 
 
 def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
-    """Return x_tip - x_sample, (2,): the displacement of the sample where the tip is."""
+    """Return x_tip - x_sample in m, shape (2,): the displacement of the sample at the tip."""
     at = np.asarray(center_m, dtype=np.float64)
     drift: Array = at - (matrix[:2, :2] @ at + matrix[:2, 2])
     return drift
 
 
 def drift_knowledge(message: OutcomeFields) -> tuple[RegistrationOutcome, float | None]:
-    """Return how the position of a scan is known, and its largest standard deviation (m); None if that is unknown."""
+    """Return the kind of knowledge of a scan's position, and its largest standard deviation in m (None: unknown)."""
     outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
     if len(message.covariance) != 4:
         return outcome, None

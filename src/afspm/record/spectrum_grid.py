@@ -111,7 +111,7 @@ def _axis(along_m: Floats, spacing_m: float) -> tuple[Floats, NDArray[np.int64]]
 
 
 def repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
-    """Return for each cell how often it has occurred before."""
+    """Return the number of earlier occurrences of each cell."""
     seen: dict[tuple[int, int], int] = {}
     found = []
     for cell in cells:
@@ -121,7 +121,7 @@ def repeats(cells: Sequence[tuple[int, int]]) -> list[int]:
 
 
 def alike(spectra: Sequence[Spectrum], *, swept_alike: bool) -> Spectrum:
-    """Return the first spectrum, if all others were measured in the same way.
+    """Return the first spectrum after a check that all spectra were measured alike.
 
     Raises:
         InvalidValue: there are no spectra, a position is unknown, or two differ in kind, variables, frame or, with
@@ -157,7 +157,7 @@ def ways(spectrum: Spectrum) -> tuple[Floats, list[dict[str, Floats]]]:
 
 
 def columns_of(spectrum: Spectrum) -> list[dict[str, str]]:
-    """Return the column of each variable by direction; one direction if one sweep goes there and back."""
+    """Return the column of each variable by direction; one direction if a single sweep goes forth and back."""
     names = spectrum.names[1:]
     plain = {_FORWARD.sub("", name) or name: name for name in names if not _BACKWARD.search(name)}
     back = {_BACKWARD.sub("", name): name for name in names if _BACKWARD.search(name)}
@@ -185,12 +185,12 @@ def at(common: Floats, swept: Floats, values: Floats) -> Floats:
 
 
 def _turning_point(swept: Floats) -> int | None:
-    # half of a sweep that goes there and back over the same values; None for a one-way sweep
+    # half of a sweep that goes forth and back over the same values; None for a one-way sweep
     half, odd = divmod(len(swept), 2)
     extent = float(np.ptp(swept)) if half else 0.0
     if odd or half < 2 or not np.allclose(swept[:half], swept[half:][::-1], rtol=0.0, atol=1e-3 * extent):
         return None
-    # the way there must cover most of the range: a one-way sweep of equal values has no turning point
+    # the forward half must cover most of the range: a one-way sweep of equal values has no turning point
     return half if abs(swept[half] - swept[0]) > 0.5 * extent else None
 
 

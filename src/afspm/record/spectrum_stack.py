@@ -46,7 +46,7 @@ class SpectrumStack:
         curves: by variable, shape (y, x, repeat, direction, z); NaN where nothing was measured.
         units: by variable.
         names: the measured columns of each spectrum, without the swept one.
-        columns: columns of each variable by direction; one direction if one sweep goes there and back.
+        columns: columns of each variable by direction; one direction if a single sweep goes forth and back.
         times: times of measurement, shape (y, x, repeat); NaT if unknown.
     """
 

@@ -39,10 +39,10 @@ def replace_file(
     aside: Path | None = None,
     mode: int = _ANYONE,
 ) -> None:
-    """Write a file so that it is complete or unchanged, even if the process is killed.
+    """Replace a file completely or not at all, even if the process is killed.
 
     Args:
-        synced: hold this over a power cut too, which needs a wait for the disk.
+        synced: guarantee it over a power cut too, which waits for the disk.
         soon: with `synced` False, sync the file a moment later. A power cut before that may leave a damaged file.
         aside: temporary path of the file; None: a hidden name of this process beside it.
         mode: mode of the file, before the umask; 0o600 for secrets, from its creation on.
@@ -99,7 +99,7 @@ def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: boo
 
 
 class FileBatch:
-    """New files that get their names together; each is synced in a thread while the next one is written.
+    """New files that get their names together; each is synced in a thread during the write of the next.
 
     Args:
         suffix: suffix of a file until it gets its name.
@@ -158,11 +158,10 @@ def _sync_and_close(descriptor: int) -> None:
 
 
 class OutageLog:
-    """A log of failed writes, once for each outage: a disk that is full or away must not end an experiment.
+    """A log of failed writes, once for each outage; a full or missing disk must not end an experiment.
 
     A slow disk is logged as a warning after `SLOW_S`: a busy disk takes a moment now and then, and its writes are only
-    late. A disk that refuses to write, or has so much waiting that something will never be written, is CRITICAL at
-    once.
+    late. A disk that refuses to write, or whose backlog is full so that data are lost, is CRITICAL at once.
 
     Args:
         loss: the consequence, for people.
@@ -178,7 +177,7 @@ class OutageLog:
 
     @contextlib.contextmanager
     def trying(self) -> Iterator[None]:
-        """Enclose a write; its FileError or OSError is logged and not passed on."""
+        """Enclose a write: its FileError or OSError is logged and suppressed."""
         try:
             yield
         # a DiskBacklogFull is a DiskTimeout, so it comes first: its data are lost, not late
@@ -220,12 +219,12 @@ def previous_generation(path: Path) -> Path:
 
 
 class CheckpointFile:
-    """A small text that is saved too often to wait for the disk each time, but survives a power cut.
+    """A small text, saved too often to wait for the disk, that survives a power cut.
 
-    Each generation is an appended line: that takes ten microseconds, a twentieth of a replacement of the file, which
-    happens only when it has grown to `longest` bytes. The last line survives a kill of any process, and a moment later
-    a power cut (see `disk`). A power cut during a replacement may leave the file empty. Then the previous generation is
-    read, at most about `period_s` older, which a thread syncs.
+    Each generation is an appended line, which takes ten microseconds: a twentieth of a replacement of the file. The
+    file is replaced only at `longest` bytes. The last line survives a kill of any process, and a moment later a power
+    cut (see `disk`). A power cut during a replacement may leave the file empty. Then the previous generation is read; a
+    thread syncs it, so it is at most about `period_s` older.
     """
 
     def __init__(self, path: Path, period_s: float = PERIOD_S, longest: int = LONGEST) -> None:
@@ -318,7 +317,7 @@ def load_checkpoint(path: Path, read: Callable[[bytes], T]) -> tuple[T | None, s
         read: converts a generation; raises ValueError, KeyError or TypeError for a damaged one.
 
     Returns:
-        The converted generation, and the damage of the last one if an earlier one was read: "" else.
+        The converted generation; and the damage of the last generation if an earlier one was read, else "".
 
     Raises:
         FileError: no generation can be read, or the folder does not exist.

@@ -1,7 +1,7 @@
-"""Threads for work with a disk: a disk that hangs delays a process for a moment only.
+"""Threads for disk operations, so that a hanging disk delays a process for a moment only.
 
 Control, retraction and notification never wait for a disk. A write that must precede a publication is awaited for at
-most `DEADLINE_S`; then the process logs it and goes on. The disk still does the work once it answers again.
+most `DEADLINE_S`; then the process logs the delay and continues. The write is carried out once the disk answers again.
 
 Written data are handed to the system at once, so that they survive a kill of all processes, and are on the disk
 `SYNC_PERIOD_S` later, so that they survive a power cut.
@@ -39,7 +39,7 @@ class DiskTimeout(OSError):
 
 
 class DiskBacklogFull(DiskTimeout):
-    """The data were never written, since too many wait for the disk."""
+    """The error that data were not written, since the disk's backlog is full."""
 
 
 class DiskTask:
@@ -65,7 +65,7 @@ class DiskThread:
     """A thread that runs one task after the other.
 
     Attributes:
-        hangs: a task was not finished in time; until it is, no caller waits.
+        hangs: whether a task is late; no caller waits until it is finished.
     """
 
     def __init__(self, deadline_s: float = DEADLINE_S, most_bytes: int = MOST_BYTES) -> None:
@@ -152,8 +152,8 @@ def run_bounded(work: Callable[[], T], within_s: float) -> T:
 class Syncer:
     """A thread that syncs written data to the disk a moment later.
 
-    An error of the disk is logged once, until a sync succeeds again. Data of a failed sync would be lost in a power cut
-    even if a later sync succeeds: the system drops them with the error.
+    An error of the disk is logged once, until a sync succeeds again. A later successful sync does not help: the system
+    drops the data of a failed sync, and a power cut loses them.
     """
 
     def __init__(self, period_s: float = SYNC_PERIOD_S) -> None:
@@ -230,7 +230,7 @@ class Syncer:
 
 
 def is_full(folder: Path) -> bool:
-    """Return whether a disk has no room for another file; False also if that is unknown."""
+    """Return whether a disk has no room for another file; False if unknown."""
     import shutil  # imported late: needed only after a failure
 
     try:

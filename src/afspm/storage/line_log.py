@@ -1,4 +1,4 @@
-"""A log of JSON lines, each handed to the operating system at once: a kill of the process loses none."""
+"""A log of JSON lines; each goes to the operating system at once, so that a kill of the process loses no line."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REQUESTS_FOLDER = "requests"
 class LineLog:
     """Appends lines to a file.
 
-    A disk that refuses must not end the experiment: the error is logged once, and the log of this life ends there.
+    A write error must not end the experiment: it is logged once, and the log ends there until a restart.
     """
 
     def __init__(self, path: Path, logger: logging.Logger) -> None:
@@ -58,7 +58,7 @@ class LineLog:
 
 
 def read_lines(path: Path) -> Iterator[list[Any]]:
-    """Yield the lines of a log; half a line, which a kill left, is skipped.
+    """Yield the lines of a log; an incomplete line, left by a kill, is skipped.
 
     Raises:
         FileError: the file can't be read.

@@ -23,7 +23,7 @@ class Memory(MutableMapping[str, Any]):
     """A dict of JSON values in a file. `save()` writes all of it, or nothing.
 
     Args:
-        path: the file; None keeps nothing over a restart.
+        path: the file; None: nothing is kept over a restart.
         synced: whether saving waits for the disk, ten milliseconds and more, so that it survives a power cut. Otherwise
             a power cut may undo the last save. A kill of any process undoes nothing in either case.
 
@@ -50,10 +50,10 @@ class Memory(MutableMapping[str, Any]):
         """Write all values to disk, so that they survive a kill and, if synced, a power cut.
 
         In a loop that the disk must not slow down, `save(synced=False)` is enough for values whose loss only repeats
-        work: after a power cut the values of the save before are still there.
+        work: after a power cut the values of the previous save remain.
 
-        A disk that is full, away or hangs must not end the experiment: it is logged. A caller must check the result
-        before an action that must not happen twice.
+        A full, missing or hanging disk must not end the experiment, so it is only logged. Check the result before an
+        action that must not happen twice.
 
         Returns:
             True if the values were written.

@@ -1,11 +1,11 @@
-"""The packet log: everything that the scheduler publishes, appended before its publication.
+"""The packet log: every published packet of the scheduler, appended before its publication.
 
 It is the only source of truth of a run. A restarted scheduler reads its cache from it, the recorder follows it, and the
-record (HDF5 files and an SQLite journal) derives from it. An appended packet is handed to the system at once, which
-survives a kill of all processes; a moment later it is on the disk, which survives a power cut (see `disk`).
+record (HDF5 files and an SQLite journal) derives from it. An appended packet goes to the system at once, so that it
+survives a kill of all processes; a moment later it is on the disk, and survives a power cut (see `disk`).
 
-The log is bounded. The recorder commits the position up to which everything is in the record and on the disk. Segments
-before it are overwritten, after the packets that the scheduler still caches have been appended again.
+The log is bounded. The recorder commits the position up to which all packets are in the record and on the disk.
+Segments before it are overwritten, after the packets that the scheduler still caches have been appended again.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class PacketLog:
 
     Args:
         folder: created with the first packet.
-        most_unrecorded_bytes: most bytes that wait for the recorder; beyond it the oldest are given up.
+        most_unrecorded_bytes: most bytes that wait for the recorder; beyond them the oldest packets are given up.
 
     Attributes:
         has_grown: a segment was filled since the last `clean`.
@@ -167,7 +167,7 @@ class LogReader:
         self._folder = folder
 
     def read(self, most_bytes: int) -> list[tuple[LoggedPacket, Position]]:
-        """Return the next packets, about `most_bytes` of them, each with the position after it.
+        """Return the next packets, of about `most_bytes` in all, each with the position after it.
 
         Raises:
             OSError: the log can't be read.
@@ -195,7 +195,7 @@ def log_folder(state_dir: Path) -> Path:
 
 
 def logged_packets(folder: Path) -> Iterator[LoggedPacket]:
-    """Yield all packets of a log in the order of appending; packets that were carried forward come again."""
+    """Yield all packets of a log in the order of appending; packets carried forward appear twice."""
     for path in segments(folder):
         yield from (entry for entry, _ in read_segment(path))
 
@@ -214,7 +214,7 @@ def cached_packets(folder: Path) -> list[LoggedPacket]:
 
 
 def expect_recorder(folder: Path) -> None:
-    """Have the log keep packets until a recorder has committed them.
+    """Make the log keep packets until a recorder has committed them.
 
     Raises:
         OSError: the disk refuses.

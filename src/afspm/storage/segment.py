@@ -1,12 +1,12 @@
 """One file of the packet log: packets one after the other, each with its length and a checksum.
 
 A packet is: "AFp3", the number of the file, the lengths of envelope and payload, its time and the translator's time of
-it (-1: none), the number of cached packets of its envelope, the checksum of all that; envelope; payload. Keyed results
-of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum of its
-64-bit words, which takes a hundredth of the time that sending them takes.
+it (-1: none), the number of cached packets of its envelope, the checksum of these fields; envelope; payload. Keyed
+results of components are kept in the same form, in files with the number 0. The checksum of a large payload is the sum
+of its 64-bit words, which takes a hundredth of the time of sending them.
 
-Overwriting an old file takes a fraction of the time of a new file. The number of the file, which is new each time,
-distinguishes new packets from remains of old ones; the checksum detects a packet that a kill or power cut left half.
+Overwriting an old file takes a fraction of the time of a new file. The number of the file, new each time, distinguishes
+new packets from remains of old ones; the checksum detects an incomplete packet after a kill or power cut.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class SegmentWriter:
     """An open file to which the packets of one segment are appended.
 
     Args:
-        spare: a file that is no longer needed, to overwrite; None: a new file.
+        spare: an unused file to overwrite; None: a new file.
 
     Attributes:
-        size: bytes of the packets in it.
+        size: bytes of the packets in the file.
 
     Raises:
         OSError: the disk refuses (full …).
@@ -68,7 +68,7 @@ class SegmentWriter:
         SYNCER.soon(self._file.fileno())
 
     def take_back(self) -> bool:
-        """Remove the part of a packet that failed; return whether more packets can be appended."""
+        """Remove the written part of a failed packet; return whether more packets can be appended."""
         try:
             self._file.seek(self.size)
             self._file.truncate()
@@ -116,7 +116,7 @@ def read_segment(path: Path, offset: int = 0) -> Iterator[tuple[LoggedPacket, in
 
 
 def read_packet(file: IO[bytes], number: int = 0) -> LoggedPacket | None:
-    """Return the packet that begins here; None if there is none, or it is incomplete."""
+    """Return the packet at the present offset; None without a complete packet."""
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size:
         return None

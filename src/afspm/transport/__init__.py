@@ -4,9 +4,9 @@
 
     comes in      packets of one publisher (`subscriber`), requests (`router`, `zmq_server`), answers (`control_client`,
                   `translator_link`)
-    state         the connected peers and their names; the time up to which a subscriber has every packet
+    state         the connected peers and their names; for each subscriber, the time up to which it has all packets
     goes out      events of a port (`port`): PacketReceived, RequestReceived, ParentGone …, in one poller per process
-    always holds  each packet arrives once and in order, or the subscriber learns that some are missing; no send waits
+    always holds  each packet arrives once and in order, or the subscriber detects the gap; no send waits
                   for a peer; a socket accepts only this experiment's processes
 
 A late or restarted subscriber sends a marker with the time of its newest packet. The publisher then replays the kept

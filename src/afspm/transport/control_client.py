@@ -38,8 +38,8 @@ class ControlClient:
     def send(self, frames: Sequence[bytes]) -> None:
         """Send a request; it is dropped while there is no scheduler.
 
-        A second request without an answer in between opens a new connection. The old one may look intact and lead
-        nowhere: cut off, or its identity taken by another process.
+        A second request before the answer to the first opens a new connection: the old one may look intact while it is
+        cut off, or while another process has taken its identity.
         """
         if not self._connected:
             return

@@ -1,4 +1,4 @@
-"""Diagnoses of the measurements of `afspm doctor`: each problem in a physicist's words, with its remedy."""
+"""Diagnoses from the measurements of `afspm doctor`: each problem in a physicist's terms, with its remedy."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Diagnosis:
     Attributes:
         code: identifier for programs.
         where: the address, file or computer.
-        remedy: what to do; empty if nothing is wrong.
+        remedy: the remedy; empty if nothing is wrong.
     """
 
     code: str
@@ -116,8 +116,8 @@ def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expecte
     """Judge an address at which `owner` listens.
 
     Args:
-        is_here: the address belongs to this computer.
-        expected: the experiment is running, so `owner` should listen.
+        is_here: whether the address belongs to this computer.
+        expected: whether the experiment is running, so that `owner` should listen.
     """
     where = f"{owner} at {address}"
     if reach is Reach.OPEN:
@@ -133,7 +133,7 @@ def of_address(owner: str, address: str, reach: Reach, *, is_here: bool, expecte
 
 
 def of_handshake(address: str, handshake: Handshake, key: str, server: str) -> Diagnosis:
-    """Judge the key exchange with the key `key` at an address of `server`."""
+    """Judge the key exchange of `key` at an address of `server`."""
     code = f"key-{handshake.value}"
     if handshake is Handshake.DONE:
         return fine(code, address, f"the key of {key} is accepted" if key else "no key is needed")
@@ -151,7 +151,7 @@ MOST_AHEAD_S = 1.0
 
 
 def of_clock(ahead_s: float, uncertain_s: float) -> Diagnosis:
-    """Judge the lead of this computer's clock over the scheduler's."""
+    """Judge the lead of this computer's clock over the scheduler's clock."""
     where = "the clock of this computer"
     if abs(ahead_s) <= MOST_AHEAD_S + uncertain_s:
         return fine("clock", where, f"agrees with the scheduler's clock to {abs(ahead_s) + uncertain_s:.2f} s")
@@ -238,5 +238,5 @@ def of_publisher(address: str, heard: Iterable[Heard], *, caught_up: bool) -> Di
 
 
 def is_well(found: Iterable[Diagnosis]) -> bool:
-    """Return whether no diagnosis is an error."""
+    """Return true if no diagnosis is an error."""
     return all(one.severity is not Severity.ERROR for one in found)

@@ -1,4 +1,4 @@
-"""Heartbeats: a thread in every process that reports its life and the age of its current step."""
+"""Heartbeats: a thread in every process that reports that it is alive, and the age of its current step."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Heartbeat(NamedTuple):
 
     Attributes:
         name: name of the process.
-        closing: the process ends on purpose; no more heartbeats follow.
+        closing: whether the process ends on purpose, so that no more heartbeats follow.
         step_age_s: age of the current step; 0 when idle. None if the process does not send it.
         longest_step_s: longest allowed step; None if the process does not send it.
     """
@@ -130,7 +130,7 @@ class HeartbeatListener:
         self._poller = zmq.Poller()
 
     def end_polls_by(self, descriptor: int) -> None:
-        """Watch a descriptor too: `poll` returns when the descriptor is readable. The caller reads the descriptor."""
+        """Let `poll` also return when a descriptor is readable; the caller reads it."""
         self._poller.register(descriptor, zmq.POLLIN)
 
     def listen(self, name: str, *, token: str = "", needs_token: bool = False) -> tuple[str, bytes | None]:
@@ -138,7 +138,7 @@ class HeartbeatListener:
 
         Args:
             token: token that the process gets, too.
-            needs_token: the process certainly sends its token; otherwise the token is required after its first use.
+            needs_token: whether the token is required from the first heartbeat on; otherwise after its first use.
         """
         socket = self._network.socket(zmq.SUB)
         socket.setsockopt(zmq.SUBSCRIBE, b"")

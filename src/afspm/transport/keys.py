@@ -1,4 +1,4 @@
-"""CURVE keys, one pair for each component in a folder of certificates, and the check of connecting keys.
+"""CURVE keys: one pair for each component in a folder of certificates, and the check of peers' keys.
 
     keys/public/<name>.key            copied to every computer that takes part
     keys/private/<name>.key_secret    only where the component runs
@@ -45,10 +45,10 @@ class Keys:
         public, secret: the pair, as Z85 text.
         peers: accepted public keys, with the names of their owners.
         servers: names of the peers that bind the addresses to connect to, by address.
-        folder: folder of public keys that may be added later; None: there are no others.
+        folder: folder to which public keys may be added later; None: no further keys.
         everywhere: every socket is encrypted. Otherwise, on one computer, only connections to `servers` are, and of the
             process's own sockets those of `guards`.
-        guards: sockets for requests are encrypted, and all that are not unix sockets.
+        guards: whether sockets for requests and all but unix sockets are encrypted.
     """
 
     name: str
@@ -89,9 +89,7 @@ class Keys:
         return self.everywhere or (self.guards and (requests or not is_private(address)))
 
     def user_as(self, user: str | None, name: str) -> str | None:
-        """Return the user of a key under a name: the guests' key is good for every name of a process without its own
-        key.
-        """
+        """Return the user of a key under a name. The guests' key fits every process without its own key."""
         component = component_of(name)
         return component if user == GUEST and component not in self.peers.values() else user
 
@@ -200,10 +198,10 @@ def from_launch(name: str, entries: PlainMapping | None) -> Keys | None:
 
 
 def with_server(name: str, entries: PlainMapping | None, address: str, key: bytes) -> Plain:
-    """Return the keys of a launch line with one more server, the supervisor's heartbeat socket.
+    """Return the keys of a launch line with one more server: the supervisor's heartbeat socket.
 
     Args:
-        name: name of the process; it gets a new pair if it has no keys yet.
+        name: name of the process; without keys, the process gets a new pair.
     """
     own = from_launch(name, entries) or Keys(name, *pair(), {}, everywhere=False, guards=False)
     owner = f"heartbeat of {name}"
@@ -220,8 +218,8 @@ def pair() -> tuple[bytes, bytes]:
 def generate(folder: str | Path, names: Iterable[str]) -> list[Path]:
     """Make a key pair for each of `names` without one; return the files written.
 
-    Existing keys stay: a new component joins without changes on the other computers. A public key without a secret one
-    belongs to a process on another computer. A lost public key is restored from the file of the secret one.
+    Existing keys stay: a new component joins without changes on the other computers. A public key without its secret
+    key belongs to a process on another computer. A lost public key is restored from the file of the secret key.
 
     Raises:
         ConfigError: a name is not valid for a file, or a file is not a certificate.
@@ -278,8 +276,8 @@ def _read(file: Path, name: str) -> dict[str, bytes]:
 class Authenticator:
     """The handler of ZeroMQ's authentication protocol (ZAP, RFC 27) for CURVE keys, in its own thread.
 
-    It answers whether a key may connect, and the name of its owner, which then is the "User-Id" of every message of the
-    connection. A key may be made while the experiment runs: for an unknown key, a changed folder of keys is read again.
+    It answers whether a key may connect, with the name of its owner, which becomes the "User-Id" of every message of
+    the connection. Keys may be added while the experiment runs: at an unknown key, a changed folder is read again.
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], keys: Keys) -> None:

@@ -1,6 +1,6 @@
 r"""Packets that a publisher keeps for late joiners, and the marker with which a subscriber requests them.
 
-A subscriber of afspm subscribes to a marker, a topic of its own that also holds its request:
+A subscriber of afspm subscribes to a marker: a topic for this subscriber that also holds its request:
 
     \0replay/<name>/<nonce> \0 <since_ns> \0 <prefix> \0 <prefix> …
 
@@ -71,7 +71,7 @@ def topic(name: str, nonce: int) -> bytes:
 
 
 def is_reserved(subscription: bytes) -> bool:
-    """Return whether a subscription begins like a marker, well-formed or not."""
+    """Return whether a subscription begins like a marker, even a malformed one."""
     return subscription.startswith(b"\0")
 
 
@@ -84,7 +84,7 @@ def spelled_out(prefixes: Iterable[bytes]) -> list[bytes]:
 
 
 class PublishedHistory:
-    """The kept packets of a publisher, which also gives packets their times.
+    """The kept packets of a publisher; it also gives packets their times.
 
     It keeps the last packet of every envelope, and the newest other packets within bounds.
     """
@@ -102,7 +102,7 @@ class PublishedHistory:
         """Return a packet with a later time than all before, and keep it unless `keep` is False.
 
         Args:
-            time_ns: a time that was already given to this packet.
+            time_ns: the time of a packet that already has one.
         """
         self._newest_ns = max(self._clock.now_ns() if time_ns is None else time_ns, self._newest_ns + 1)
         packet = Packet(envelope, payload, self._newest_ns)

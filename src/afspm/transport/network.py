@@ -119,9 +119,7 @@ class Network:
 
     @classmethod
     def connecting(cls, name: str, entries: Mapping[str, object] | None) -> Network:
-        """Return a network as `from_launch` for connections on this computer only, plain to servers without a known
-        key.
-        """
+        """Return a network as `from_launch`, for this computer only, with plain connections to servers without keys."""
         from afspm.transport.keys import from_launch
 
         own = from_launch(name, entries)
@@ -143,7 +141,7 @@ class Network:
         return socket
 
     def bind(self, socket: zmq.Socket[bytes], address: str, *, requests: bool = False) -> str:
-        """Bind a socket, and return the address with the port that was found if `address` has port 0.
+        """Bind a socket, and return its address, with the chosen port if `address` has port 0.
 
         Args:
             requests: peers send requests to this socket, so that they must prove their names.
@@ -183,7 +181,7 @@ class Network:
             raise TransportError(f"can't connect: {error}", where=address) from error
 
     def close(self) -> None:
-        """Close all sockets, after all sent messages have left or a fraction of a second has passed."""
+        """Close all sockets once all sent messages have left, within a fraction of a second."""
         if self._context.closed:
             return
         if self._authenticator is not None:
@@ -275,9 +273,7 @@ _numbers = itertools.count()
 
 
 class ConnectionEvent(NamedTuple):
-    """A connection event: `kind` is one of the constants above; `value` the descriptor of a connection that is
-    DISCONNECTED.
-    """
+    """A connection event: its `kind` (a constant above), and the descriptor of a DISCONNECTED connection as `value`."""
 
     kind: int
     value: int

@@ -61,7 +61,7 @@ class WakeUp(Generic[T]):
 
 
 class Poller(Generic[S]):
-    """A wait until a socket is readable, or another thread ends the wait."""
+    """A poller: it waits until a socket is readable, or another thread ends the wait."""
 
     def __init__(self, wake_up: WakeUp[Any]) -> None:
         self._poller = zmq.Poller()

@@ -89,7 +89,7 @@ class Port(Protocol):
         """
 
     def publish(self, envelope: str, payload: bytes) -> None:
-        """Publish on the component's own publisher, with the experiment time, made strictly increasing.
+        """Publish on the component's own publisher, with the strictly increasing experiment time.
 
         Raises:
             ConfigError: the component has no address to publish on.
@@ -114,7 +114,7 @@ class RequestReceived:
 
     Attributes:
         user: owner of the key of its connection.
-        epoch: epoch of the sending scheduler; empty without one.
+        epoch: epoch of the sending scheduler; empty for other senders.
         connection: its connection.
     """
 
@@ -126,7 +126,7 @@ class RequestReceived:
 
 @dataclass(frozen=True, slots=True)
 class SubscriberJoined:
-    """A peer (the scheduler of a translator) subscribed, and was sent the packets before."""
+    """The event that a peer (the scheduler of a translator) subscribed and received the earlier packets."""
 
 
 Served = RequestReceived | SubscriberJoined | ParentGone
@@ -151,19 +151,19 @@ class ServerPort(Protocol):
     def reply(self, frames: Sequence[bytes] | None) -> None:
         """Answer the request, with frames of `wire.encode_response`. Never blocks.
 
-        None: drop the answer, as if it was lost (a fault for tests with a simulated microscope).
+        None drops the answer (a fault for tests with a simulated microscope).
         """
 
     def is_connected(self, connection: bytes) -> bool:
         """Return whether the connection of a scheduler with an epoch still exists."""
 
     def publish(self, envelope: str, payload: bytes, time_ns: int | None = None, *, keep: bool = True) -> None:
-        """Publish a packet with the experiment time, made strictly increasing.
+        """Publish a packet with the strictly increasing experiment time.
 
         Args:
-            time_ns: time of the packet. A restarted translator publishes packets that the kill may have lost again,
-                with their first times, so that a receiver ignores repeated ones.
-            keep: keep the packet for later subscribers; False for packets about the present moment only.
+            time_ns: time of the packet. After a kill, a restarted translator publishes possibly lost packets again,
+                with their first times, so that a receiver ignores repetitions.
+            keep: whether to keep the packet for later subscribers; False for packets about the present moment.
         """
 
     def wake_up(self, incoming: Served | None = None) -> None:

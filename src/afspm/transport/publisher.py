@@ -17,12 +17,12 @@ _BATCH, _MOST_REPLAYS = 100, 5
 class Publisher:
     """A publishing socket that handles subscriptions.
 
-    A subscriber of afspm is sent its missed packets under its own topic (see `late_joiners`), so that no other
-    subscriber gets them twice, and from then on every packet, without a gap. A plain SUB socket is sent the kept
-    packets as ordinary packets, which all others with the same subscription get again.
+    A subscriber of afspm gets its missed packets under its own topic (see `late_joiners`), so that no other subscriber
+    gets them twice; then every packet, without a gap. A plain SUB socket gets the kept packets as ordinary packets,
+    which all subscribers with the same subscription receive again.
 
-    The publisher waits for no subscriber. One that stands still is disconnected; when it reads again, it reconnects and
-    gets the missed packets.
+    The publisher waits for no subscriber. A subscriber that stops reading is disconnected; when it reads again, it
+    reconnects and gets the missed packets.
 
     Args:
         history: returns earlier packets for a new subscriber.

@@ -1,4 +1,4 @@
-"""A log that passes a few warnings and counts the rest: a flood must not fill the log."""
+"""A log that passes a few warnings and counts the rest, so that a flood does not fill the log."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _PERIOD_S = 10.0
 
 
 class RateLimitedLog:
-    """A log of at most five warnings every ten seconds, and later of the number of dropped ones."""
+    """A log of at most five warnings every ten seconds; later it adds the number of dropped warnings."""
 
     def __init__(self, log: logging.Logger, clock: Clock) -> None:
         self._log = log

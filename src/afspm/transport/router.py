@@ -1,11 +1,12 @@
-"""The scheduler's control socket: requests with their senders, and the end of senders.
+"""The scheduler's control socket: requests with their senders, and the disconnections of senders.
 
 The identity of its socket identifies a sender: its name, a zero byte, and a random text (`keys.routing_id`). So two
 processes with one name are two senders, and answers to one never reach the other. Sockets with a bare name as identity,
 such as a REQ socket of a program without a client, share one sender.
 
-ZeroMQ reports the end of a connection, but not whose. So each known sender is then probed with an empty message, which
-every client ignores: ROUTER refuses to send it to a peer that is gone (ROUTER_MANDATORY). A REQ socket would take the
+ZeroMQ reports the end of a connection without its peer. So each known sender is then probed with an empty message,
+which every client ignores: ROUTER refuses to send to a disconnected peer (ROUTER_MANDATORY). A REQ socket would take
+the
 probe for the answer to its request: its end is recognised by the descriptor of its connection.
 """
 
@@ -43,7 +44,7 @@ class PeerAsked(NamedTuple):
     """A request, as frames for `wire.decode_request`; without frames the peer only gives its name.
 
     Attributes:
-        name: name of the peer; "" without a readable one.
+        name: name of the peer; "" without a readable name.
         user: owner of its key; None without keys.
     """
 
@@ -94,7 +95,7 @@ class Router:
         return self._looks_s[0] if self._looks_s else math.inf
 
     def receive(self) -> list[RouterEvent]:
-        """Return the next request, and ended senders, each after its last request.
+        """Return the next request, and disconnected senders, each after its last request.
 
         The socket takes messages from its clients in turn.
         """

@@ -40,8 +40,8 @@ class LinkReply(NamedTuple):
 class TranslatorLink:
     """A client that sends requests to the translator.
 
-    A REP socket returns the frames before the empty frame: a number, so that a late answer is never taken for another
-    one, and the scheduler's epoch, which the translator checks.
+    A REP socket returns the frames before the empty frame: a number, so that a late answer is never taken for the
+    answer to another request, and the scheduler's epoch, which the translator checks.
 
     Args:
         epoch: epoch of the scheduler; empty: none.
@@ -95,7 +95,7 @@ class SchedulerSockets:
     """Publisher and router for the components, subscriber and link for the translator.
 
     Args:
-        since_ns: time up to which the translator's packets are known.
+        since_ns: time up to which the scheduler has all packets of the translator.
         epoch: epoch before each request to the translator; empty: none.
 
     Raises:

@@ -27,9 +27,9 @@ class Subscriber:
     Args:
         name: name of this component.
         prefixes: prefixes of the wanted envelopes; None for all. The signal KILL always comes.
-        since_ns: time up to which packets are known already.
-        filtered: drop packets that are not newer than the newest of their envelope. Set it to False for a translator,
-            whose clock may be set back: then the receiver must drop repeated packets.
+        since_ns: time up to which the receiver has all packets.
+        filtered: whether to drop packets not newer than the newest of their envelope. False for a translator, whose
+            clock may be set back: then the receiver must drop repeated packets.
 
     Raises:
         ConfigError: the prefixes are too long for one marker.

@@ -22,7 +22,7 @@ T = TypeVar("T")
 
 
 class BasePort(Generic[T]):
-    """A port that waits for its sockets and publishes.
+    """Base of the ports: it waits for its sockets and publishes.
 
     Args:
         publish: address to publish on; None: none.
@@ -46,7 +46,7 @@ class BasePort(Generic[T]):
 
     @property
     def publish_address(self) -> str | None:
-        """Return the address of the publisher, with the port that was found."""
+        """Return the address of the publisher, with the chosen port."""
         return self._publisher.address if self._publisher else None
 
     def poll(self, timeout_s: float | None) -> list[T]:

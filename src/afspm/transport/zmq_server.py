@@ -21,12 +21,12 @@ class ZmqServerPort(BasePort[Served]):
     """A translator's port, see `transport.port.ServerPort`.
 
     To a client it behaves as a REP socket: it returns all frames before the empty one, so that a scheduler can number
-    its requests. It is a ROUTER, since an answer may also be withheld.
+    its requests. The socket is a ROUTER, since an answer may also be withheld.
 
     Args:
         serve: address for requests.
         publish: address to publish on.
-        allowed: with keys, the only name whose requests are answered (the scheduler's); None: all accepted keys.
+        allowed: with keys, the only client whose requests are answered (the scheduler); None: all accepted keys.
 
     Raises:
         TransportError: an address can't be used.

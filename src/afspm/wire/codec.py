@@ -23,10 +23,10 @@ _VALUES_OF_DATA = 5
 
 
 def encode(thing: object) -> tuple[str, bytes]:
-    """Return a model object, or any message, as (name of the message, bytes).
+    """Return a model object or a message as (name of the message, bytes).
 
     Raises:
-        InvalidValue: `thing` is neither.
+        InvalidValue: `thing` is neither a model object nor a message.
     """
     if isinstance(thing, Message):
         return _serialised(thing)
@@ -52,7 +52,7 @@ def decode(name: str, payload: Buffer) -> Any:
 
 
 def header(name: str, payload: Buffer) -> model.PacketHeader:
-    """Return the facts on which the envelope of a message may depend, without reading its values.
+    """Return the header of a message, on which its envelope may depend, without reading its values.
 
     Raises:
         WireError: the bytes are no such message.

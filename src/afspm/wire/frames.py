@@ -1,4 +1,4 @@
-"""Packets, requests and responses as frames of a ZeroMQ message, and the signals of one frame."""
+"""Packets, requests and responses as frames of a ZeroMQ message, and signals, which have one frame."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def decode_request(frames: Sequence[Buffer]) -> Request:
 
 
 def id_of(frames: Sequence[Buffer]) -> str:
-    """Return the id of a request, perhaps a malformed one, for a refusal; empty if there is none."""
+    """Return the id of a request, even a malformed one, for its refusal; empty without an id."""
     return str(frames[2], "utf-8", "replace") if len(frames) == 3 and len(frames[2]) <= LONGEST_ID else ""
 
 

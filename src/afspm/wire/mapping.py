@@ -36,7 +36,7 @@ def time_ns(stamp: Timestamp) -> int:
     """Return a timestamp in ns since the Unix epoch.
 
     Raises:
-        InvalidValue: the time does not fit 64 bits (the years 1678 to 2261), so that no record could keep it.
+        InvalidValue: the time does not fit 64 bits (the years 1678 to 2261), as in the record.
     """
     found = int(stamp.seconds) * NS_PER_S + stamp.nanos
     if not -_TIMES <= found < _TIMES:
@@ -50,7 +50,7 @@ def known(kind: type[E], number: int) -> E:
 
 
 def shortest(number: float) -> float:
-    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612, which exceeds a limit of 0.1."""
+    """Return the shortest decimal number for a float32: 0.1, not 0.10000000149011612 (above a limit of 0.1)."""
     for digits in range(6, 9):
         decimal = float(f"{number:.{digits}g}")
         if _FLOAT32.unpack(_FLOAT32.pack(decimal)) == (number,):
@@ -62,7 +62,7 @@ class FieldMapping(NamedTuple):
     """One field of a message, and the conversion of its value in both directions.
 
     Attributes:
-        sparse: an empty or zero value is not sent.
+        sparse: whether an empty or zero value is not sent.
     """
 
     name: str
@@ -74,7 +74,7 @@ class FieldMapping(NamedTuple):
 class MessageMapping(Generic[T]):
     """A model class and its message.
 
-    None is sent as an absent field. An absent field is read as None if that is the attribute's default.
+    None is sent as an absent field. An absent field is read as None if None is the attribute's default.
 
     Args:
         same: attributes with a field of the same name and type.

@@ -1,15 +1,15 @@
-"""The registry of messages: one declaration for each message, which all other rooms follow.
+"""The registry of messages: one declaration for each message, used by all other rooms.
 
 Nothing outside of this package imports the generated modules; it provides message classes to other rooms.
 
 | a declaration states | and thereby |
 | --- | --- |
-| type | how bytes are read; the name, with which its envelopes begin |
+| type | the class that reads the bytes; the name, with which its envelopes begin |
 | kind, source, always | what clients follow, what a terminal subscribes to, what `afspm check` expects to be published
 |
 | history | how many packets of an envelope the scheduler keeps for late joiners |
 | handler | the method of a component, and of an overview of the record, for this message |
-| attribute | where a client keeps the newest |
+| attribute | the attribute of a client that holds the newest message |
 | event | the kind of event under which the gateway streams it |
 
 Always holds: a name is declared once; no set, table or tuple of message names stands in another package.
@@ -51,7 +51,7 @@ M = TypeVar("M", bound=Message)
 
 
 class MessageKind(Enum):
-    """The kinds of messages, which receivers treat differently."""
+    """The kinds of messages; receivers treat each differently."""
 
     MEASUREMENT = "a finished measurement, with its values"
     LINES = "rows of a running scan, for the moment: not kept"
@@ -73,10 +73,10 @@ class MessageDeclaration:
         named: its envelopes continue after the message's name with size and channel, kind or owner.
         history: number of packets for each envelope that the scheduler keeps for late joiners.
         handler: method of a `Component` and of an `Overview` for this message.
-        attribute: attribute of a client's view for the newest; empty: not kept.
-        set_by: the request that sets its content.
+        attribute: attribute of a client's view for the newest message; empty: not kept.
+        set_by: the request that sets the content of the message.
         event: kind of the event in the gateway; empty: not streamed.
-        in_past: an overview of an earlier part of a run needs all packets, not only the newest.
+        in_past: whether an overview of an earlier part of a run needs all packets, not only the newest.
         name: name of the message, with which its envelopes begin.
     """
 
@@ -101,7 +101,7 @@ class MessageDeclaration:
 
     @property
     def has_values(self) -> bool:
-        """Return whether it carries an array of measured values."""
+        """Return whether the message carries an array of measured values."""
         return self.kind in (MessageKind.MEASUREMENT, MessageKind.LINES)
 
 
@@ -310,7 +310,7 @@ def register(message: type[Message]) -> type[Message]:
 
 
 def declared() -> tuple[MessageDeclaration, ...]:
-    """Return the declarations of all messages, with those of users."""
+    """Return the declarations of all messages, including users' messages."""
     return tuple(_declared.values())
 
 
@@ -338,7 +338,7 @@ def message_type(name: str) -> type[Message]:
 
 
 def known_messages() -> tuple[str, ...]:
-    """Return the names of all messages, with those of users."""
+    """Return the names of all messages, including users' messages."""
     return tuple(_declared)
 
 
@@ -351,7 +351,7 @@ def messages_of_the_experiment() -> tuple[str, ...]:
 
 
 def followed_messages() -> tuple[str, ...]:
-    """Return the names of messages that every client follows: states, and measurements, which may be its own."""
+    """Return the names of messages that every client follows: states and measurements."""
     return tuple(name for name, one in _declared.items() if one.kind in (MessageKind.STATE, MessageKind.MEASUREMENT))
 
 
@@ -362,7 +362,7 @@ def messages_without_values() -> tuple[str, ...]:
 
 
 def message_of(envelope: str) -> str:
-    """Return the name of the message in a packet: all of its envelope, or the part before an underscore.
+    """Return the name of a packet's message: its whole envelope, or the part before an underscore.
 
     Raises:
         WireError: the envelope begins with no known name.

@@ -65,7 +65,7 @@ def split(buffer: bytes | memoryview, field: int) -> tuple[bytes, list[memoryvie
 
 
 def doubles(chunks: list[memoryview]) -> NDArray[np.float64]:
-    """Return the contents of a `repeated double` as an array, shape (n,): a view if they came in one piece.
+    """Return the contents of a `repeated double` as an array, shape (n,): a view if there is one piece.
 
     Raises:
         WireError: the length is not a multiple of eight bytes.

@@ -1,6 +1,6 @@
-"""Conversion of places, positions and scan parameters to and from messages, with units and corners of the wire.
+"""Conversion of places, positions and scan parameters to and from the units and corners on the wire.
 
-Sent messages are in metres and degrees and have every field; received ones may have any unit and lack fields.
+Sent messages are in metres and degrees and have every field; received messages may have any unit and lack fields.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def spatial_to_wire(region: model.Region | model.RegionChange) -> scan_pb2.Spati
 
 
 def spatial_from_wire(spatial: scan_pb2.SpatialAspects) -> model.RegionChange | None:
-    """Return the given fields of a message's region, in SI; None if there are none.
+    """Return the given fields of a message's region, in SI; None without any.
 
     Raises:
         UnitError: a unit is neither a length nor an angle.

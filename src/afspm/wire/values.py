@@ -46,7 +46,7 @@ def without_values(message: str, payload: Buffer) -> bytes:
 
 
 def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes:
-    """Return a message from `without_values` with values: of a scan or lines [y, x], of a spectrum (points, variables).
+    """Return a message from `without_values` with values: [y, x] of a scan or lines, (points, variables) of a spectrum.
 
     Raises:
         WireError: the bytes are no message.
@@ -78,7 +78,7 @@ def encode_place(place: Region | ProbePosition) -> bytes:
 
 
 def place_in(name: str, payload: Buffer) -> bytes:
-    """Return the place in a ScanParameters2d or a ProbePosition, bit by bit and in its own unit.
+    """Return the place in a ScanParameters2d or a ProbePosition, unchanged to the bit, in its own unit.
 
     Raises:
         WireError: the bytes are no such message.

@@ -1,4 +1,4 @@
-"""State of the Asylum controller, and the measurements that wait for their end."""
+"""State of the Asylum controller, and the measurements in progress."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class AsylumActivity(Activity):
         return as_region(self._kept["image"])
 
     def find_image(self) -> None:
-        """Use the frame in force as the open image's frame, unless an earlier run has stored one."""
+        """Use the frame in force as the open image's frame, unless an earlier run has stored a frame."""
         self._kept.setdefault("image", as_list(self._frame_in_force()))
 
     def _image_begins(self) -> None:

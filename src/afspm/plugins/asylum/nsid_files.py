@@ -1,4 +1,4 @@
-"""NSID files (.h5, pycroscopy's format): images [x, y], both ascending; with notes if Asylum's."""
+"""NSID files (.h5, pycroscopy's format): images [x, y], both ascending, with notes in files of Asylum."""
 
 from __future__ import annotations
 

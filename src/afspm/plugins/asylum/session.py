@@ -36,7 +36,7 @@ class Doing:
 
     @property
     def state(self) -> ScopeState:
-        """The state by both sources; a measurement reported by one of them counts as running."""
+        """Return the state from both sources; a measurement reported by either counts as running."""
         bits = self.bits or 0
         if self.mapping or bits & _FORCE:
             return ScopeState.SPEC

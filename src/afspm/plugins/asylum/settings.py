@@ -76,7 +76,7 @@ def on_image(xy_m: tuple[float, float], image: Region) -> tuple[float, float]:
 
 
 def from_image(spot_m: tuple[float, float], image: Region) -> tuple[float, float]:
-    """Convert an Asylum spot to a position; the reverse of `on_image`."""
+    """Convert an Asylum spot to a position: the inverse of `on_image`."""
     cos, sin = math.cos(image.angle_rad), math.sin(image.angle_rad)
     dx, dy = spot_m[0] - image.size_m[0] / 2, spot_m[1] - image.size_m[1] / 2
     return image.center_m[0] + cos * dx - sin * dy, image.center_m[1] + cos * dy + sin * dx

@@ -1,11 +1,11 @@
-"""The microscope as ophyd-async devices, for plans of Bluesky. Needs the extra `bluesky`.
+"""The microscope as ophyd-async devices for Bluesky plans. Needs the extra `bluesky`.
 
     RE = RunEngine()
     with init_devices():
         scope = Microscope("runs", parameters=["tip-bias-voltage"])
     RE(bp.scan([scope.scan], scope.scan.center_x, -1e-6, 1e-6, 5))
 
-The scheduler treats a plan like a notebook: the plan waits for control, limits hold, a repair of the tip comes first. A
+The scheduler treats a plan like a notebook: the plan waits for control, limits hold, tip repairs come first. A
 plan keeps control while it has staged the microscope. An aborted plan stops its measurement.
 """
 
@@ -46,7 +46,7 @@ T = TypeVar("T")
 
 
 class _PlanSession:
-    """The handle to the experiment, used in a thread of its own: its calls block."""
+    """The handle to the experiment, used in its own thread since its calls block."""
 
     def __init__(self, where: str | Path, name: str) -> None:
         self.source = f"afspm://{Path(where).as_posix()}"
@@ -167,7 +167,7 @@ class _Measurement(StandardReadable, Triggerable):
 
 
 class ScanDevice(_Measurement):
-    """A scan: `trigger` takes it, and reading it gives all channels, [y, x] with both ascending.
+    """A scan device: `trigger` takes a scan, and a reading gives all its channels, [y, x], both ascending.
 
     Signals `center_x`, `center_y`, `size_x`, `size_y` (m) and `angle` (rad) set the region, `rows` and `columns` its
     pixels.
@@ -200,7 +200,9 @@ class ScanDevice(_Measurement):
 
 
 class SpectrumDevice(_Measurement):
-    """A spectrum: `trigger` takes it at `x`, `y` (m), and reading it gives all variables over the points."""
+    """A spectrum device: `trigger` takes a spectrum at `x`, `y` (m), and a reading gives its variables over the
+    points.
+    """
 
     def __init__(self, session: _PlanSession, name: str = "") -> None:
         with self.add_children_as_readables(StandardReadableFormat.UNCACHED_SIGNAL):
@@ -251,7 +253,7 @@ class Microscope(StandardReadable):
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """Stop the current measurement, and release control."""
+        """Stop the present measurement, and release control."""
         self._session.interrupt()
         await self._session.call(lambda _: self._held.close())
 

@@ -1,4 +1,4 @@
-"""A run as documents of Bluesky's event model: start, descriptors with their events, stop.
+"""A run as documents of Bluesky's event model: start, descriptors with events, stop.
 
 Each group of measurements with equal arrays has one descriptor. Values stay in the files of the record, to which
 StreamResource and StreamDatum point. Identifiers follow from the run, so that the same run always gives the same
@@ -36,7 +36,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def documents(run: Run, scans: Iterable[ScanRow], spectra: Iterable[SpectrumRow]) -> Iterator[Document]:
-    """Yield the documents of a run, in the order of their times."""
+    """Yield the documents of a run in the order of time."""
     rows: list[ScanRow | SpectrumRow] = sorted([*scans, *spectra], key=lambda row: row.time_ns)
     began_ns = rows[0].began_ns or rows[0].time_ns if rows else run.newest_ns
     start = _uid(run, "start")

@@ -1,4 +1,4 @@
-"""A picture, or a scan of another microscope, as the sample of a simulated microscope."""
+"""A simulated microscope whose sample is a picture, or a scan of another microscope."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _IDEAL: Mapping[str, PlainMapping] = {
 
 
 class ImageMicroscope(Simulator):
-    """The simulated microscope, ideal, with the heights of a file as its sample.
+    """An ideal simulated microscope whose sample has the heights of a file.
 
-    The middle of the picture is at the origin; beyond its borders it continues mirrored.
+    The middle of the picture is at the origin; beyond its borders the sample continues mirrored.
 
     Args:
         file: a picture (bright is high), a numpy array, or a scan in any format that `afspm.read` reads.

@@ -8,7 +8,7 @@ unconfirmed: the driver accepts each plausible form, and refuses unknown words i
     state         the running and the ended measurement, the position where the tip was sent: persistent; the running
                   long script (`activity`)
     goes out      expressions; scans and curves from files
-    always holds  a reply of unknown form ends the connection; the files of a scan are taken once no more appear
+    always holds  a reply of unknown form ends the connection; the files of a scan are read once no further file appears
 """
 
 from __future__ import annotations

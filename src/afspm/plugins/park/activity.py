@@ -1,4 +1,4 @@
-"""State of SmartScan, and the measurements that wait for their end."""
+"""State of SmartScan, and the measurements in progress."""
 
 from __future__ import annotations
 

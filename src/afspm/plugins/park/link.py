@@ -1,4 +1,4 @@
-"""Connection to SmartScan: JSON-RPC over ZeroMQ, with scripts that return their outcome in a form of afspm's own."""
+"""Connection to SmartScan: JSON-RPC over ZeroMQ, with scripts that return their outcome in afspm's own form."""
 
 from __future__ import annotations
 
@@ -51,7 +51,8 @@ class Link:
         """Evaluate a JavaScript expression; return its value.
 
         Raises:
-            SmartScanError: it failed. ControllerLost: no reply, or an untrustworthy one; the connection is closed.
+            SmartScanError: the script failed. ControllerLost: no reply, or an untrustworthy one; the connection is
+                closed.
         """
         reply = self._connection.ask(shown(expression), _request(RUN_SCRIPT, wrapped(expression)), _fields)
         # `wrapped` always returns a text: without one the script did not run to its end.
@@ -102,7 +103,7 @@ class Link:
 
 
 def wrapped(expression: str) -> str:
-    """Return a script whose value reports if the expression failed: SmartScan's own form of errors is unconfirmed."""
+    """Return a script whose value reports a failure of the expression: SmartScan's form of errors is unconfirmed."""
     ok, error = f'JSON.stringify({{"{OK}": ({expression})}})', f'JSON.stringify({{"{ERROR}": String(e)}})'
     return f"(function() {{ try {{ return {ok}; }} catch (e) {{ return {error}; }} }})()"
 

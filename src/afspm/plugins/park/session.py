@@ -105,8 +105,8 @@ class Session:
     def begin(self, what: str, expression: str, wait_s: float = 0.0) -> LongCall:
         """Start a long script on a connection of its own; wait up to `wait_s` for its reply. Raises ControllerLost.
 
-        It is unconfirmed if a reply arrives at the end of a script, or at once and without a value. In the second case
-        SmartScan is polled for the end.
+        Whether the reply arrives at the end of a script, or at once without a value, is unconfirmed. After an early
+        reply SmartScan is polled for the end.
         """
         link = self._open_link()
         try:

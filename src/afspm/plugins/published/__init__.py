@@ -16,9 +16,9 @@ translator or scheduler of afspm.
 | `PublishedTranslator` | DEALER and SUB, as the scheduler of a peer translator | a translator |
 | `PublishedScheduler` | one DEALER for each client, and SUB, as clients of a peer scheduler | a scheduler |
 
-What always holds: only messages of version 1 go outside (`version_1`). A request goes outside once, since peers know no
-ids; inside, its answer has the id of the request. To a subscriber outside, times increase, and packets that a peer
-would miss are delayed (`version_1.Pacing`).
+What always holds: only messages of version 1 go outside (`version_1`). A request goes outside once, since peers have no
+request ids; inside, its answer has the id of the request. To a subscriber outside, times increase, and packets that a
+peer would miss are delayed (`version_1.Pacing`).
 
 Experiment files of the published form are converted as they are read (`files`), and `afspm check --explain` writes them
 in afspm's form (`short_form`). Nothing is imported here: a file is read without the sockets of the bridge.

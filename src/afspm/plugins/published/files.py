@@ -1,4 +1,4 @@
-"""Files of the published implementation: afspm's names for its classes and settings, and those without counterpart."""
+"""Files of the published implementation: its classes and settings with their counterparts in afspm, if any."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class PublishedSetting:
 
     Attributes:
         becomes: returns afspm's settings, with dots for tables, from the value and the table that contains it.
-        why: for a setting without counterpart: how afspm does it.
+        why: for a setting without counterpart: afspm's way.
     """
 
     becomes: Becomes
@@ -77,7 +77,7 @@ def wire_of(table: object) -> str:
 
 
 def converted(value: object, channels: Mapping[str, str]) -> Any:
-    """Convert intermediaries within a value, and replace calls of published functions by the envelope that they return.
+    """Convert intermediaries within a value, and replace calls of published functions by the returned envelope.
 
     Args:
         channels: new names of the file's channels.
@@ -162,13 +162,13 @@ def length_m(value: str | float) -> float:
 
 
 def renamed_channels(components: Mapping[str, Table]) -> dict[str, str]:
-    """Return the channels that a file gives to simulated pictures, each with its afspm name."""
+    """Return the channels of simulated pictures in a file, each with its afspm name."""
     pictures = (table for table in components.values() if last(table) in _PICTURES)
     return {str(table["channel_id"]): CHANNEL for table in pictures if "channel_id" in table}
 
 
 def class_of(table: Table) -> PublishedClass | None:
-    """Return the counterpart of a component's class; None for a class that is not in the tables."""
+    """Return the counterpart of a component's class; None for an unknown class."""
     name, path = last(table), str(table.get("class", ""))
     if not path.startswith(COMPONENTS) and name != "DriftImageTranslator":  # beside the file, in its samples
         return None

@@ -46,14 +46,14 @@ _NAMELESS = b"a client without a name: set the socket's identity to the componen
 
 
 class PublishedPeers:
-    """The entry for components of the published implementation: it acts as the scheduler that they expect.
+    """The scheduler that components of the published implementation expect: their entry to an afspm experiment.
 
-    The afspm scheduler sees each of them as a client with its own name.
+    In the afspm scheduler each of them is a client with its own name.
 
     Args:
         serve: the address that their control clients connect to.
         publish: the address that their subscribers connect to.
-        as_translator: play the translator instead, for their scheduler or their test suite. Packets then have a
+        as_translator: act as the translator instead, for the published scheduler or test suite. Packets then have a
             translator's envelopes, and this process takes control before each command.
     """
 
@@ -86,8 +86,8 @@ class _PeerClient:
 
     Attributes:
         asked: requests without an answer, by id: the peer's identity, the number, and the frames sent.
-        admitted: the scheduler has answered under this name before; until then a failure concerns the name itself.
-        leaves: the peer is gone, and its last request is not answered yet.
+        admitted: whether the scheduler has answered under this name; before, a failure concerns the name itself.
+        leaves: whether the peer is gone with its last request still unanswered.
     """
 
     def __init__(self, bridge: _PeersPort, name: str) -> None:
@@ -165,7 +165,7 @@ class _PeersPort(BasePort[Incoming]):
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment has ended, and the time for last answers, too."""
+        """Return whether the experiment and the time for last answers are over."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def publish_due(self) -> None:
@@ -348,11 +348,11 @@ class _Outlet:
 
     @property
     def due_s(self) -> float:
-        """Time of the next publication; infinity: nothing waits."""
+        """Return the time of the next publication; infinity if nothing waits."""
         return min(self.pacing.due_s, self._replay_s)
 
     def subscriptions(self) -> list[str]:
-        """Process new subscriptions; return the prefixes that they mean."""
+        """Process new subscriptions; return their prefixes."""
         meant: list[str] = []
         while frames := receive_frames(self.socket):
             kind, subscription = frames[0].bytes[:1], frames[0].bytes[1:]

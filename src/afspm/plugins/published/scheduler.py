@@ -34,13 +34,13 @@ MOST_ANSWERS: Final = 256
 
 
 class PublishedScheduler:
-    """Stands for a scheduler of the published implementation, which arbitrates control.
+    """A substitute for a scheduler of the published implementation, which arbitrates control.
 
     Args:
         serve: the address of its router.
         publish: the address of its publisher.
-        control, limits, cache: sections of the experiment file. Its own configuration takes their place, so limits,
-            which nothing would enforce, are refused.
+        control, limits, cache: sections of the experiment file, which the published scheduler's own configuration
+            replaces. Limits are refused, since nothing would enforce them.
     """
 
     role: ClassVar[Role] = Role.SCHEDULER
@@ -81,7 +81,7 @@ class PublishedScheduler:
 
 
 class _ClientOutside:
-    """The connection of one client to their scheduler.
+    """The connection of one client to the published scheduler.
 
     Attributes:
         connection: the newest connection of the client.
@@ -191,11 +191,11 @@ class _SchedulerPort(BasePort[Incoming]):
         return None if due_s == math.inf else due_s - self._clock.monotonic_s()
 
     def is_over(self) -> bool:
-        """Return whether the experiment has ended, and the time for last answers, too."""
+        """Return whether the experiment and the time for last answers are over."""
         return self._clock.monotonic_s() >= self._ends_s
 
     def open_when_cached(self) -> None:
-        """Let afspm's components in, once their scheduler has had time to send its cache."""
+        """Let afspm's components connect once the published scheduler has had time to send its cache."""
         if self._clock.monotonic_s() >= self._opens_s and self.launch.sockets.serve is not None:
             self._opens_s = math.inf
             self._router = Router(self._network, self.launch.sockets.serve, self._warnings, self._clock)
@@ -203,7 +203,7 @@ class _SchedulerPort(BasePort[Incoming]):
             self._poller.register(self._router.monitor.socket, self._requests)
 
     def known_answer(self, request: Request) -> Response | None:
-        """Return the answer to a request that would end their scheduler; None: it may be sent."""
+        """Return the answer to a request that would end the published scheduler; None: send the request."""
         if not version_1.has_request(request.kind):
             return version_1.unknown_request(request.kind, "scheduler", request.id)
         if request.kind == ControlRequest.RMV_EXP_PRBLM and request.subject not in self._flagged | self._unpublished:
@@ -219,7 +219,7 @@ class _SchedulerPort(BasePort[Incoming]):
             self._flagged.discard(int(request.subject))
 
     def reply(self, client: _ClientOutside, response: Response) -> None:
-        """Answer by the newest connection of a client."""
+        """Answer through the newest connection of a client."""
         if self._router is not None:
             self._router.reply(client.connection, wire.encode_response(response))
 

@@ -34,8 +34,7 @@ def explained(resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, s
 def short(resolved: ResolvedExperiment) -> str:
     """Return the experiment in the short form: components with their settings, and sections unlike the defaults.
 
-    A component without counterpart becomes its substitute, where the settings determine one, else a comment with
-    advice.
+    A component without counterpart becomes a substitute if the settings determine one, else a comment with advice.
     """
     parts = resolved.parts
     kept = {name: parts.variables[name] for name in _VARIABLES if name in parts.variables}

@@ -56,14 +56,14 @@ _OWN = b"own"  # the id of this process's own requests, which clients' requests 
 
 
 class PublishedTranslator:
-    """Stands for a translator of the published implementation, for an afspm scheduler.
+    """A substitute for a translator of the published implementation, for an afspm scheduler.
 
     Args:
         serve: the address of its control server.
         publish: the address of its publisher.
-        program: starts it, with afspm's launch line, which contains both addresses, on its standard input.
-        spectra_by_variable: it sends the values of a spectrum variable after variable, as the published ones for
-            Nanonis and Asylum do.
+        program: command that starts the translator; its standard input gets afspm's launch line with both addresses.
+        spectra_by_variable: whether the translator sends the values of a spectrum variable by variable, as the
+            published ones for Nanonis and Asylum.
     """
 
     role: ClassVar[Role] = Role.TRANSLATOR
@@ -109,7 +109,7 @@ class PublishedTranslator:
 
 
 class SimulatedPublishedTranslator(PublishedTranslator):
-    """A translator of the published implementation whose microscope is certainly simulated."""
+    """A translator of the published implementation with a microscope declared as simulated."""
 
     simulated: ClassVar[bool] = True
 
@@ -154,7 +154,7 @@ def _started(
 
 
 def by_point(payload: bytes) -> bytes:
-    """Return a Spec1d whose values came variable after variable with its values point by point. Raises WireError."""
+    """Return a Spec1d point by point whose values came variable by variable. Raises WireError."""
     spectrum = wire.decode(SPECTRUM.name, payload)
     points, variables = spectrum.values.shape
     return wire.encode(replace(spectrum, values=spectrum.values.reshape(variables, points).T))[1]
@@ -178,7 +178,7 @@ def _is_connected(launch: Launch, address: str, stop: _Stop) -> bool:
 
 
 class _TranslatorPort(ZmqServerPort):
-    """A port with a translator's sockets towards afspm, and a scheduler's sockets towards the published translator."""
+    """A port with a translator's sockets towards afspm and a scheduler's towards the published translator."""
 
     def __init__(self, context: ProcessContext, memory: Memory, serve: str, publish: str, *, by_variable: bool) -> None:
         launch = context.launch
@@ -217,7 +217,7 @@ class _TranslatorPort(ZmqServerPort):
         self._poller.register(self._sub, self._packets)
 
     def run(self, stop: _Stop) -> bool:
-        """Run until the end of the experiment (True), a request to end, or the loss of their translator."""
+        """Run until the end of the experiment (True), a request to end, or the loss of the published translator."""
         stop.bridge = self
         try:
             while not (stop.is_set or self._is_lost):

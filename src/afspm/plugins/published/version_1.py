@@ -1,4 +1,4 @@
-"""Version 1 of the protocol: the messages that its programs can read, and the pace at which they can follow.
+"""Version 1 of the protocol: the messages that its programs can read, and a pace that they can follow.
 
 Any other envelope or request number ends them.
 """
@@ -82,7 +82,7 @@ def unknown_request(number: int, whose: str, request_id: str) -> Response:
 
 
 def topics_meant(prefix: str) -> list[str]:
-    """Return the prefixes that a subscription of version 1 means: a common beginning stands for the messages it knows.
+    """Return the prefixes that a subscription of version 1 means: a common beginning stands for its known messages.
 
     >>> topics_meant("Scan")
     ['Scan2d', 'ScanParameters2d']
@@ -109,13 +109,13 @@ class Pacing:
         """Add a packet.
 
         Args:
-            message: its kind.
+            message: the name of its message.
             state: the state in a ScopeStateMsg; None for others.
         """
         self._waiting.append((packet, message, state))
 
     def hold(self, until_s: float) -> None:
-        """Hold all packets until then: a late joiner still has to get earlier ones."""
+        """Hold all packets until a time, so that a late joiner first gets earlier packets."""
         self._held_until_s = max(self._held_until_s, until_s)
 
     def take(self, now_s: float) -> list[Packet]:
@@ -135,7 +135,7 @@ class Pacing:
 
     @property
     def due_s(self) -> float:
-        """Time of the next packet; infinity: none waits."""
+        """Return the time of the next packet; infinity if none waits."""
         if not self._waiting:
             return math.inf
         _, message, state = self._waiting[0]

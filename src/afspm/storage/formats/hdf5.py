@@ -1,4 +1,4 @@
-"""Safe access to HDF5 files: damaged sizes and parts in other files are refused."""
+"""Safe access to HDF5 files: damaged sizes and links to other files are refused."""
 
 from __future__ import annotations
 

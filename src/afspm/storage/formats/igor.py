@@ -76,9 +76,7 @@ def read_wave(data: bytes) -> Wave:
 
 
 def decoded(text: bytes) -> str:
-    """Return text from bytes: Igor 7 and later write UTF-8, older versions the system's encoding, here taken as
-    Latin-1.
-    """
+    """Return text from bytes: UTF-8 as of Igor 7, else Latin-1 in place of the unknown system's encoding."""
     try:
         return text.decode("utf-8")
     except UnicodeDecodeError:

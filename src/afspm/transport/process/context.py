@@ -55,7 +55,7 @@ class ProcessActivity:
 
 
 def new_session(run: str) -> str:
-    """Return a random identity of this life of a process, after the identity of its run, if known."""
+    """Return a random identity for this life of a process, preceded by the identity of its run, if known."""
     return "-".join(filter(None, [run, os.urandom(4).hex()]))
 
 
@@ -71,14 +71,14 @@ class ProcessContext:
     Attributes:
         launch: the launch line of the process.
         clock: the experiment's clock.
-        open_port: connects to the experiment as a component does (scheduler and translators have their own sockets); a
-            tuple of envelopes replaces those of the launch line.
+        open_port: connects to the experiment as a component (scheduler and translators have their own sockets); a tuple
+            of envelopes replaces the envelopes of the launch line.
         log: logger of the process; its records go to the supervisor, and to the log collector if there is one.
         activity: marks steps that take time.
         when_stopping: registers a callback, called from another thread when the parent is gone or stops the process (a
             port made by `open_port` gets an event anyway).
-        tip_in_danger: registers a function, called from another thread at that moment, that returns whether the tip
-            needs attention, which takes longer than an ordinary end may.
+        tip_in_danger: registers a function that returns whether the tip needs attention, which takes longer than an
+            ordinary end. It is called from another thread at a stop.
         session: differs between two lives of a process, for ids that must not collide.
         problems: the problems of the experiment by name.
 

@@ -50,12 +50,12 @@ _REFUSED_AGAIN = {
 def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> str:
     """Return the message of an exception, followed by the lines of code that led to it.
 
-    afspm's frames above the user's are left out; for a deliberate refusal also those below. An error from afspm's code
-    alone is shown with all frames, unless it was foreseen.
+    Frames of afspm above the user's are left out; for a deliberate refusal also the frames below. An error from afspm's
+    code alone is shown with all frames, unless it was foreseen.
 
     Args:
         name: name of the component, which is left out of the message.
-        package: folder of afspm's code.
+        package: path of the folder with afspm's code.
     """
     trace = traceback.TracebackException.from_exception(error)
     if isinstance(error, AfspmError) and all(_is_passage(frame, package) for frame in trace.stack):
@@ -75,7 +75,7 @@ def describe(error: BaseException, name: str = "", package: Path = PACKAGE) -> s
 
 
 def may_pass(error: BaseException) -> bool:
-    """Return whether an error may pass by itself, as one of controller or computer, unlike a fault of the code."""
+    """Return whether an error may pass by itself, such as a failure of the controller, unlike a fault of the code."""
     if isinstance(error, Refused):
         return error.response not in _REFUSED_AGAIN
     return isinstance(error, (RequestError, FileError, TransportError, OSError, MemoryError))

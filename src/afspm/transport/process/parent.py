@@ -1,6 +1,6 @@
 """The bond to the parent process: its end of the standard input of this process.
 
-It closes when the parent stops the process, and when the parent dies in any way, on every system.
+The pipe closes when the parent stops the process, and when the parent dies in any way, on every system.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _CHUNK = 1 << 16
 
 
 def leave_interrupts_to_parent() -> None:
-    """Ignore Ctrl-C and Windows' Ctrl-Break: they reach the whole terminal, and the parent decides what to end."""
+    """Ignore Ctrl-C and Windows' Ctrl-Break: they reach the whole terminal, and the parent ends its processes."""
     for name in ("SIGINT", "SIGBREAK"):
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
@@ -41,7 +41,7 @@ def take_standard_input() -> int:
 def read_launch_line(pipe: int) -> bytes:
     """Return the first line of a pipe; empty if the pipe ends before.
 
-    It bypasses Python's buffered reader: a thread that waits in that would block the end of the interpreter.
+    The read bypasses Python's buffered reader: a thread that waits in it would block the end of the interpreter.
     """
     line = bytearray()
     while (chunk := os.read(pipe, _CHUNK)) and b"\n" not in chunk:

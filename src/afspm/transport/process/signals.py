@@ -15,7 +15,7 @@ ENDING = (*CTRL_C, "SIGTERM", "SIGBREAK", "SIGHUP")
 
 @contextmanager
 def caught(tell: Callable[[int], None], wakeup_fd: int, names: Sequence[str] = ENDING) -> Iterator[None]:
-    """Pass signals that end a program to `tell` while in this block, and write to `wakeup_fd` with each.
+    """Pass signals that end a program to `tell` within this block; each also writes to `wakeup_fd`.
 
     A signal that is already ignored (SIGHUP under nohup) stays ignored. Outside the main thread Python delivers no
     signals, and this does nothing.

@@ -35,7 +35,8 @@ class AsylumEmulator(Emulator):
     """The emulated microscope.
 
     Args:
-        idle_s: real seconds between two idle moments of Igor; one call is executed at each. 0: at once.
+        idle_s: real seconds between two idle moments of Igor, with one call executed at each; 0: calls are executed at
+            once.
         start_s: duration of the ramp to the first line, experiment time.
         file_s: delay between the end of a measurement and the first half of its file, and between both halves.
         save_path: Igor's name of the data folder, "C:Users:Me:Data:". Default: the folder's own path.

@@ -1,4 +1,4 @@
-"""Asylum's software: the effects of its functions, and the scans and curves that go on meanwhile."""
+"""Asylum's software: the effects of its functions, and the running scans and curves."""
 
 from __future__ import annotations
 

@@ -38,11 +38,10 @@ class ParkEmulator(ScriptedEmulator):
         errors: place of a script's error in a reply: JSON-RPC's "error", the "result", or the "value" alone ("rpc",
             "result", "value").
         values: form of values: "text", or "native".
-        replies: time of the reply to a script that waits for the instrument: "at-end", or "at-once" and without a
-            value.
+        replies: time of the reply to a script that waits for the instrument: "at-end", or "at-once" without a value.
         scan_words: answers of `scan_query`: scanning, idle.
         reports_gains: True if the gains of the feedback can be read, False if only set.
-        start_s: duration of the ramp to the first line, experiment time.
+        start_s: duration of the ramp to the first line, in experiment time.
         file_s: delay between the end of a measurement and the first half of its file, and between both halves.
         seed, faults, and the simulated world: settings of every emulator.
     """

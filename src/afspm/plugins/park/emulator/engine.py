@@ -1,7 +1,7 @@
 """JavaScript scripts, each in an engine of its own, that wait for the instrument without blocking others.
 
-An engine can't be left in the middle of a script, so each has a thread. The emulator's own thread executes what a
-script requests of the instrument, and takes turns with the script's thread.
+An engine can't be left in the middle of a script, so each engine has a thread. The emulator's own thread executes the
+requests of a script to the instrument, and takes turns with the script's thread.
 """
 
 from __future__ import annotations
@@ -85,12 +85,14 @@ class Script:
 
     @property
     def waits(self) -> bool:
-        """True while the script waits for the instrument."""
+        """Return true while the script waits for the instrument."""
         return self._wait is not None
 
     @property
     def computes_for_s(self) -> float:
-        """Real seconds left for computing before the script is ended; infinite while it waits for the instrument."""
+        """Return the real seconds left for computing before the script is ended; infinite during a wait for the
+        instrument.
+        """
         return math.inf if self.waits else self._computes_since_s + LONGEST_S - time.monotonic()
 
     def end(self) -> None:

@@ -132,7 +132,7 @@ class SmartScanProgram(MakerProgram):
 
     @property
     def names(self) -> str:
-        """The names below `spm`, as JSON."""
+        """Return the names below `spm` as JSON."""
         return json.dumps({"values": [*self._values, *self._reported], "methods": list(self._methods)})
 
     def ask(self, kind: str, path: str, given: list[Any]) -> object:
