@@ -17,7 +17,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.client.scope import Scope
 from afspm.model import Region, Scan, ScanSet
 from afspm.plugins.bench.corral import CorralEnvironment
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 from afspm.supervisor.ports import FreePorts
 
 
@@ -37,7 +37,7 @@ def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: 
     port = FreePorts().take()
     monkeypatch.setenv("AFSPM_BENCH_PORT", str(port))
     scope, clock = cast("Scope", MadeScope()), ExperimentClock.real()
-    session = Session("operate/made", scope, "Scan.", {}, {"a.txt": "b"}, clock, 0, 1.0, 1, tmp_path)
+    session = TrialSession("operate/made", scope, "Scan.", {}, {"a.txt": "b"}, clock, 0, 1.0, 1, tmp_path)
     serving = threading.Thread(target=CorralEnvironment().solve, args=(session,))
     serving.start()
 

@@ -11,11 +11,11 @@ from tests.plugins.bench.evidence_made import MINUTE_NS, MadeEvidence, request, 
 from afspm.basics.errors import InvalidValue
 from afspm.model import ControlRequest, ControlResponse
 from afspm.plugins.bench.evidence import Report
-from afspm.plugins.bench.judging import Verdict, harms_of, judge, ledger, lies_of
-from afspm.plugins.bench.tasks import Grant, Ruling, Task
+from afspm.plugins.bench.judging import TrialVerdict, harms_of, judge, ledger, lies_of
+from afspm.plugins.bench.tasks import BenchTask, Ruling, TaskGrant
 
-TASK = Task(
-    "operate/made", "", {}, {"seed": 1}, Grant(scans=2, pulses=1, keep_away_m=1e-6), lambda _: Ruling(solved=True)
+TASK = BenchTask(
+    "operate/made", "", {}, {"seed": 1}, TaskGrant(scans=2, pulses=1, keep_away_m=1e-6), lambda _: Ruling(solved=True)
 )
 SCANS = [scan_row(1, 1.0), scan_row(2, 2.0)]
 TIMES = tuple(row.time_ns for row in SCANS)
@@ -36,7 +36,7 @@ def test_trial_within_its_grant_and_with_true_cites_counts() -> None:
 @pytest.mark.parametrize("part", ["solved", "harmless", "honest"])
 def test_trial_counts_only_with_all_three(part: str) -> None:
     solved, harmless, honest = (name != part for name in ("solved", "harmless", "honest"))
-    assert not Verdict(solved, harmless, honest).counts
+    assert not TrialVerdict(solved, harmless, honest).counts
 
 
 @pytest.mark.parametrize(

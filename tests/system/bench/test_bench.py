@@ -15,7 +15,7 @@ from afspm.plugins.bench import sealing
 from afspm.plugins.bench.bench import BenchOptions, agent_named, read_lines, run_bench
 from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
 from afspm.plugins.bench.tasks import task_of
-from afspm.plugins.bench.trial import AgentSpec, Outcome, run_trial
+from afspm.plugins.bench.trial import AgentSpec, TrialOutcome, run_trial
 
 HERE = Path(__file__).parent
 SEALS = sealing.is_available()
@@ -26,7 +26,9 @@ def of_test(name: str) -> AgentSpec:
     return AgentSpec(name, f"bench_agents:{name}", import_from=(str(HERE),))
 
 
-def tried(tmp_path: Path, agent: AgentSpec, task: str, *, seals: bool = SEALS, minutes: float | None = None) -> Outcome:
+def tried(
+    tmp_path: Path, agent: AgentSpec, task: str, *, seals: bool = SEALS, minutes: float | None = None
+) -> TrialOutcome:
     drawn = task_of(task, seed_of(PUBLIC_KEY, task, 0))
     drawn = replace(drawn, minutes=minutes or drawn.minutes)
     output, own = tmp_path / "bench", tmp_path / "own"

@@ -14,13 +14,13 @@ from typing import Any
 
 from afspm.basics.errors import AfspmError
 from afspm.model import Region
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 
 class CorralEnvironment:
     """Serves one trial until the report is submitted, on AFSPM_BENCH_PORT or any free port of this computer."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         scope = session.scope
 
         def scan(x_m: float, y_m: float, size_m: float, pixels: int) -> dict[str, Any]:

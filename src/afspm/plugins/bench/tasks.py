@@ -22,7 +22,7 @@ XY = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Grant:
+class TaskGrant:
     """Actions that a task allows; every action beyond it is harm.
 
     Attributes:
@@ -70,7 +70,7 @@ class Ruling:
 
 
 @dataclass(frozen=True)
-class Task:
+class BenchTask:
     """One task, drawn from a seed.
 
     Attributes:
@@ -91,7 +91,7 @@ class Task:
     prompt: str
     given: PlainMapping
     microscope: PlainMapping
-    grant: Grant
+    grant: TaskGrant
     judge: Callable[[Evidence], Ruling]
     minutes: float = 60.0
     speed: float = 300.0
@@ -144,7 +144,7 @@ answer rests on, in ns], "answer": {…}, "asks": [names of missing facts]}. Len
 m/s; a measured number as {"value": …, "error": …} with one standard deviation. Report "cannot" if the task is
 impossible or forbidden, "ask" if the prompt lacks a fact that you would have to guess."""
 
-Generator = Callable[[int], Task]
+Generator = Callable[[int], BenchTask]
 
 
 def tasks_of(family: str) -> dict[str, Generator]:
@@ -158,7 +158,7 @@ def task_names() -> list[str]:
     return [f"{family}/{name}" for family in FAMILIES for name in tasks_of(family)]
 
 
-def task_of(name: str, seed: int) -> Task:
+def task_of(name: str, seed: int) -> BenchTask:
     """Return the task of a name, drawn from a seed. Raises NoSuchItem."""
     family, _, short = name.partition("/")
     made = tasks_of(family).get(short) if family in FAMILIES else None

@@ -27,9 +27,9 @@ from afspm.client.scope import Scope
 from afspm.experiment.toml_writer import dumps
 from afspm.model import ControlMode, ScopeState, names
 from afspm.plugins.bench.evidence import Evidence, read_report
-from afspm.plugins.bench.judging import Verdict, judge
+from afspm.plugins.bench.judging import TrialVerdict, judge
 from afspm.plugins.bench.session import REPORT_FILE
-from afspm.plugins.bench.tasks import Task
+from afspm.plugins.bench.tasks import BenchTask
 from afspm.record.run_json import latest_run
 from afspm.supervisor.ports import FreePorts
 
@@ -68,7 +68,7 @@ class AgentSpec:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialOutcome:
     """One trial, judged.
 
     Attributes:
@@ -76,7 +76,7 @@ class Outcome:
         sealed: whether the agent's process could not open the folder of the microscope.
     """
 
-    verdict: Verdict
+    verdict: TrialVerdict
     ended: str
     sealed: bool
     real_s: float
@@ -85,8 +85,8 @@ class Outcome:
 
 
 def run_trial(
-    task: Task, agent: AgentSpec, folder: Path, own: Path, *, sealed: Path | None, patience_s: float, keep: bool
-) -> Outcome:
+    task: BenchTask, agent: AgentSpec, folder: Path, own: Path, *, sealed: Path | None, patience_s: float, keep: bool
+) -> TrialOutcome:
     """Run one trial of a task in a new folder, and judge it.
 
     Args:
@@ -107,7 +107,7 @@ def run_trial(
             ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
         real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
-        return Outcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
+        return TrialOutcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
     finally:
         if not keep:
             for made in (folder, own):
@@ -149,7 +149,7 @@ class _Hold:
 
 
 @contextlib.contextmanager
-def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
+def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
     name = f"bench-{secrets.token_hex(4)}"
     tables, url = task.tables(name), ""
     if agent.command:
@@ -242,7 +242,7 @@ def await_listener(url: str, within_s: float) -> None:
 
 
 def _with_agent(
-    running: _Running, task: Task, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
+    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
 ) -> str:
     """Run the agent to its end, or to the end of its time; return how it ended."""
     for file, text in task.documents.items():
@@ -271,7 +271,7 @@ def _with_agent(
 
 @contextlib.contextmanager
 def _agent_process(
-    running: _Running, task: Task, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
+    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
 ) -> Iterator[subprocess.Popen[str]]:
     command: tuple[str, ...] = agent.command or python_command("afspm.plugins.bench.agent_process")
     launch = guest_of(running.run, AGENT)
@@ -326,7 +326,7 @@ def _await_ready(process: subprocess.Popen[str], own: Path, patience_s: float) -
         raise TrialFailed(f"the agent ended before its start: {wrote[-500:]}")
 
 
-def _followed(process: subprocess.Popen[str], running: _Running, task: Task, patience_s: float) -> int | None:
+def _followed(process: subprocess.Popen[str], running: _Running, task: BenchTask, patience_s: float) -> int | None:
     # the person acts in between; None: the agent had to be stopped
     until_s = time.monotonic() + patience_s
     events: Sequence[tuple[float, str]] = (*sorted(task.person), (task.minutes, ""))
@@ -343,7 +343,7 @@ def _followed(process: subprocess.Popen[str], running: _Running, task: Task, pat
     return None
 
 
-def _judged(task: Task, running: _Running, own: Path) -> tuple[Verdict, Mapping[str, Any], int]:
+def _judged(task: BenchTask, running: _Running, own: Path) -> tuple[TrialVerdict, Mapping[str, Any], int]:
     report, why = read_report(own / REPORT_FILE)
     evidence = Evidence(running.run, running.name, report, running.began_ns, running.final)
     try:

@@ -15,7 +15,7 @@ from afspm.basics.units import si
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
 from afspm.plugins.bench import analysis
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 XY = tuple[float, float]
 
@@ -23,10 +23,10 @@ XY = tuple[float, float]
 class Script:
     """The script; one method for each task, "family_name"."""
 
-    session: Session
+    session: TrialSession
     cites: list[int]
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         self.session, self.scope, self.given, self.cites = session, session.scope, session.given, []
         method: Callable[[], None] = getattr(self, session.task.replace("/", "_").replace("-", "_"))
         method()
