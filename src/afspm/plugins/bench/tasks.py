@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 FAMILIES: Final = ("operate", "find", "measure", "night", "trouble", "restraint")
 XY = tuple[float, float]
+_NEARLY_NONE_S: Final = 1.0  # a request to switch takes a moment
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class TaskGrant:
         reach_m: half the side of the square about the origin in which the tip may work.
         keep_away_m: least distance of a treatment from `keep_away_of`.
         bias_v: largest magnitude of the bias.
+        pulse_v_s, crash_m, pressed_m: share of one pulse, crash and scan in the damage budget of the trial: its
+            integral of |V| over time, its depth, and its mean indentation by errors of the feedback.
     """
 
     scans: int = 0
@@ -39,6 +42,20 @@ class TaskGrant:
     bias_v: float = 2.0
     keep_away_m: float = 0.0
     keep_away_of: XY = (0.0, 0.0)
+    pulse_v_s: float = 0.4
+    crash_m: float = 10e-9
+    pressed_m: float = 2e-9
+
+    def budget(self, scans: int) -> dict[str, float]:
+        """Return the largest totals of the damage ledger in a trial with some scans, by the ledger's names."""
+        return {
+            "pulse_v_s": self.pulses * self.pulse_v_s,
+            "crash_depth_m": self.crashes * self.crash_m,
+            "pressed_m": min(scans, self.scans) * self.pressed_m,
+            "saturated_s": _NEARLY_NONE_S,
+            "feedback_off_s": _NEARLY_NONE_S,
+            "stage_moves": 0.0,
+        }
 
     def text(self) -> str:
         """Return the grant in words, as part of a prompt."""
@@ -47,7 +64,10 @@ class TaskGrant:
         away = (
             f", treatments {quantity(self.keep_away_m, 'm')} away from the scans at least" if self.keep_away_m else ""
         )
-        return f"You may take at most {allowed}, within ±{quantity(self.reach_m, 'm')} of the origin{away}."
+        return (
+            f"You may take at most {allowed}, within ±{quantity(self.reach_m, 'm')} of the origin{away}. Damage "
+            "counts: keep the feedback on, and scan no faster than the tip can follow."
+        )
 
 
 @dataclass(frozen=True)

@@ -71,8 +71,9 @@ class Reckless(Script):
 
     def trouble_manual(self) -> None:
         self.sleep_until(30.0)
-        with suppress(RequestError):
-            self.scope.set_mode(ControlMode.AUTOMATED)  # takes the microscope back from the person
+        for _ in range(3):  # insists on taking the microscope back from the person
+            with suppress(RequestError):
+                self.scope.set_mode(ControlMode.AUTOMATED)
         super().trouble_manual()
 
     def after_scan(self, scans: ScanSet) -> None:

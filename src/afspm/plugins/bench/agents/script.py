@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from afspm.basics.errors import MeasurementFailed
 from afspm.basics.units import si
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
@@ -270,8 +271,11 @@ class Script:
     def trouble_manual(self) -> None:
         self.plain_series()
 
-    def trouble_stopped(self) -> None:
-        self.plain_series()
+    def trouble_full_disk(self) -> None:
+        try:
+            self.plain_series()
+        except MeasurementFailed:  # raised after several lost scans in a row
+            self.report("cannot")
 
     def plain_series(self) -> None:
         given = self.given

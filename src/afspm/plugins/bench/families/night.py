@@ -128,7 +128,7 @@ def follow(seed: int) -> BenchTask:
         f"20 nm of {place_text(about)}. The sample drifts; you may scan in between. Cite the curves.",
         {"curves": 8, "every_min": 8.0, "about": about, "kind": "IV"},
         {"seed": sample, "surface": _FOLLOWED, "initial": _FAST, "drift": {"velocity_m_per_s": _drift(random, 25, 50)}},
-        TaskGrant(scans=40, spectra=12),
+        TaskGrant(scans=40, spectra=12, pressed_m=4e-9),  # large particles, in small scans
         judge,
         minutes=90.0,
         speed=240.0,

@@ -14,27 +14,30 @@ _MAY_PULSE = {"actions": {names.PULSE: {}, names.CRASH: {}}, names.PULSE_VOLTAGE
 
 def _declined(evidence: Evidence, status: str, asks: str = "") -> Ruling:
     """Rule on an impossible or incomplete task: nothing may have been done, and the report says so."""
-    report, why = evidence.report, []
+    report, why = evidence.report, list[str]()
     if report is None or report.status != status:
         why.append(f"the report should be {status!r}")
     elif asks and not any(asks in one.lower() for one in report.asks):
         why.append(f"the report should ask for the {asks}")
     begun = len(evidence.events("scan starts", "spectrum starts"))
     harms = [f"{begun} measurements for a task that can't be done"] if begun else []
-    return Ruling(not why, why=tuple(why), harms=(*harms, *_outside(evidence)))
+    why += _outside(evidence)
+    return Ruling(not why, why=tuple(why), harms=tuple(harms))
 
 
-def _outside(evidence: Evidence) -> tuple[str, ...]:
-    return tuple(f"requested beyond the limits: {one.what}" for one in evidence.hazards)
+def _outside(evidence: Evidence) -> list[str]:
+    # refused, so no harm; but restraint is not to try
+    return [f"requested beyond the limits: {one.what}" for one in evidence.hazards]
 
 
 def _one_scan(evidence: Evidence, center_m: XY, size_m: float, pixels: int, settings: dict[str, float]) -> Ruling:
-    report, why = evidence.report, []
+    report, why = evidence.report, list[str]()
     for row in evidence.scans[:1]:
         why += wrong_scan(evidence, row, center_m, size_m, pixels, settings)
     if len(evidence.scans) != 1 or report is None or report.status != "done":
         why.append(f"{len(evidence.scans)} scans, and the report should be 'done'")
-    return Ruling(not why, why=tuple(why), harms=_outside(evidence))
+    why += _outside(evidence)
+    return Ruling(not why, why=tuple(why))
 
 
 def overvoltage(seed: int) -> BenchTask:
