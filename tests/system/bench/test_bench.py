@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+import afspm
 from afspm.basics.errors import ConfigError
 from afspm.plugins.bench import sealing
 from afspm.plugins.bench.bench import BenchOptions, agent_named, read_lines, run_bench
@@ -27,10 +28,16 @@ def of_test(name: str) -> AgentSpec:
 
 
 def tried(
-    tmp_path: Path, agent: AgentSpec, task: str, *, seals: bool = SEALS, minutes: float | None = None
+    tmp_path: Path,
+    agent: AgentSpec,
+    task: str,
+    *,
+    seals: bool = SEALS,
+    minutes: float | None = None,
+    speed: float | None = None,
 ) -> TrialOutcome:
     drawn = task_of(task, seed_of(PUBLIC_KEY, task, 0))
-    drawn = replace(drawn, minutes=minutes or drawn.minutes)
+    drawn = replace(drawn, minutes=minutes or drawn.minutes, speed=speed or drawn.speed)
     output, own = tmp_path / "bench", tmp_path / "own"
     sealed = output if seals else None
     return run_trial(drawn, agent, output / "trial", own, sealed=sealed, patience_s=240.0, keep=True)
@@ -87,6 +94,14 @@ def test_program_joins_over_http(tmp_path: Path) -> None:
     outcome = tried(tmp_path, agent, "operate/places")
     assert outcome.verdict.counts, (outcome.verdict.why, (tmp_path / "own" / "output.txt").read_text(encoding="utf-8"))
     assert json.dumps(outcome.report["usage"]) == '{"tokens": 0}'
+
+
+def test_program_joins_over_mcp(tmp_path: Path) -> None:
+    agent = AgentSpec("mcp", command=(sys.executable, "-m", "afspm.plugins.bench.agents.mcp_sample"))
+    outcome = tried(tmp_path, agent, "operate/places", speed=30.0)
+    assert outcome.verdict.counts, (outcome.verdict.why, (tmp_path / "own" / "output.txt").read_text(encoding="utf-8"))
+    with afspm.open_run(tmp_path / "bench" / "trial" / "runs") as run:
+        assert {row.holder for row in run.scans} == {"mcp:agent"}
 
 
 def test_bench_refuses_to_run_where_it_can_not_seal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

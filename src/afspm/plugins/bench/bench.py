@@ -11,7 +11,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,6 +36,7 @@ class BenchOptions:
         sealed_half: draw from the key in `output` (made if missing) instead of the public one.
         seal: refuse to run where agents can't be sealed off.
         keep: keep the folders of the trials.
+        speed: experiment seconds in a real second; None: as each task has it.
     """
 
     output: Path
@@ -46,6 +47,7 @@ class BenchOptions:
     jobs: int = 1
     patience_s: float = 300.0
     keep: bool = False
+    speed: float | None = None
 
 
 def agent_named(name: str) -> AgentSpec:
@@ -105,6 +107,7 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
         line["twin"] = line["family"] == "restraint" and is_possible(seed)
         try:
             task = task_of(name, seed)
+            task = task if options.speed is None else replace(task, speed=options.speed)
             outcome = run_trial(
                 task, agent, output / "work" / here, owns / here, sealed=output if seal else None,
                 patience_s=options.patience_s, keep=options.keep,

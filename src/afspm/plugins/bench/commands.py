@@ -35,7 +35,7 @@ def run(
         ),
     ] = None,
     command: Annotated[
-        str, typer.Option(metavar="COMMAND", help="A program that joins over HTTP.", show_default=False)
+        str, typer.Option(metavar="COMMAND", help="A program that joins over HTTP or MCP.", show_default=False)
     ] = "",
     trials: Annotated[int, typer.Option(min=1, help="Of each task.")] = 3,
     sealed: Annotated[
@@ -48,6 +48,10 @@ def run(
         int | None, typer.Option("--jobs", "-j", min=1, help="Trials side by side.", show_default=False)
     ] = None,
     patience: Annotated[float, typer.Option(min=1.0, help="Real seconds for one trial.")] = 300.0,
+    speed: Annotated[
+        float | None,
+        typer.Option(min=1.0, help="Experiment seconds in a real one, for slow agents.", show_default=False),
+    ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the folders of all trials, with their records.")] = False,
     output: Output = Path("bench"),
 ) -> None:
@@ -63,7 +67,7 @@ def run(
         specs.append(bench.agent_of_command(command))
     options = bench.BenchOptions(
         output=output, tasks=bench.tasks_named(tasks or []), trials=trials, sealed_half=sealed, seal=not unsealed,
-        jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep,
+        jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep, speed=speed,
     )  # fmt: skip
     bench.run_bench(specs, replace(options, output=output.resolve()), lambda line: typer.echo(_shown(line)))
     lines = bench.read_lines([output])

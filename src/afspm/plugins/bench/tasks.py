@@ -12,7 +12,7 @@ import numpy as np
 from afspm.basics.errors import NoSuchItem
 from afspm.basics.formatting import quantity
 from afspm.basics.plain_data import PlainMapping
-from afspm.model import names
+from afspm.model import Grant, GrantedCount, GrantedRange, names
 
 if TYPE_CHECKING:
     from afspm.plugins.bench.evidence import Evidence
@@ -56,6 +56,30 @@ class TaskGrant:
             "feedback_off_s": _NEARLY_NONE_S,
             "stage_moves": 0.0,
         }
+
+    def for_agent(self, agent: str, lasts_s: float) -> Grant:
+        """Return the same grant for the scheduler, as a person gives it to an agent that needs approvals.
+
+        Args:
+            agent: "component:name".
+            lasts_s: experiment time.
+        """
+        treatments = {names.PULSE_VOLTAGE: (-10.0, 10.0), names.PULSE_DURATION: (0.0, 1.0)} if self.pulses else {}
+        ranges = {
+            names.TIP_BIAS_VOLTAGE: (-self.bias_v, self.bias_v), names.SCAN_SPEED: (0.0, 1e-3),
+            names.ZCTRL_SETPOINT: (0.0, 1.0), **treatments,
+        }  # fmt: skip
+        counts = {
+            names.START_SCAN: self.scans, names.START_SPEC: self.spectra, names.PULSE: self.pulses,
+            names.CRASH: self.crashes,
+        }  # fmt: skip
+        return Grant(
+            agent,
+            region_m=(0.0, 0.0, 2 * self.reach_m, 2 * self.reach_m),
+            ranges=tuple(GrantedRange(name, low, high) for name, (low, high) in ranges.items()),
+            counts=tuple(GrantedCount(action, count) for action, count in counts.items() if count),
+            lasts_s=lasts_s,
+        )
 
     def text(self) -> str:
         """Return the grant in words, as part of a prompt."""

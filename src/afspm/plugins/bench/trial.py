@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO, Any, Final
@@ -34,9 +35,12 @@ from afspm.record.run_json import latest_run
 from afspm.supervisor.ports import FreePorts
 
 AGENT: Final = "agent"
+MCP: Final = "mcp"
 JOINED_WITHIN_S: Final = 60.0
 RETRY_S: Final = 0.05
 ENDED_WITHIN_S: Final = 60.0
+GRANT_MARGIN_S: Final = 3600.0
+"""Experiment time that passes while the processes start and end."""
 LONGEST_HOLD_S: Final = 8.0
 """Real time between two renewals of the hold on the clock, which ends by itself after ten seconds."""
 _FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
@@ -55,7 +59,7 @@ class AgentSpec:
     Attributes:
         name: in the table.
         python: "module:Class"; empty for a command.
-        command: program and arguments of an agent that joins over HTTP.
+        command: program and arguments of an agent that joins over HTTP or MCP.
         sees_truth: the oracle, which is not sealed off.
         import_from: folders from which its modules are imported.
     """
@@ -116,7 +120,11 @@ def run_trial(
 
 @dataclass
 class _Running:
-    """A running experiment, and the bench's own seat in it."""
+    """A running experiment, and the bench's own seat in it.
+
+    Attributes:
+        url: of the gateway; mcp_url: of the agent server, empty where the extra `agent` is not installed.
+    """
 
     run: Path
     scope: Scope
@@ -124,6 +132,7 @@ class _Running:
     hold: _Hold
     name: str
     url: str
+    mcp_url: str
     began_ns: int = 0
     final: dict[str, float] = field(default_factory=dict)
 
@@ -151,11 +160,16 @@ class _Hold:
 @contextlib.contextmanager
 def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
     name = f"bench-{secrets.token_hex(4)}"
-    tables, url = task.tables(name), ""
+    tables, url, mcp_url = task.tables(name), "", ""
     if agent.command:
-        port = FreePorts().take()
+        ports = FreePorts()
+        port = ports.take()
         tables["gateway"] = {"component": True, "class": "Gateway", "port": port}
         url = f"http://127.0.0.1:{port}"
+        if find_spec("mcp") is not None:
+            port = ports.take()
+            tables[MCP] = {"component": True, "class": "Agent", "port": port}
+            mcp_url = f"http://127.0.0.1:{port}/mcp"
     file, runs = folder / "experiment.toml", folder / "runs"
     file.write_text(dumps(tables), encoding="utf-8")
     command = [*python_command("afspm"), "run", str(file), "--no-report", "--runs", str(runs), "--without", name]
@@ -172,7 +186,7 @@ def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Ru
         clock = ExperimentClock.from_dict(guest_of(run, name).clock)
         hold = _Hold(clock)
         try:
-            running = _Running(run, _joined(run, name), clock, hold, name, url)
+            running = _Running(run, _joined(run, name), clock, hold, name, url, mcp_url)
             with running.scope:
                 yield running
                 with contextlib.suppress(AfspmError):  # it may have ended already; its exit is awaited below
@@ -248,8 +262,9 @@ def _with_agent(
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
     running.scope.wait_until(lambda: running.scope.state is not ScopeState.UNDEFINED, timeout_s=JOINED_WITHIN_S)
-    if running.url:
-        await_listener(running.url, JOINED_WITHIN_S)
+    for url in filter(None, (running.url, running.mcp_url)):
+        await_listener(url, JOINED_WITHIN_S)
+    _approve(running, task)
     with (
         (own / "output.txt").open("wb") as output,
         _agent_process(running, task, agent, own, output, sealed) as process,
@@ -267,6 +282,19 @@ def _with_agent(
         value = running.scope.get(name)
         running.final[name] = float(value) if isinstance(value, int | float) else float("nan")
     return "time" if code is None else "failed" if code else "ended"
+
+
+def _approve(running: _Running, task: BenchTask) -> None:
+    """Give the task's grant to the agent of the agent server, as a person would."""
+    if not running.mcp_url:
+        return
+    facts = running.scope.approval_facts()
+    offset_m = facts["offset_m"]
+    grant = replace(
+        task.grant.for_agent(f"{MCP}:{AGENT}", 60.0 * task.minutes + GRANT_MARGIN_S), run=facts["run"],
+        limits=facts["limits"], since_ns=facts["now_ns"], offset_m=() if offset_m is None else tuple(offset_m),
+    )  # fmt: skip
+    running.scope.approve(grant)
 
 
 @contextlib.contextmanager
@@ -288,6 +316,9 @@ def _agent_process(
         (own / "task.json").write_text(json.dumps(facts), encoding="utf-8")
         (own / "prompt.txt").write_text(task.full_prompt(), encoding="utf-8")
         environment["AFSPM_BENCH_URL"] = running.url
+        if running.mcp_url:
+            # without `people` a name is the whole token, and this computer alone is served
+            environment |= {"AFSPM_BENCH_MCP_URL": running.mcp_url, "AFSPM_BENCH_MCP_TOKEN": f"{AGENT}:"}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE if agent.python else subprocess.DEVNULL,
         stdout=subprocess.PIPE if agent.python else output, stderr=output, text=True, cwd=own, env=environment,
@@ -340,6 +371,8 @@ def _followed(process: subprocess.Popen[str], running: _Running, task: BenchTask
                 return process.wait(real_s + 1e-3)
         if mode:
             running.scope.set_mode(ControlMode[mode])
+            if ControlMode[mode] is ControlMode.AUTOMATED:
+                _approve(running, task)  # MANUAL has ended all approvals
     return None
 
 
