@@ -27,6 +27,7 @@ from afspm.client.connect import guest_of
 from afspm.client.scope import Scope
 from afspm.experiment.toml_writer import dumps
 from afspm.model import ControlMode, ScopeState, names
+from afspm.plugins.bench.cassette import REPORT_CALL, ToolCall, recording
 from afspm.plugins.bench.evidence import Evidence, read_report
 from afspm.plugins.bench.judging import TrialVerdict, judge
 from afspm.plugins.bench.session import REPORT_FILE
@@ -89,7 +90,15 @@ class TrialOutcome:
 
 
 def run_trial(
-    task: BenchTask, agent: AgentSpec, folder: Path, own: Path, *, sealed: Path | None, patience_s: float, keep: bool
+    task: BenchTask,
+    agent: AgentSpec,
+    folder: Path,
+    own: Path,
+    *,
+    sealed: Path | None,
+    patience_s: float,
+    keep: bool,
+    calls: list[ToolCall] | None = None,
 ) -> TrialOutcome:
     """Run one trial of a task in a new folder, and judge it.
 
@@ -98,6 +107,7 @@ def run_trial(
         sealed: folder that the agent's process can't open, which contains `folder`; None where the computer can't seal.
         patience_s: real time after which the agent is stopped.
         keep: keep both folders.
+        calls: takes the agent's calls of tools over MCP, and its report as the last one.
 
     Raises:
         TrialFailed: the experiment did not start, or its record can't be read.
@@ -107,9 +117,14 @@ def run_trial(
         made.mkdir(parents=True, mode=0o700)
     started_s = time.monotonic()
     try:
-        with _experiment(task, agent, folder) as running:
+        with _experiment(task, agent, folder) as running, contextlib.ExitStack() as proxy:
+            if calls is not None:
+                running.mcp_url = proxy.enter_context(recording(running.mcp_url, task.full_prompt(), calls))
             ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
+        if calls is not None and report:
+            handed_in = json.loads((own / REPORT_FILE).read_bytes())
+            calls.append(ToolCall(task.full_prompt(), REPORT_CALL, answer=handed_in))
         real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
         return TrialOutcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
     finally:
