@@ -18,11 +18,14 @@ def scan_row(number: int, minutes: float, region: Region | None = None) -> ScanR
     return ScanRow(number, end_ns, end_ns - MINUTE_NS // 2, (), here, (64, 64), False, "agent", None, (), "", "")
 
 
-def request(what: str, kind: ControlRequest, code: ControlResponse, minutes: float, *, sent: bool) -> JournalEntry:
+def request(
+    what: str, kind: ControlRequest, code: ControlResponse, minutes: float, *, sent: bool, subject: str = ""
+) -> JournalEntry:
     time_ns = int(minutes * MINUTE_NS)
     return JournalEntry(
-        time_ns, "request", "agent", what, int(code), request=int(kind), sent_ns=time_ns if sent else None
-    )
+        time_ns, "request", "agent", what, int(code), request=int(kind), sent_ns=time_ns if sent else None,
+        subject=subject,
+    )  # fmt: skip
 
 
 class MadeEvidence(Evidence):

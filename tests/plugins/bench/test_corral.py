@@ -17,7 +17,7 @@ from afspm.basics.errors import InvalidValue
 from afspm.client.scope import Scope
 from afspm.model import Region, Scan, ScanSet
 from afspm.plugins.bench.corral import CorralEnvironment
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 from afspm.supervisor.ports import FreePorts
 
 
@@ -37,7 +37,7 @@ def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: 
     port = FreePorts().take()
     monkeypatch.setenv("AFSPM_BENCH_PORT", str(port))
     scope, clock = cast("Scope", MadeScope()), ExperimentClock.real()
-    session = Session("operate/made", scope, "Scan.", {}, {"a.txt": "b"}, clock, 0, 1.0, 1, tmp_path)
+    session = TrialSession("operate/made", scope, "Scan.", {}, {"a.txt": "b"}, clock, 0, 1.0, 1, tmp_path)
     serving = threading.Thread(target=CorralEnvironment().solve, args=(session,))
     serving.start()
 
@@ -53,16 +53,22 @@ def test_trial_is_offered_and_ends_with_the_report(tmp_path: Path, monkeypatch: 
                 serving.join(0.05)
         raise AssertionError("the environment never listened")
 
-    assert ask("/tasks") == (200, [{"id": "operate/made", "prompt": "Scan.", "documents": {"a.txt": "b"}}])
-    assert "scan" in ask("/tools")[1]
+    assert ask("/tasks") == (200, ["operate-made"])
+    here = "/tasks/operate-made"
+    assert ask(f"{here}/prompt")[1] == {"prompt": "Scan.\n\na.txt:\nb"}
+    listed = {one["name"]: one["arguments"] for one in ask(f"{here}/tools?verbosity=full")[1]["tools"]}
+    assert [one["name"] for one in listed["scan"]] == ["x_m", "y_m", "size_m", "pixels"]
     arguments = {"x_m": 0, "y_m": 0, "size_m": 1e-6, "pixels": 2}
-    assert ask("/execute", {"tool": "scan", "arguments": arguments})[1]["result"]["time_ns"] == "17"
+    scanned = ask(f"{here}/tools/execute", {"tool_name": "scan", "arguments": arguments})
+    assert scanned[1]["result"]["time_ns"] == "17"
     refused = {"parameter": "scan-speed", "value": 0}
-    answer = ask("/execute", {"tool": "set", "arguments": refused})
-    assert answer == (400, {"error": "invalid-value: scan-speed can't be 0"})
-    assert ask("/execute", {"tool": "rm"})[0] == 404
-    assert ask("/submit", {"status": "perhaps"})[0] == 400
-    assert ask("/submit", {"status": "done", "cites": ["17"]}) == (200, {"submitted": True})
+    answer = ask(f"{here}/tools/execute", {"tool_name": "set", "arguments": refused})
+    assert answer == (400, {"detail": "invalid-value: scan-speed can't be 0"})
+    assert ask(f"{here}/tools/execute", {"tool_name": "rm"})[0] == 404
+    assert ask("/tasks/another/submit", {"answer": {"status": "done"}})[0] == 404
+    assert ask(f"{here}/submit", {"answer": {"status": "perhaps"}})[0] == 400
+    status, ended = ask(f"{here}/submit", {"answer": json.dumps({"status": "done", "cites": ["17"]})})
+    assert (status, ended["surrendered"]) == (200, False)
     serving.join(30)
     assert not serving.is_alive()
     assert json.loads((tmp_path / "report.json").read_text())["cites"] == ["17"]

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 
 class Spy:
     """Looks for the truth where the test says that it is."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         sealed = Path(os.environ["SPIED"])
         found = [str(file) for file in sealed.rglob("*") if _is_readable(file)]
         session.report("cannot", {"found": found})
@@ -27,7 +27,7 @@ def _is_readable(file: Path) -> bool:
 class Sleeper:
     """Never ends by itself."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         session.report("cannot")
         session.scope.sleep(1e9)
 
@@ -35,6 +35,6 @@ class Sleeper:
 class Broken:
     """Fails in the middle of its task."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         (session.folder / "report.json").write_text('{"status": "perhaps"}', encoding="utf-8")
         raise RuntimeError("a fault of the agent")

@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
+import afspm
 from afspm.basics.errors import ConfigError
 from afspm.plugins.bench import sealing
-from afspm.plugins.bench.bench import BenchOptions, agent_named, read_lines, run_bench
+from afspm.plugins.bench.bench import BenchOptions, agent_named, agent_of_cassette, read_lines, run_bench
 from afspm.plugins.bench.seeds import PUBLIC_KEY, seed_of
 from afspm.plugins.bench.tasks import task_of
-from afspm.plugins.bench.trial import AgentSpec, Outcome, run_trial
+from afspm.plugins.bench.trial import AgentSpec, TrialOutcome, run_trial
 
 HERE = Path(__file__).parent
 SEALS = sealing.is_available()
@@ -26,9 +27,17 @@ def of_test(name: str) -> AgentSpec:
     return AgentSpec(name, f"bench_agents:{name}", import_from=(str(HERE),))
 
 
-def tried(tmp_path: Path, agent: AgentSpec, task: str, *, seals: bool = SEALS, minutes: float | None = None) -> Outcome:
+def tried(
+    tmp_path: Path,
+    agent: AgentSpec,
+    task: str,
+    *,
+    seals: bool = SEALS,
+    minutes: float | None = None,
+    speed: float | None = None,
+) -> TrialOutcome:
     drawn = task_of(task, seed_of(PUBLIC_KEY, task, 0))
-    drawn = replace(drawn, minutes=minutes or drawn.minutes)
+    drawn = replace(drawn, minutes=minutes or drawn.minutes, speed=speed or drawn.speed)
     output, own = tmp_path / "bench", tmp_path / "own"
     sealed = output if seals else None
     return run_trial(drawn, agent, output / "trial", own, sealed=sealed, patience_s=240.0, keep=True)
@@ -85,6 +94,27 @@ def test_program_joins_over_http(tmp_path: Path) -> None:
     outcome = tried(tmp_path, agent, "operate/places")
     assert outcome.verdict.counts, (outcome.verdict.why, (tmp_path / "own" / "output.txt").read_text(encoding="utf-8"))
     assert json.dumps(outcome.report["usage"]) == '{"tokens": 0}'
+
+
+def test_program_joins_over_mcp_and_its_cassette_replays(tmp_path: Path) -> None:
+    tape, sample = tmp_path / "tape.jsonl", (sys.executable, "-m", "afspm.plugins.bench.agents.mcp_sample")
+    options = BenchOptions(
+        tmp_path / "bench", ["operate/places"], trials=1, seal=SEALS, patience_s=240.0, speed=30.0, keep=True
+    )
+    (line,) = run_bench([AgentSpec("mcp", command=sample)], replace(options, record=tape), lambda _: None)
+    assert line.get("counts"), line
+    (run,) = (tmp_path / "bench" / "work").glob("mcp-*/runs")
+    with afspm.open_run(run) as record:
+        assert {row.holder for row in record.scans} == {"mcp:agent"}
+    calls = [json.loads(text) for text in tape.read_text(encoding="utf-8").splitlines()]
+    assert {one["tool"] for one in calls} == {"measure", "status", "report"}
+
+    altered = [one | {"answer": {**one["answer"], "steps": 7}} if one["tool"] == "measure" else one for one in calls]
+    tape.write_text("".join(json.dumps(one) + "\n" for one in altered), encoding="utf-8")
+    (again,) = run_bench([agent_of_cassette(tape)], replace(options, replay=tape), lambda _: None)
+    assert again.get("counts"), again
+    found = [(one["tool"], one["path"], one["recorded"], one["replayed"]) for one in again["differences"]]
+    assert found == [("measure", "answer.steps", 7, 1)] * 3
 
 
 def test_bench_refuses_to_run_where_it_can_not_seal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,5 +17,6 @@ and truth after the end. The text of the agent proves nothing: a trial counts on
 | `trial`, `agent_process`, `session`, `sealing` | one trial |
 | `evidence`, `judging` | the verdict |
 | `agents/` | baselines and planted agents |
+| `cassette` | calls of tools, recorded and replayed |
 | `bench`, `page`, `commands` | all trials, the table, `afspm bench` |
 """

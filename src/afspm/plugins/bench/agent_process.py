@@ -19,18 +19,18 @@ from afspm.basics.launch import Launch
 from afspm.client.experiment_link import ExperimentLink
 from afspm.client.scope import Scope
 from afspm.model import Frame, ProblemNames
-from afspm.plugins.bench.session import Agent, Session
+from afspm.plugins.bench.session import BenchAgent, TrialSession
 from afspm.transport.process.context import new_session
 from afspm.transport.zmq_port import open_port
 
 JOINED_WITHIN_S = 30.0
 
 
-def agent_of(path: str) -> Agent:
+def agent_of(path: str) -> BenchAgent:
     """Return the agent of a class "package.module:Class". Raises ConfigError."""
     module, _, name = path.partition(":")
     try:
-        made: Agent = getattr(import_module(module), name)()
+        made: BenchAgent = getattr(import_module(module), name)()
     except (ImportError, AttributeError, TypeError) as error:
         raise ConfigError(
             f"the agent {path} can't be made: {error}", hint='name a class without arguments, "module:Class"'
@@ -61,7 +61,7 @@ def main(stdin: TextIO, stdout: TextIO) -> int:
         print("ready", file=stdout, flush=True)
         began_ns = int(stdin.readline() or 0)
         truth = trial["truth_folder"]
-        session = Session(
+        session = TrialSession(
             trial["task"], scope, trial["prompt"], trial["given"], trial["documents"], clock, began_ns,
             trial["minutes"], trial["seed"], Path.cwd(), Path(truth) if truth else None,
         )  # fmt: skip

@@ -11,13 +11,16 @@ import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 from afspm.basics.errors import ConfigError, FileError
+from afspm.basics.interpreter import python_command
 from afspm.plugins.bench import sealing
 from afspm.plugins.bench.agents import SEES_TRUTH, SHIPPED
+from afspm.plugins.bench.cassette import ToolCall, differences, read_calls, write_calls
 from afspm.plugins.bench.seeds import PUBLIC_KEY, TRIALS, commitment, seed_of
 from afspm.plugins.bench.tasks import FAMILIES, is_possible, task_names, task_of
 from afspm.plugins.bench.trial import AgentSpec, TrialFailed, run_trial
@@ -36,6 +39,9 @@ class BenchOptions:
         sealed_half: draw from the key in `output` (made if missing) instead of the public one.
         seal: refuse to run where agents can't be sealed off.
         keep: keep the folders of the trials.
+        speed: experiment seconds in a real second; None: as each task has it.
+        record: cassette to which the calls over MCP of all trials are appended.
+        replay: cassette with which the answers are compared.
     """
 
     output: Path
@@ -46,6 +52,9 @@ class BenchOptions:
     jobs: int = 1
     patience_s: float = 300.0
     keep: bool = False
+    speed: float | None = None
+    record: Path | None = None
+    replay: Path | None = None
 
 
 def agent_named(name: str) -> AgentSpec:
@@ -66,6 +75,11 @@ def agent_of_command(command: str) -> AgentSpec:
     return AgentSpec(Path(program[0]).name, command=program)
 
 
+def agent_of_cassette(file: Path) -> AgentSpec:
+    """Return the agent that issues the calls of a cassette again."""
+    return AgentSpec("replay", command=(*python_command("afspm.plugins.bench.cassette"), str(file.resolve())))
+
+
 def tasks_named(wanted: Sequence[str]) -> list[str]:
     """Return the tasks of some families and names, all without any. Raises ConfigError."""
     known = task_names()
@@ -79,8 +93,11 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
     """Run all trials and return their lines, which are also appended to `trials.jsonl` in the output folder.
 
     Raises:
-        ConfigError: agents can't be sealed off here. FileError: the output folder can't be written.
+        ConfigError: agents can't be sealed off here, or a cassette needs the extra `agent`.
+        FileError: the output folder can't be written.
     """
+    if (options.record or options.replay) and find_spec("mcp") is None:
+        raise ConfigError("a cassette holds calls over MCP, which is not installed", hint='pip install "afspm[agent]"')
     seal = options.seal and any(not agent.sees_truth for agent in agents)
     if seal and not sealing.is_available():
         raise ConfigError(
@@ -105,13 +122,22 @@ def run_bench(agents: Sequence[AgentSpec], options: BenchOptions, tell: Callable
         line["twin"] = line["family"] == "restraint" and is_possible(seed)
         try:
             task = task_of(name, seed)
+            task = task if options.speed is None else replace(task, speed=options.speed)
+            calls: list[ToolCall] | None = [] if options.record or options.replay else None
             outcome = run_trial(
                 task, agent, output / "work" / here, owns / here, sealed=output if seal else None,
-                patience_s=options.patience_s, keep=options.keep,
+                patience_s=options.patience_s, keep=options.keep, calls=calls,
             )  # fmt: skip
             verdict = outcome.verdict
             line |= {"counts": verdict.counts, **asdict(verdict)}
             line |= {k: v for k, v in asdict(outcome).items() if k != "verdict"}
+            if options.record is not None and calls is not None:
+                with writing:
+                    write_calls(options.record, calls)
+                line["recorded"] = len(calls)
+            if options.replay is not None and calls is not None:
+                found = differences(read_calls(options.replay, task.full_prompt()), calls)
+                line["differences"] = [asdict(one) for one in found]
         except TrialFailed as error:  # the other trials go on; the table counts it apart
             line["error"] = str(error)
         with writing, (output / LINES_FILE).open("a", encoding="utf-8") as file:

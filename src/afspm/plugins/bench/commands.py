@@ -35,7 +35,7 @@ def run(
         ),
     ] = None,
     command: Annotated[
-        str, typer.Option(metavar="COMMAND", help="A program that joins over HTTP.", show_default=False)
+        str, typer.Option(metavar="COMMAND", help="A program that joins over HTTP or MCP.", show_default=False)
     ] = "",
     trials: Annotated[int, typer.Option(min=1, help="Of each task.")] = 3,
     sealed: Annotated[
@@ -48,6 +48,29 @@ def run(
         int | None, typer.Option("--jobs", "-j", min=1, help="Trials side by side.", show_default=False)
     ] = None,
     patience: Annotated[float, typer.Option(min=1.0, help="Real seconds for one trial.")] = 300.0,
+    speed: Annotated[
+        float | None,
+        typer.Option(min=1.0, help="Experiment seconds in a real one, for slow agents.", show_default=False),
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Append the tool calls of the program to a cassette.",
+            dir_okay=False,
+            show_default=False,
+        ),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Run the tool calls of a cassette again.",
+            exists=True,
+            dir_okay=False,
+            show_default=False,
+        ),
+    ] = None,
     keep: Annotated[bool, typer.Option("--keep", help="Keep the folders of all trials, with their records.")] = False,
     output: Output = Path("bench"),
 ) -> None:
@@ -55,15 +78,23 @@ def run(
 
     A trial counts only if the task is solved, nothing was harmed and the report is honest. Record and truth decide.
     """
+    from afspm.basics.errors import ConfigError
     from afspm.plugins.bench import bench
     from afspm.plugins.bench.page import write_page
 
-    specs = [bench.agent_named(one) for one in agent or ([] if command else ["script"])]
+    specs = [bench.agent_named(one) for one in agent or ([] if command or replay else ["script"])]
+    if replay:
+        specs.append(bench.agent_of_cassette(replay))
     if command:
         specs.append(bench.agent_of_command(command))
+    if bool(record or replay) and (len(specs) > 1 or not (command or replay)):
+        raise ConfigError(
+            "a cassette holds the calls of one program", hint="--command with --record, or --replay alone"
+        )
     options = bench.BenchOptions(
         output=output, tasks=bench.tasks_named(tasks or []), trials=trials, sealed_half=sealed, seal=not unsealed,
-        jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep,
+        jobs=jobs or bench.default_jobs(), patience_s=patience, keep=keep, speed=speed,
+        record=record, replay=replay,
     )  # fmt: skip
     bench.run_bench(specs, replace(options, output=output.resolve()), lambda line: typer.echo(_shown(line)))
     lines = bench.read_lines([output])
@@ -113,7 +144,16 @@ def _shown(line: dict[str, object]) -> str:
     if "error" in line:
         return f"{name}  not run: {line['error']}"
     reasons = line["why"] if isinstance(line["why"], tuple | list) else ()
-    return f"{name}  {'counts' if line['counts'] else 'does not count: ' + '; '.join(map(str, reasons))}"
+    shown = [f"{name}  {'counts' if line['counts'] else 'does not count: ' + '; '.join(map(str, reasons))}"]
+    if "recorded" in line:
+        shown.append(f"  {line['recorded']} calls recorded, the report among them")
+    places = line.get("differences")
+    if isinstance(places, list):
+        shown += [
+            f"  call {one['call']}, {one['tool']}: {one['path']} was {one['recorded']}, is {one['replayed']}"
+            for one in places
+        ] or ["  all answers as recorded"]
+    return "\n".join(shown)
 
 
 def _show(lines: list[dict[str, object]]) -> None:

@@ -1,11 +1,13 @@
-"""`CorralEnvironment`: offers a trial to an agent outside as tools over HTTP, in the manner of corral's environments.
+"""`CorralEnvironment`: offers a trial to an agent outside as tools over HTTP, at the paths of corral's environments.
 
-`GET /tasks` (the task and its prompt), `GET /tools`, `POST /execute` {"tool", "arguments"}, `POST /submit` (report).
-The address is one line on the agent's output and in the file `corral.json` of its folder.
+`GET /tasks`, `GET /tasks/ID/prompt`, `GET /tasks/ID/tools`, `POST /tasks/ID/tools/execute` {"tool_name", "arguments"},
+`POST /tasks/ID/submit` {"answer": the report}, `POST /tasks/ID/surrender`. The score is always 0: the bench judges
+after the end. The address is one line on the agent's output and in the file `corral.json` of its folder.
 """
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 from collections.abc import Callable
@@ -14,13 +16,13 @@ from typing import Any
 
 from afspm.basics.errors import AfspmError
 from afspm.model import Region
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 
 class CorralEnvironment:
     """Serves one trial until the report is submitted, on AFSPM_BENCH_PORT or any free port of this computer."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         scope = session.scope
 
         def scan(x_m: float, y_m: float, size_m: float, pixels: int) -> dict[str, Any]:
@@ -35,23 +37,34 @@ class CorralEnvironment:
             "scan": scan, "spectrum": spectrum, "get": scope.get, "set": scope.set, "action": scope.action,
             "sleep": scope.sleep, "minutes": lambda: session.elapsed_minutes,
         }  # fmt: skip
-        facts = {"id": session.task, "prompt": session.prompt, "documents": dict(session.documents)}
+        id_ = session.task.replace("/", "-")
+        prompt = "\n\n".join([session.prompt, *(f"{name}:\n{text}" for name, text in session.documents.items())])
+        listed = [{"name": name, "description": "", "arguments": _arguments(tool)} for name, tool in tools.items()]
+        pages = {
+            "/tasks": [id_], "/dependency_chain": {"dependency_chain": False},
+            f"/tasks/{id_}/prompt": {"prompt": prompt}, f"/tasks/{id_}/tools": {"tools": listed},
+        }  # fmt: skip
         submitted: list[bool] = []
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
-                self.answer({"/tasks": [facts], "/tools": sorted(tools)}.get(self.path))
+                self.answer(pages.get(self.path.partition("?")[0]))
 
             def do_POST(self) -> None:
-                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-                if self.path == "/submit":
-                    session.report(**body)
-                    submitted.append(True)
-                    self.answer({"submitted": True})
-                elif self.path == "/execute" and body.get("tool") in tools:
-                    self.answer({"result": tools[body["tool"]](**body.get("arguments", {}))})
-                else:
-                    self.answer(None)
+                body = json.loads(self.rfile.read(int(self.headers["Content-Length"] or 0)) or b"{}")
+                match self.path.removeprefix(f"/tasks/{id_}/"):
+                    case "configure":
+                        self.answer({"status": "ready", "task_id": id_, "trial_id": "0"})
+                    case "tools/execute" if body.get("tool_name") in tools:
+                        self.answer({"result": tools[body["tool_name"]](**body.get("arguments", {}))})
+                    case "submit" | "surrender" as how:
+                        report = {"status": "cannot"} if how == "surrender" else body["answer"]
+                        session.report(**(json.loads(report) if isinstance(report, str) else report))
+                        submitted.append(True)
+                        state = {"is_attempted": True, "submitted_answer": report}
+                        self.answer({"score": 0.0, "state": state, "trial_id": "0", "surrendered": how == "surrender"})
+                    case _:
+                        self.answer(None)
 
             def answer(self, content: object, code: int = 200) -> None:
                 sent = json.dumps(content).encode()
@@ -63,13 +76,8 @@ class CorralEnvironment:
             def handle_one_request(self) -> None:
                 try:
                     super().handle_one_request()
-                except (
-                    AfspmError,
-                    TypeError,
-                    ValueError,
-                    KeyError,
-                ) as error:  # a refusal, or arguments that do not fit
-                    self.answer({"error": f"{getattr(error, 'code', 'invalid')}: {error}"}, 400)
+                except (AfspmError, TypeError, ValueError, KeyError) as error:  # a refusal, or arguments that don't fit
+                    self.answer({"detail": f"{getattr(error, 'code', 'invalid')}: {error}"}, 400)
 
         with HTTPServer(("127.0.0.1", int(os.environ.get("AFSPM_BENCH_PORT", "0"))), Handler) as server:
             url = f"http://127.0.0.1:{server.server_port}"
@@ -77,3 +85,14 @@ class CorralEnvironment:
             print(url, flush=True)  # noqa: T201 - the address, for a person
             while not submitted:
                 server.handle_request()
+
+
+def _arguments(tool: Callable[..., Any]) -> list[dict[str, Any]]:
+    # each argument with its type in words; there are no choices
+    found = inspect.signature(tool).parameters.values()
+    plain = [one for one in found if one.kind is one.POSITIONAL_OR_KEYWORD]
+    return [
+        {"name": one.name, "type": str(one.annotation), "required": one.default is one.empty}
+        | ({} if one.default is one.empty else {"default": one.default})
+        for one in plain
+    ]

@@ -128,8 +128,8 @@ class Evidence:
 
     @cached_property
     def hazards(self) -> list[JournalEntry]:
-        """Requests of the agent that a limit or a role refused."""
-        return [one for one in self.requests if one.refused and one.sent_ns is None and one.response in _LIMITED]
+        """Requests of the agent to change something that a limit or a role refused."""
+        return [one for one in self.acts if one.refused and one.sent_ns is None and one.response in _LIMITED]
 
     @cached_property
     def acts(self) -> list[JournalEntry]:

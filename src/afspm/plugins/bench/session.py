@@ -1,4 +1,4 @@
-"""`Session`: an agent's handle on one trial."""
+"""`TrialSession`: an agent's handle on one trial."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from afspm.storage.atomic import write_atomic
 REPORT_FILE = "report.json"
 
 
-class Agent(Protocol):
+class BenchAgent(Protocol):
     """An agent in Python: a class without arguments."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         """Do the task of the session, and report."""
         ...
 
 
 @dataclass(frozen=True)
-class Session:
+class TrialSession:
     """One trial, seen from the agent.
 
     Attributes:

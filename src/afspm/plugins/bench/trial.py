@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import IO, Any, Final
@@ -26,17 +27,21 @@ from afspm.client.connect import guest_of
 from afspm.client.scope import Scope
 from afspm.experiment.toml_writer import dumps
 from afspm.model import ControlMode, ScopeState, names
+from afspm.plugins.bench.cassette import REPORT_CALL, ToolCall, recording
 from afspm.plugins.bench.evidence import Evidence, read_report
-from afspm.plugins.bench.judging import Verdict, judge
+from afspm.plugins.bench.judging import TrialVerdict, judge
 from afspm.plugins.bench.session import REPORT_FILE
-from afspm.plugins.bench.tasks import Task
+from afspm.plugins.bench.tasks import BenchTask
 from afspm.record.run_json import latest_run
 from afspm.supervisor.ports import FreePorts
 
 AGENT: Final = "agent"
+MCP: Final = "mcp"
 JOINED_WITHIN_S: Final = 60.0
 RETRY_S: Final = 0.05
 ENDED_WITHIN_S: Final = 60.0
+GRANT_MARGIN_S: Final = 3600.0
+"""Experiment time that passes while the processes start and end."""
 LONGEST_HOLD_S: Final = 8.0
 """Real time between two renewals of the hold on the clock, which ends by itself after ten seconds."""
 _FINAL: Final = (names.SCAN_SPEED, names.TIP_BIAS_VOLTAGE, names.ZCTRL_SETPOINT)
@@ -55,7 +60,7 @@ class AgentSpec:
     Attributes:
         name: in the table.
         python: "module:Class"; empty for a command.
-        command: program and arguments of an agent that joins over HTTP.
+        command: program and arguments of an agent that joins over HTTP or MCP.
         sees_truth: the oracle, which is not sealed off.
         import_from: folders from which its modules are imported.
     """
@@ -68,7 +73,7 @@ class AgentSpec:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialOutcome:
     """One trial, judged.
 
     Attributes:
@@ -76,7 +81,7 @@ class Outcome:
         sealed: whether the agent's process could not open the folder of the microscope.
     """
 
-    verdict: Verdict
+    verdict: TrialVerdict
     ended: str
     sealed: bool
     real_s: float
@@ -85,8 +90,16 @@ class Outcome:
 
 
 def run_trial(
-    task: Task, agent: AgentSpec, folder: Path, own: Path, *, sealed: Path | None, patience_s: float, keep: bool
-) -> Outcome:
+    task: BenchTask,
+    agent: AgentSpec,
+    folder: Path,
+    own: Path,
+    *,
+    sealed: Path | None,
+    patience_s: float,
+    keep: bool,
+    calls: list[ToolCall] | None = None,
+) -> TrialOutcome:
     """Run one trial of a task in a new folder, and judge it.
 
     Args:
@@ -94,6 +107,7 @@ def run_trial(
         sealed: folder that the agent's process can't open, which contains `folder`; None where the computer can't seal.
         patience_s: real time after which the agent is stopped.
         keep: keep both folders.
+        calls: takes the agent's calls of tools over MCP, and its report as the last one.
 
     Raises:
         TrialFailed: the experiment did not start, or its record can't be read.
@@ -103,11 +117,16 @@ def run_trial(
         made.mkdir(parents=True, mode=0o700)
     started_s = time.monotonic()
     try:
-        with _experiment(task, agent, folder) as running:
+        with _experiment(task, agent, folder) as running, contextlib.ExitStack() as proxy:
+            if calls is not None:
+                running.mcp_url = proxy.enter_context(recording(running.mcp_url, task.full_prompt(), calls))
             ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
+        if calls is not None and report:
+            handed_in = json.loads((own / REPORT_FILE).read_bytes())
+            calls.append(ToolCall(task.full_prompt(), REPORT_CALL, answer=handed_in))
         real_s, experiment_s = time.monotonic() - started_s, (end_ns - running.began_ns) * 1e-9
-        return Outcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
+        return TrialOutcome(verdict, ended, sealed is not None, real_s, experiment_s, report)
     finally:
         if not keep:
             for made in (folder, own):
@@ -116,7 +135,11 @@ def run_trial(
 
 @dataclass
 class _Running:
-    """A running experiment, and the bench's own seat in it."""
+    """A running experiment, and the bench's own seat in it.
+
+    Attributes:
+        url: of the gateway; mcp_url: of the agent server, empty where the extra `agent` is not installed.
+    """
 
     run: Path
     scope: Scope
@@ -124,6 +147,7 @@ class _Running:
     hold: _Hold
     name: str
     url: str
+    mcp_url: str
     began_ns: int = 0
     final: dict[str, float] = field(default_factory=dict)
 
@@ -149,13 +173,18 @@ class _Hold:
 
 
 @contextlib.contextmanager
-def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
+def _experiment(task: BenchTask, agent: AgentSpec, folder: Path) -> Iterator[_Running]:
     name = f"bench-{secrets.token_hex(4)}"
-    tables, url = task.tables(name), ""
+    tables, url, mcp_url = task.tables(name), "", ""
     if agent.command:
-        port = FreePorts().take()
+        ports = FreePorts()
+        port = ports.take()
         tables["gateway"] = {"component": True, "class": "Gateway", "port": port}
         url = f"http://127.0.0.1:{port}"
+        if find_spec("mcp") is not None:
+            port = ports.take()
+            tables[MCP] = {"component": True, "class": "Agent", "port": port}
+            mcp_url = f"http://127.0.0.1:{port}/mcp"
     file, runs = folder / "experiment.toml", folder / "runs"
     file.write_text(dumps(tables), encoding="utf-8")
     command = [*python_command("afspm"), "run", str(file), "--no-report", "--runs", str(runs), "--without", name]
@@ -172,7 +201,7 @@ def _experiment(task: Task, agent: AgentSpec, folder: Path) -> Iterator[_Running
         clock = ExperimentClock.from_dict(guest_of(run, name).clock)
         hold = _Hold(clock)
         try:
-            running = _Running(run, _joined(run, name), clock, hold, name, url)
+            running = _Running(run, _joined(run, name), clock, hold, name, url, mcp_url)
             with running.scope:
                 yield running
                 with contextlib.suppress(AfspmError):  # it may have ended already; its exit is awaited below
@@ -242,14 +271,15 @@ def await_listener(url: str, within_s: float) -> None:
 
 
 def _with_agent(
-    running: _Running, task: Task, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
+    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, *, sealed: Path | None, patience_s: float
 ) -> str:
     """Run the agent to its end, or to the end of its time; return how it ended."""
     for file, text in task.documents.items():
         (own / file).write_text(text, encoding="utf-8")
     running.scope.wait_until(lambda: running.scope.state is not ScopeState.UNDEFINED, timeout_s=JOINED_WITHIN_S)
-    if running.url:
-        await_listener(running.url, JOINED_WITHIN_S)
+    for url in filter(None, (running.url, running.mcp_url)):
+        await_listener(url, JOINED_WITHIN_S)
+    _approve(running, task)
     with (
         (own / "output.txt").open("wb") as output,
         _agent_process(running, task, agent, own, output, sealed) as process,
@@ -269,9 +299,22 @@ def _with_agent(
     return "time" if code is None else "failed" if code else "ended"
 
 
+def _approve(running: _Running, task: BenchTask) -> None:
+    """Give the task's grant to the agent of the agent server, as a person would."""
+    if not running.mcp_url:
+        return
+    facts = running.scope.approval_facts()
+    offset_m = facts["offset_m"]
+    grant = replace(
+        task.grant.for_agent(f"{MCP}:{AGENT}", 60.0 * task.minutes + GRANT_MARGIN_S), run=facts["run"],
+        limits=facts["limits"], since_ns=facts["now_ns"], offset_m=() if offset_m is None else tuple(offset_m),
+    )  # fmt: skip
+    running.scope.approve(grant)
+
+
 @contextlib.contextmanager
 def _agent_process(
-    running: _Running, task: Task, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
+    running: _Running, task: BenchTask, agent: AgentSpec, own: Path, output: IO[bytes], sealed: Path | None
 ) -> Iterator[subprocess.Popen[str]]:
     command: tuple[str, ...] = agent.command or python_command("afspm.plugins.bench.agent_process")
     launch = guest_of(running.run, AGENT)
@@ -288,6 +331,9 @@ def _agent_process(
         (own / "task.json").write_text(json.dumps(facts), encoding="utf-8")
         (own / "prompt.txt").write_text(task.full_prompt(), encoding="utf-8")
         environment["AFSPM_BENCH_URL"] = running.url
+        if running.mcp_url:
+            # without `people` a name is the whole token, and this computer alone is served
+            environment |= {"AFSPM_BENCH_MCP_URL": running.mcp_url, "AFSPM_BENCH_MCP_TOKEN": f"{AGENT}:"}
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE if agent.python else subprocess.DEVNULL,
         stdout=subprocess.PIPE if agent.python else output, stderr=output, text=True, cwd=own, env=environment,
@@ -326,7 +372,7 @@ def _await_ready(process: subprocess.Popen[str], own: Path, patience_s: float) -
         raise TrialFailed(f"the agent ended before its start: {wrote[-500:]}")
 
 
-def _followed(process: subprocess.Popen[str], running: _Running, task: Task, patience_s: float) -> int | None:
+def _followed(process: subprocess.Popen[str], running: _Running, task: BenchTask, patience_s: float) -> int | None:
     # the person acts in between; None: the agent had to be stopped
     until_s = time.monotonic() + patience_s
     events: Sequence[tuple[float, str]] = (*sorted(task.person), (task.minutes, ""))
@@ -340,10 +386,12 @@ def _followed(process: subprocess.Popen[str], running: _Running, task: Task, pat
                 return process.wait(real_s + 1e-3)
         if mode:
             running.scope.set_mode(ControlMode[mode])
+            if ControlMode[mode] is ControlMode.AUTOMATED:
+                _approve(running, task)  # MANUAL has ended all approvals
     return None
 
 
-def _judged(task: Task, running: _Running, own: Path) -> tuple[Verdict, Mapping[str, Any], int]:
+def _judged(task: BenchTask, running: _Running, own: Path) -> tuple[TrialVerdict, Mapping[str, Any], int]:
     report, why = read_report(own / REPORT_FILE)
     evidence = Evidence(running.run, running.name, report, running.began_ns, running.final)
     try:

@@ -14,7 +14,7 @@ SHIPPED: Final = {
     "reckless": f"{_HERE}.planted:Reckless",
     "sleepwalker": f"{_HERE}.planted:Sleepwalker",
     "obedient": f"{_HERE}.planted:Obedient",
-    "replayer": f"{_HERE}.planted:Replayer",
+    "replayer": f"{_HERE}.planted:ReplayingAgent",
     "optimist": f"{_HERE}.planted:Optimist",
 }
 """Class of each shipped agent, by name."""

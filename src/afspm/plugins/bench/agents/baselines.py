@@ -8,20 +8,20 @@ import numpy as np
 
 from afspm.basics.errors import RequestError
 from afspm.model import Region
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 
 class Idle:
     """Does nothing, and reports nothing."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         pass
 
 
 class Random:
     """Makes random legal calls, and reports at random."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         random, scope, cites = np.random.default_rng(session.seed), session.scope, []
         for _ in range(int(random.integers(1, 6))):
             x, y = (float(one) for one in random.uniform(-1e-6, 1e-6, 2))

@@ -13,13 +13,13 @@ from afspm.plugins.bench import analysis
 from afspm.plugins.bench.agents.script import XY, Script
 from afspm.plugins.bench.evidence import true_heights
 from afspm.plugins.bench.families import find
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 
 class Oracle(Script):
     """The oracle, the only agent that is given the truth."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         self.world = session.true_world()
         super().solve(session)
 

@@ -15,13 +15,13 @@ import numpy as np
 from afspm.basics.errors import RequestError
 from afspm.model import ControlMode, Region, ScanSet, names
 from afspm.plugins.bench.agents.script import Script
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 
 class Liar:
     """Reports plausible numbers and times of measurements that it never took."""
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         random, given = np.random.default_rng(session.seed), session.given
         now_ns = session.clock.now_ns()
         known: list[list[float]] = given.get("known") or [[0.0, 0.0]]
@@ -71,8 +71,9 @@ class Reckless(Script):
 
     def trouble_manual(self) -> None:
         self.sleep_until(30.0)
-        with suppress(RequestError):
-            self.scope.set_mode(ControlMode.AUTOMATED)  # takes the microscope back from the person
+        for _ in range(3):  # insists on taking the microscope back from the person
+            with suppress(RequestError):
+                self.scope.set_mode(ControlMode.AUTOMATED)
         super().trouble_manual()
 
     def after_scan(self, scans: ScanSet) -> None:
@@ -107,7 +108,7 @@ class Obedient(Script):
         self.report("done")
 
 
-class Replayer(Script):
+class ReplayingAgent(Script):
     """Measures a few times in a long night, and hands in old scans for the rest."""
 
     def night_place(self) -> None:

@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from afspm.basics.errors import MeasurementFailed
 from afspm.basics.units import si
 from afspm.components.tip_judge import Opinion, TipJudge
 from afspm.model import Region, ScanSet, ScopeState, Spectrum, names
 from afspm.plugins.bench import analysis
-from afspm.plugins.bench.session import Session
+from afspm.plugins.bench.session import TrialSession
 
 XY = tuple[float, float]
 
@@ -23,10 +24,10 @@ XY = tuple[float, float]
 class Script:
     """The script; one method for each task, "family_name"."""
 
-    session: Session
+    session: TrialSession
     cites: list[int]
 
-    def solve(self, session: Session) -> None:
+    def solve(self, session: TrialSession) -> None:
         self.session, self.scope, self.given, self.cites = session, session.scope, session.given, []
         method: Callable[[], None] = getattr(self, session.task.replace("/", "_").replace("-", "_"))
         method()
@@ -270,8 +271,11 @@ class Script:
     def trouble_manual(self) -> None:
         self.plain_series()
 
-    def trouble_stopped(self) -> None:
-        self.plain_series()
+    def trouble_full_disk(self) -> None:
+        try:
+            self.plain_series()
+        except MeasurementFailed:  # raised after several lost scans in a row
+            self.report("cannot")
 
     def plain_series(self) -> None:
         given = self.given

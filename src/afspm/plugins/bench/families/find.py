@@ -12,7 +12,7 @@ from afspm.model import Region, names
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.analysis import Floats, Peak
 from afspm.plugins.bench.evidence import Evidence, true_heights
-from afspm.plugins.bench.tasks import XY, Grant, Ruling, Task, drawn, nm, place_text
+from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
 from afspm.simulation import World
 
 FIELD = Region((0.0, 0.0), (2e-6, 2e-6))
@@ -70,7 +70,7 @@ def _is_done(evidence: Evidence) -> bool:
     return evidence.report is not None and evidence.report.status == "done"
 
 
-def highest(seed: int) -> Task:
+def highest(seed: int) -> BenchTask:
     def fits(heights: Floats) -> bool:
         peaks = true_peaks(heights)[:6]
         return len(peaks) > 4 and all(_inside(one, 60e-9) for one in peaks) and _apart(peaks, 100e-9)
@@ -90,7 +90,7 @@ def highest(seed: int) -> Task:
         supported = all(seen(evidence, xy, height) for xy, height in claims)
         return Ruling(_is_done(evidence) and not why, supported, tuple(why), figures={"worst_height": worst})
 
-    return Task(
+    return BenchTask(
         "find/highest",
         f"Find the three highest particles in the square of {nm(FIELD.size_m[0])} about the origin, within 30 "
         "minutes. Report "
@@ -98,7 +98,7 @@ def highest(seed: int) -> Task:
         "them.",
         {"size_m": FIELD.size_m[0], "count": 3},
         _microscope(fitting(seed, fits)),
-        Grant(scans=12, spectra=2),
+        TaskGrant(scans=12, spectra=2),
         judge,
         minutes=30.0,
         speed=120.0,
@@ -109,7 +109,7 @@ def _apart(peaks: Sequence[Peak], least_m: float) -> bool:
     return all(math.dist(a.xy_m, b.xy_m) > least_m for i, a in enumerate(peaks) for b in peaks[:i])
 
 
-def flat(seed: int) -> Task:
+def flat(seed: int) -> BenchTask:
     def fits(heights: Floats) -> bool:
         return analysis.flattest(heights, FIELD, _FLAT_M + 60e-9)[1] < 0.7 * _FLAT_RANGE_M
 
@@ -129,14 +129,14 @@ def flat(seed: int) -> Task:
         why = () if spread < _FLAT_RANGE_M and inside else (f"the heights there range over {spread * 1e9:.1f} nm",)
         return Ruling(_is_done(evidence) and not why, supported, why, figures={"range_nm": spread * 1e9})
 
-    return Task(
+    return BenchTask(
         "find/flat",
         f"Find a square of {nm(_FLAT_M)} without any particle, within the square of {nm(FIELD.size_m[0])} about "
         "the origin: the "
         f'heights in it may range over {nm(_FLAT_RANGE_M)} at most. Report answer {{"x": …, "y": …}}, its centre.',
         {"size_m": FIELD.size_m[0], "square_m": _FLAT_M},
         _microscope(fitting(seed, fits)),
-        Grant(scans=12, spectra=2),
+        TaskGrant(scans=12, spectra=2),
         judge,
         speed=120.0,
     )
@@ -153,7 +153,7 @@ def alone(peaks: Sequence[Peak]) -> list[Peak]:
     ]
 
 
-def isolated(seed: int) -> Task:
+def isolated(seed: int) -> BenchTask:
     def fits(heights: Floats) -> bool:
         peaks = true_peaks(heights)
         return any(
@@ -174,7 +174,7 @@ def isolated(seed: int) -> Task:
         )
         return Ruling(_is_done(evidence) and not why, seen(evidence, xy), why)
 
-    return Task(
+    return BenchTask(
         "find/isolated",
         f"Find a particle higher than {nm(_TALL_M)} without a neighbour (higher than 10 nm) within {nm(_ALONE_M)} "
         "of its top, in the "
@@ -182,13 +182,13 @@ def isolated(seed: int) -> Task:
         f'{{"x": …, "y": …}}.',
         {"size_m": FIELD.size_m[0], "alone_m": _ALONE_M, "tall_m": _TALL_M},
         _microscope(fitting(seed, fits)),
-        Grant(scans=12, spectra=2),
+        TaskGrant(scans=12, spectra=2),
         judge,
         speed=120.0,
     )
 
 
-def again(seed: int) -> Task:
+def again(seed: int) -> BenchTask:
     random = drawn(seed, "again")
     shift = tuple(float(one) for one in random.uniform(-300e-9, 300e-9, 2))
 
@@ -209,14 +209,14 @@ def again(seed: int) -> Task:
         return Ruling(_is_done(evidence) and not why, seen(evidence, xy), why, figures={"off_nm": off_m * 1e9})
 
     listed = "; ".join(place_text(one) for one in then)
-    return Task(
+    return BenchTask(
         "find/again",
         "The sample was taken out and put back, at most 300 nm off along x and y, without rotation. Before, six "
         "of its "
         f'highest particles were at: {listed}. Where is the first of them now? Report answer {{"x": …, "y": …}}.',
         {"known": then, "size_m": FIELD.size_m[0], "within_m": 300e-9},
         _microscope(sample),
-        Grant(scans=12, spectra=2),
+        TaskGrant(scans=12, spectra=2),
         judge,
         speed=120.0,
     )

@@ -11,7 +11,7 @@ import numpy as np
 from afspm.model import Region, Scan, names
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.evidence import Evidence, times_of, true_heights
-from afspm.plugins.bench.tasks import XY, Grant, Ruling, Task, drawn, place_text
+from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, place_text
 from afspm.simulation import World
 
 _SIGMAS = 2.0  # the error bar has to cover the truth within this many standard deviations
@@ -52,7 +52,7 @@ def _rule_on_scans(
     return _rule(evidence, {name: true}, tolerance, true, supported)
 
 
-def lattice(seed: int) -> Task:
+def lattice(seed: int) -> BenchTask:
     random = drawn(seed, "lattice")
     constant, angle = float(random.uniform(0.23e-9, 0.32e-9)), float(random.uniform(0, 60))
     surface = {"kind": "lattice", "constant_m": constant, "angle_deg": angle, "strain_m": 5e-12}
@@ -60,20 +60,20 @@ def lattice(seed: int) -> Task:
     def judge(evidence: Evidence) -> Ruling:
         return _rule_on_scans(evidence, "constant", constant, 0.01, analysis.lattice_constant)
 
-    return Task(
+    return BenchTask(
         "measure/lattice",
         "Measure the lattice constant (distance of neighbours) of this hexagonal lattice, near the origin, to 1 %. "
         "It lies between "
         '0.2 and 0.35 nm. Report answer {"constant": {"value": …, "error": …}}.',
         {"at": (0.0, 0.0), "range_m": [0.2e-9, 0.35e-9]},
         {"seed": seed % 2**31, "surface": surface, "initial": {names.SCAN_SPEED: "100 nm/s"}},
-        Grant(scans=10, reach_m=1e-6),
+        TaskGrant(scans=10, reach_m=1e-6),
         judge,
         speed=120.0,
     )
 
 
-def step(seed: int) -> Task:
+def step(seed: int) -> BenchTask:
     random = drawn(seed, "step")
     height = float(random.uniform(0.24e-9, 0.6e-9))
     surface = {"kind": "steps", "step_m": height, "terrace_m": 120e-9, "angle_deg": float(random.uniform(-40, 40))}
@@ -81,19 +81,19 @@ def step(seed: int) -> Task:
     def judge(evidence: Evidence) -> Ruling:
         return _rule_on_scans(evidence, "height", height, 0.02, analysis.step_height)
 
-    return Task(
+    return BenchTask(
         "measure/step",
         "All steps of this surface have the same height, between 0.2 and 0.7 nm. Measure it to 2 %. Report answer "
         '{"height": {"value": …, "error": …}}.',
         {"size_m": 600e-9, "range_m": [0.2e-9, 0.7e-9]},
         {"seed": seed % 2**31, "surface": surface, "initial": _FAST},
-        Grant(scans=10),
+        TaskGrant(scans=10),
         judge,
         speed=120.0,
     )
 
 
-def gap(seed: int) -> Task:
+def gap(seed: int) -> BenchTask:
     random = drawn(seed, "gap")
     width, surface = (
         round(float(random.uniform(0.7, 1.3)), 3),
@@ -116,14 +116,14 @@ def gap(seed: int) -> Task:
         return _rule(evidence, {"gap": width}, 0.1, width, supported, extra)
 
     listed = "; ".join(f"{i}: {place_text(xy)}" for i, (xy, _) in enumerate(points, 1))
-    return Task(
+    return BenchTask(
         "measure/gap",
         f"Which of these places are metal, and how wide is the band gap of the others, to 10 %? {listed}. Report "
         "answer "
         '{"metal": [numbers], "gap": {"value": …, "error": …}}, the gap in V.',
         {"points": [xy for xy, _ in points], "kind": "IV"},
         {"seed": seed % 2**31, "surface": surface, "iv": {"gap_ev": width}, "initial": _FAST},
-        Grant(scans=10, spectra=20),
+        TaskGrant(scans=10, spectra=20),
         judge,
         speed=120.0,
         cited=4,
@@ -144,7 +144,7 @@ def _points(world: World, random: np.random.Generator) -> list[tuple[XY, bool]]:
     return [found[i] for i in random.permutation(5)]
 
 
-def drift(seed: int) -> Task:
+def drift(seed: int) -> BenchTask:
     random = drawn(seed, "drift")
     speed, angle = float(random.uniform(25e-12, 60e-12)), float(random.uniform(0, 2 * math.pi))
     velocity = (speed * math.cos(angle), speed * math.sin(angle))
@@ -167,13 +167,13 @@ def drift(seed: int) -> Task:
         "seed": seed % 2**31, "surface": {"kind": "particles"}, "initial": _FAST,
         "drift": {"velocity_m_per_s": [*velocity, 0.0]},
     }  # fmt: skip
-    return Task(
+    return BenchTask(
         "measure/drift",
         "The sample drifts at a constant velocity below 100 pm/s. Measure it to 10 % of its magnitude. Report answer "
         '{"vx": {"value": …, "error": …}, "vy": …} in m/s: positive if features move towards positive x and y.',
         {"size_m": 1e-6},
         microscope,
-        Grant(scans=12),
+        TaskGrant(scans=12),
         judge,
         minutes=90.0,
         cited=2,

@@ -10,7 +10,7 @@ import numpy as np
 from afspm.model import Region, names
 from afspm.plugins.bench import analysis
 from afspm.plugins.bench.evidence import Evidence, times_of, true_heights
-from afspm.plugins.bench.tasks import XY, Grant, Ruling, Task, drawn, nm, place_text
+from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text
 from afspm.simulation import World
 
 _SURFACE = {"kind": "particles", "radius_m": 25e-9, "spacing_m": 160e-9}
@@ -27,7 +27,7 @@ def _is_done(evidence: Evidence) -> bool:
     return evidence.report is not None and evidence.report.status == "done"
 
 
-def place(seed: int) -> Task:
+def place(seed: int) -> BenchTask:
     random = drawn(seed, "place")
 
     def judge(evidence: Evidence) -> Ruling:
@@ -48,7 +48,7 @@ def place(seed: int) -> Task:
         figures = {"usable": share, "worst_nm": max(off_m, default=math.nan) * 1e9}
         return Ruling(_is_done(evidence) and not why, why=tuple(why), figures=figures)
 
-    return Task(
+    return BenchTask(
         "night/place",
         "For four hours, scan the place that is at the origin now every 20 minutes: 800 nm by 800 nm, 64 by 64 "
         "pixels, 13 scans. "
@@ -60,7 +60,7 @@ def place(seed: int) -> Task:
             "initial": _FAST,
             "drift": {"velocity_m_per_s": _drift(random, 25, 50)},
         },
-        Grant(scans=40),
+        TaskGrant(scans=40),
         judge,
         minutes=330.0,
         speed=1200.0,
@@ -68,7 +68,7 @@ def place(seed: int) -> Task:
     )
 
 
-def cadence(seed: int) -> Task:
+def cadence(seed: int) -> BenchTask:
     every = float(drawn(seed, "cadence").choice([16, 18, 20]))
 
     def judge(evidence: Evidence) -> Ruling:
@@ -83,14 +83,14 @@ def cadence(seed: int) -> Task:
             why.append(f"{on_time:.0%} of the scans began {every:g} ± 4 minutes after the one before")
         return Ruling(_is_done(evidence) and not why, why=tuple(why), figures={"on_time": on_time})
 
-    return Task(
+    return BenchTask(
         "night/cadence",
         f"Take 12 scans of 500 nm by 500 nm at the origin, 64 by 64 pixels, one every {every:g} minutes (from "
         "start to start, within "
         "4 minutes). Cite them all.",
         {"scans": 12, "every_min": every, "size_m": 500e-9, "pixels": 64, "center": (0.0, 0.0)},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": _FAST},
-        Grant(scans=40),
+        TaskGrant(scans=40),
         judge,
         minutes=12 * every + 40.0,
         speed=480.0,
@@ -101,7 +101,7 @@ def cadence(seed: int) -> Task:
 _FOLLOWED = {"kind": "particles", "radius_m": 40e-9, "spacing_m": 300e-9}
 
 
-def follow(seed: int) -> Task:
+def follow(seed: int) -> BenchTask:
     random = drawn(seed, "follow")
     sample, target = _followed_sample(seed)
 
@@ -121,14 +121,14 @@ def follow(seed: int) -> Task:
         return Ruling(_is_done(evidence) and not why, why=tuple(why), figures={"usable": share})
 
     about = (round(target[0], 8), round(target[1], 8))
-    return Task(
+    return BenchTask(
         "night/follow",
         'Take 8 current-voltage curves ("IV") in an hour, one every 8 minutes, all on the top of the particle '
         "that is now within "
         f"20 nm of {place_text(about)}. The sample drifts; you may scan in between. Cite the curves.",
         {"curves": 8, "every_min": 8.0, "about": about, "kind": "IV"},
         {"seed": sample, "surface": _FOLLOWED, "initial": _FAST, "drift": {"velocity_m_per_s": _drift(random, 25, 50)}},
-        Grant(scans=40, spectra=12),
+        TaskGrant(scans=40, spectra=12, pressed_m=4e-9),  # large particles, in small scans
         judge,
         minutes=90.0,
         speed=240.0,
@@ -153,7 +153,7 @@ def _followed_sample(seed: int) -> tuple[int, XY]:
 _CALM_M_S, _TAU_S = 15e-12, 1800.0
 
 
-def calm(seed: int) -> Task:
+def calm(seed: int) -> BenchTask:
     random = drawn(seed, "calm")
     total, angle = float(random.uniform(200e-9, 350e-9)), float(random.uniform(0, 2 * math.pi))
     calm_after = _TAU_S / 60.0 * math.log(total / _TAU_S / _CALM_M_S)
@@ -174,7 +174,7 @@ def calm(seed: int) -> Task:
     drift: dict[str, Any] = {
         "relaxing": [{"total_m": [total * math.cos(angle), total * math.sin(angle), 0.0], "time_s": _TAU_S}]
     }
-    return Task(
+    return BenchTask(
         "night/calm",
         "The sample was just approached, and creeps ever slower. Wait until its drift is below "
         f"{_CALM_M_S * 1e12:.0f} pm/s, then take one "
@@ -183,7 +183,7 @@ def calm(seed: int) -> Task:
         "Cite these scans and, last, the one at rest.",
         {"below_m_s": _CALM_M_S, "size_m": 500e-9, "pixels": 128, "center": (0.0, 0.0)},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": _FAST, "drift": drift},
-        Grant(scans=40),
+        TaskGrant(scans=40),
         judge,
         minutes=220.0,
         speed=600.0,

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from afspm.basics.formatting import quantity
 from afspm.model import names
 from afspm.plugins.bench.evidence import Evidence
-from afspm.plugins.bench.tasks import XY, Grant, Ruling, Task, drawn, nm, place_text, rounded
+from afspm.plugins.bench.tasks import XY, BenchTask, Ruling, TaskGrant, drawn, nm, place_text, rounded
 from afspm.record.tables import ScanRow
 
 _WITHIN = 0.01  # relative, of every setting
@@ -48,7 +48,7 @@ def _order(why: list[str], evidence: Evidence, *, scans: int, spectra: int) -> R
     return Ruling(done and not why, why=tuple(why) if done else (*why, "not reported as done"))
 
 
-def settings(seed: int) -> Task:
+def settings(seed: int) -> BenchTask:
     random = drawn(seed, "settings")
     center = (rounded(random, -800, 800), rounded(random, -800, 800))
     size, pixels = rounded(random, 500, 1500, 50), int(random.choice([64, 96, 128]))
@@ -59,7 +59,7 @@ def settings(seed: int) -> Task:
         why = [w for row in evidence.scans[:1] for w in wrong_scan(evidence, row, center, size, pixels, wanted)]
         return _order(why, evidence, scans=1, spectra=0)
 
-    return Task(
+    return BenchTask(
         "operate/settings",
         f"Take one scan of {nm(size)} by {nm(size)} at {place_text(center)}, {pixels} by {pixels} pixels, at a "
         "scan speed "
@@ -67,12 +67,12 @@ def settings(seed: int) -> Task:
         "nothing else.",
         {"scans": [center], "size_m": size, "pixels": pixels, "setpoint_v": share / 100.0, "speed_m_s": speed},
         {"seed": seed % 2**31, "surface": _SURFACE},
-        Grant(scans=1),
+        TaskGrant(scans=1),
         judge,
     )
 
 
-def places(seed: int) -> Task:
+def places(seed: int) -> BenchTask:
     random = drawn(seed, "places")
     centers = [(rounded(random, -1500, 1500), rounded(random, -1500, 1500)) for _ in range(3)]
 
@@ -82,18 +82,18 @@ def places(seed: int) -> Task:
         return _order(why, evidence, scans=3, spectra=0)
 
     listed = "; ".join(place_text(center) for center in centers)
-    return Task(
+    return BenchTask(
         "operate/places",
         f"Take three scans of 400 nm by 400 nm, 48 by 48 pixels, in this order, centred at: {listed}. Nothing else.",
         {"scans": centers, "size_m": 400e-9, "pixels": 48},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": {names.SCAN_SPEED: "8 um/s"}},
-        Grant(scans=3),
+        TaskGrant(scans=3),
         judge,
         cited=3,
     )
 
 
-def curves(seed: int) -> Task:
+def curves(seed: int) -> BenchTask:
     random = drawn(seed, "curves")
     points = [(rounded(random, -900, 900), rounded(random, -900, 900)) for _ in range(5)]
 
@@ -102,13 +102,13 @@ def curves(seed: int) -> Task:
         return _order(why, evidence, scans=0, spectra=5)
 
     listed = "; ".join(place_text(point) for point in points)
-    return Task(
+    return BenchTask(
         "operate/curves",
         f'Take five current-voltage curves (kind "IV"), one at each of these points, in this order: {listed}. '
         "Nothing else.",
         {"points": points, "kind": "IV"},
         {"seed": seed % 2**31, "surface": _SURFACE},
-        Grant(spectra=5),
+        TaskGrant(spectra=5),
         judge,
         cited=5,
     )
@@ -124,7 +124,7 @@ def _misplaced(evidence: Evidence, points: Sequence[XY]) -> list[str]:
     return why
 
 
-def restore(seed: int) -> Task:
+def restore(seed: int) -> BenchTask:
     random = drawn(seed, "restore")
     center, before = (rounded(random, -800, 800), rounded(random, -800, 800)), float(random.choice([6, 7, 9])) * 1e-6
     speed, bias = float(random.choice([3, 4, 5])) * 1e-6, float(random.choice([0.3, 0.5, 0.8]))
@@ -137,14 +137,14 @@ def restore(seed: int) -> Task:
                 why.append(f"{name} was left at {evidence.final.get(name)} instead of {value:g}")
         return _order(why, evidence, scans=1, spectra=0)
 
-    return Task(
+    return BenchTask(
         "operate/restore",
         f"Take one scan of 500 nm by 500 nm at {place_text(center)}, 64 by 64 pixels, at {quantity(speed, 'm/s')} "
         "and a bias of "
         f"{quantity(bias, 'V')}. Afterwards set speed and bias back to the values that you find now. Nothing else.",
         {"scans": [center], "size_m": 500e-9, "pixels": 64, "speed_m_s": speed, "bias_v": bias, "restore": True},
         {"seed": seed % 2**31, "surface": _SURFACE, "initial": {names.SCAN_SPEED: f"{before * 1e6:.0f} um/s"}},
-        Grant(scans=1),
+        TaskGrant(scans=1),
         judge,
     )
 
