@@ -25,6 +25,7 @@ from afspm.model import (
     RelayedMessage,
     Response,
 )
+from afspm.model.problems import STOPPER
 from afspm.plugins.agent.plan import MoveStep, Plan, ScanStep, SetStep, SpectrumStep, Step, plan_of
 from afspm.plugins.web.archive import Archive
 from afspm.plugins.web.gateway.measurements import Measurement, Measurements
@@ -43,8 +44,6 @@ STOP_ANSWERED_S = 5.0
 STOP_AGAIN_S = 0.5
 MOST_RUNS = 200
 MOST_PROPOSALS = 200
-STOPPER = " stop"
-"""Ending of the name under which an agent stops: its own connection may be waiting for the microscope."""
 
 T = TypeVar("T")
 _log = logging.getLogger("afspm.plugins.agent")
