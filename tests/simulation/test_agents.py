@@ -29,15 +29,15 @@ from afspm.plugins.agent.tools import AgentTools
 from tests.simulation.agent_attacks import attacked
 from tests.simulation.agent_rig import ADA, AGENT, STOP, AgentRig, facts
 
-CALLS = 100_000 if ALL else 3_000
-SEEDS = 10
+# 100,000 calls, in parts that a busy computer finishes within the time limit of a test
+SEEDS, CALLS = (40, 2_500) if ALL else (10, 300)
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_adversarial_calls_stay_within_approvals(seed: int) -> None:
-    attack = attacked(seed, CALLS // SEEDS, kills=0.02)
+    attack = attacked(seed, CALLS, kills=0.02)
     # the attack was real: requests of the agent did arrive, and the scheduler did die
-    assert attack.rig.watchman.checked > CALLS // SEEDS // 50
+    assert attack.rig.watchman.checked > CALLS // 50
     assert attack.rig.kills_done
 
 

@@ -97,10 +97,7 @@ class Grant:
 
     @property
     def region(self) -> Region | None:
-        if not self.region_m:
-            return None
-        x, y, width, height = self.region_m
-        return Region((x, y), (width, height))
+        return _region(self.region_m)
 
     @property
     def origin_m(self) -> XY | None:
@@ -119,6 +116,7 @@ class Approval:
         plan: empty: a grant.
         by: the person who approved.
         left: of a grant: the actions still allowed.
+        region_m, ranges, counts: of a grant, as in `Grant`.
     """
 
     agent: str
@@ -127,6 +125,13 @@ class Approval:
     until_ns: int
     steps_left: int = 0
     left: tuple[GrantedCount, ...] = ()
+    region_m: tuple[float, ...] = ()
+    ranges: tuple[GrantedRange, ...] = ()
+    counts: tuple[GrantedCount, ...] = ()
+
+    @property
+    def region(self) -> Region | None:
+        return _region(self.region_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,3 +157,10 @@ class Proposal:
     id: str
     plan: str
     preflight: str = ""
+
+
+def _region(numbers_m: tuple[float, ...]) -> Region | None:
+    if not numbers_m:
+        return None
+    x, y, width, height = numbers_m
+    return Region((x, y), (width, height))

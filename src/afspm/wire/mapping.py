@@ -260,6 +260,7 @@ INSTRUMENT_ORDERS = MessageMapping(
     model.InstrumentOrders, journal_pb2.Orders, "token", orders=_each("instrument", _ORDER)
 )
 _COUNT = MessageMapping(model.GrantedCount, grants_pb2.GrantedCount, "action", "count")
+_RANGE = MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")
 GRANT = MessageMapping(
     model.Grant,
     grants_pb2.Grant,
@@ -267,7 +268,7 @@ GRANT = MessageMapping(
     agent=FieldMapping("agent", from_wire=_needed("an agent")),
     steps=_each("steps", MessageMapping(model.GrantedStep, grants_pb2.GrantedStep, "request", "payload")),
     region_m=FieldMapping("region", from_wire=tuple),
-    ranges=_each("ranges", MessageMapping(model.GrantedRange, grants_pb2.GrantedRange, "parameter", "low", "high")),
+    ranges=_each("ranges", _RANGE),
     counts=_each("counts", _COUNT),
     lasts_s="lasts",
     since_ns=_time("since"),
@@ -280,6 +281,9 @@ _APPROVAL = MessageMapping(
     *("agent", "plan", "by", "steps_left"),
     until_ns=_time("until"),
     left=_each("left", _COUNT),
+    region_m=FieldMapping("region", from_wire=tuple),
+    ranges=_each("ranges", _RANGE),
+    counts=_each("counts", _COUNT),
 )
 MAPPINGS: tuple[MessageMapping[Any], ...] = (
     GRANT,

@@ -13,7 +13,7 @@ from google.protobuf import json_format
 
 from afspm import model, wire
 from afspm.model import ControlRequest, ControlResponse
-from afspm.wire.messages import message_type
+from afspm.wire.messages import MessageKind, declared, message_type
 
 GOLDEN = json.loads((Path(__file__).parents[3] / "proto" / "golden.json").read_text(encoding="utf-8"))
 AS_MODEL = {
@@ -32,6 +32,9 @@ AS_MODEL = {
     "Note",
     "MeasurementSettings",
     "InstrumentReadings",
+    "Grant",
+    "Approvals",
+    "Proposal",
 }
 
 
@@ -41,6 +44,16 @@ def each(kind: str) -> pytest.MarkDecorator:
 
 def parsed(name: str, payload: bytes) -> Any:
     return message_type(name).FromString(payload)
+
+
+def test_every_declared_message_has_reference_bytes() -> None:
+    own = {one.name for one in declared() if one.kind is not MessageKind.PART}
+    assert own - {entry["type"] for entry in GOLDEN["messages"]} == set()
+
+
+def test_every_own_request_has_reference_bytes() -> None:
+    numbers = {value for name, value in vars(model).items() if name.endswith("_REQUEST")}
+    assert {entry["request"] for entry in GOLDEN["our_requests"]} == numbers
 
 
 @each("messages")
@@ -127,6 +140,8 @@ def test_requests_that_version_1_does_not_know(entry: Any) -> None:
     assert (request.kind, request.id) == (entry["request"], "exp/1/7")
     if isinstance(request.subject, model.RelayedMessage):
         assert [request.subject.message, bytes(request.subject.payload).hex()] == entry["object"]
+    elif isinstance(request.subject, model.Grant):
+        assert ["Grant", wire.encode(request.subject)[1].hex()] == entry["object"]
     else:
         assert request.subject == entry["object"]
     assert wire.encode_request(model.Request(request.kind, request.subject, id=request.id)) == frames

@@ -280,6 +280,8 @@ class AgentTools:
                 "until": iso_utc(one.until_ns),
                 "steps_left": one.steps_left,
                 "left": {count.action: count.count for count in one.left},
+                "region_m": list(one.region_m) or None,
+                "ranges": {each.parameter: [each.low, each.high] for each in one.ranges},
                 **untrusted({"by": one.by}),
             }
             for one in self._place.approvals.approvals

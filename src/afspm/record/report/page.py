@@ -13,7 +13,7 @@ from afspm.model.events import SUPERVISOR
 from afspm.record.drawing import timeline
 from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
-from afspm.record.report import curves, estimate, markup, sample
+from afspm.record.report import agents, curves, estimate, markup, sample
 from afspm.record.report.curves import SpectrumGroup
 from afspm.record.report.markup import PageTimes, document, section, table
 from afspm.record.report.pictures import FigurePicture, TopographyPicture
@@ -37,6 +37,7 @@ def html(
         section("Time line", f'<div class="scroll">{_timeline(story)}</div>{_zones(clock)}'),
         section("Problems and repairs", _problems(story, clock)),
         section("Treatments of the tip", _treatments(story)),
+        section("Agents", agents.html(story.agents, clock)),
         section("Drift", _drift(story, clock)),
         section("Notes", _notes(story, clock)),
         section("On the sample", sample.sample_map(shown, places, story.frame)),

@@ -21,6 +21,7 @@ from afspm.model import (
 from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.expected_end import plans_of
 from afspm.record.overview import Overview, ProcessRestart
+from afspm.record.report import agents
 from afspm.record.report.work_comparison import WorkComparison, compare
 from afspm.record.run import Run
 from afspm.record.run_json import REAL_S
@@ -60,6 +61,7 @@ class RunStory:
         seen_late: the first request to flag each problem that was only noticed after the end.
         ledger: totals of what was done to tip and sample.
         comparisons: planned and measured work of each component with a plan.
+        agents: the work of each agent.
     """
 
     name: str
@@ -79,6 +81,7 @@ class RunStory:
     seen_late: Sequence[JournalEntry]
     ledger: TreatmentLedger
     comparisons: Sequence[WorkComparison] = ()
+    agents: Sequence[agents.AgentWork] = ()
 
     @property
     def end_ns(self) -> int:
@@ -172,6 +175,7 @@ def read(run: Run) -> RunStory:
         notes=list(run.notes),
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
         comparisons=compare(plans_of(run.facts), scans, run.spectra),
+        agents=agents.read(run),
     )
 
 

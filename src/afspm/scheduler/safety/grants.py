@@ -113,6 +113,13 @@ class HeldGrant:
     def until_ns(self) -> int:
         return self.given_ns + round(self.grant.lasts_s * 1e9)
 
+    def published(self) -> Approval:
+        grant = self.grant
+        box = (grant.region_m, grant.ranges, grant.counts)
+        return Approval(
+            grant.agent, grant.plan, self.by, self.until_ns, len(grant.steps) - self.step, self.left(), *box
+        )
+
     def left(self) -> tuple[GrantedCount, ...]:
         return tuple(GrantedCount(one.action, one.count - self.used.get(one.action, 0)) for one in self.grant.counts)
 
@@ -168,11 +175,7 @@ class GrantBook:
     def approvals(self) -> Approvals:
         """Return the part that is published."""
         return Approvals(
-            tuple(
-                Approval(agent, one.grant.plan, one.by, one.until_ns, len(one.grant.steps) - one.step, one.left())
-                for held in (self.plans, self.grants)
-                for agent, one in sorted(held.items())
-            )
+            tuple(one.published() for held in (self.plans, self.grants) for _, one in sorted(held.items()))
         )
 
 
