@@ -7,6 +7,7 @@ computer:
     serve({"mf": Module("magnet", "T", get=magnet.field, set=magnet.field, bounds=(-8, 8))}, port=10767)
 """
 
+import contextlib
 import json
 import socketserver
 import threading
@@ -85,15 +86,18 @@ class RefusedError(Exception):
 
 class _Session(socketserver.StreamRequestHandler):
     def handle(self) -> None:
-        for line in self.rfile:
-            action, _, rest = line.decode().strip().partition(" ")
-            specifier, _, data = rest.partition(" ")
-            try:
-                answer = self._answer(action, specifier, data)
-            except Exception as error:  # of any kind of driver: its client must get an answer
-                name, text = error.args if isinstance(error, RefusedError) else ("HardwareError", repr(error))
-                answer = f"error_{action} {specifier} {json.dumps([name, text, {}])}"
-            self.wfile.write((answer + "\n").encode())
+        with contextlib.suppress(ConnectionError):  # a client that has gone comes back by a new connection
+            for line in self.rfile:
+                self.wfile.write((self._reply(line.decode().strip()) + "\n").encode())
+
+    def _reply(self, line: str) -> str:
+        action, _, rest = line.partition(" ")
+        specifier, _, data = rest.partition(" ")
+        try:
+            return self._answer(action, specifier, data)
+        except Exception as error:  # of any kind of driver: its client must get an answer
+            name, text = error.args if isinstance(error, RefusedError) else ("HardwareError", repr(error))
+            return f"error_{action} {specifier} {json.dumps([name, text, {}])}"
 
     def _answer(self, action: str, specifier: str, data: str) -> str:
         modules: dict[str, Module] = self.server.modules

@@ -81,9 +81,12 @@ class CoordinateFrame(Protocol):
     Attributes:
         is_moving: whether the microscope may have to be moved before an action. The scheduler then remembers a sent
             action, so that it is repeated after a restart without another move.
+        reports: classes of the worker's reports: dataclasses for `model.snapshot`. `[record] requests = true` keeps
+            the reports, and a replay gets them again.
     """
 
     is_moving: ClassVar[bool]
+    reports: ClassVar[tuple[type, ...]]
 
     def step(
         self, event: Input, control: ArbitrationState, now_s: float, now_ns: int
@@ -160,6 +163,7 @@ class TipFrame:
     """The coordinates of the microscope itself: every input passes, and nothing is mapped."""
 
     is_moving: ClassVar[bool] = False
+    reports: ClassVar[tuple[type, ...]] = ()
 
     def step(
         self, event: Input, control: ArbitrationState, now_s: float, now_ns: int

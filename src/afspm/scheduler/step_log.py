@@ -6,6 +6,9 @@ is a list:
 - ["life", launch, saved, cached]: the scheduler starts, with the state and the packets restored from disk.
 - ["step", event, now_s, now_ns, effects, state]: an input, or null for the start itself; `state` has a checksum of each
   part of the state that the step has changed.
+
+Measured values decide nothing, so scans, lines and spectra are kept with zeros in their place, compressed. The results
+of a coordinate frame's worker are inputs, too: a replay gets the recorded ones, and starts no worker.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from afspm import wire
+from afspm.basics.errors import WireError
 from afspm.basics.launch import Launch
 from afspm.model import (
     CLOCK_REQUEST,
@@ -39,9 +43,11 @@ from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.state import SchedulerState
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
+from afspm.wire import Buffer
+from afspm.wire.values import with_zeros
 
 INLINE_BYTES = 4096
-"""The values of larger packets decide nothing: only their length is kept."""
+"""Packets up to this size are kept as they are."""
 SUFFIX = ".steps.jsonl"
 _PLAIN = (
     events.Connected, events.Disconnected, events.Greeted, events.TranslatorUp, events.TranslatorDown,
@@ -157,11 +163,14 @@ def read_cached(plain: Sequence[Any]) -> tuple[LoggedPacket, ...]:
     return tuple(LoggedPacket(_packet(packet), source_ns, history) for packet, source_ns, history in plain)
 
 
-def read_event(plain: Sequence[Any] | None) -> events.Input | None:
+def read_event(plain: Sequence[Any] | None, reports: Iterable[type] = ()) -> events.Input | None:
     """Return the input in a line "step".
 
+    Args:
+        reports: the classes that the scheduler's coordinate frame declares.
+
     Raises:
-        KeyError: only the coordinate frame can read it.
+        KeyError: it is unknown, or a report of another coordinate frame.
         WireError: its bytes are damaged.
     """
     if plain is None:
@@ -179,6 +188,8 @@ def read_event(plain: Sequence[Any] | None) -> events.Input | None:
         return events.TranslatorReply(given[0], wire.decode_response([*map(b64decode, given[1])]))
     if name == "ReplayRequested":
         return events.ReplayRequested(given[0], tuple(given[1]), given[2])
+    if name == "FrameReported":
+        return events.FrameReported(from_plain({one.__name__: one for one in reports}[given[0]], given[1]))
     made: events.Input = from_plain(_BY_NAME[name], given[0])
     return made
 
@@ -190,20 +201,12 @@ def facts_of(effect: events.Effect) -> list[Any]:
             key = f"{name} {request_name(asked)}" if asked else name
             text = f"{_code(response)} {response.reason}".strip()
             payload = b"" if asked == CLOCK_REQUEST else response.payload  # versions and time, which decide nothing
-            return ["Reply", key, text, response.id, _sum(payload), int(response.detail)]
+            return ["Reply", key, text, response.id, zlib.crc32(payload), int(response.detail)]
         case events.Forward(number, request):
             return ["Forward", request_name(request.kind), str(request.subject), request.id, number]
         case events.Publish(packet, source_ns, history):
-            size = _short(packet.payload)
-            return [
-                "Publish",
-                packet.envelope,
-                f"{len(packet.payload)} bytes",
-                packet.time_ns,
-                source_ns,
-                history,
-                size,
-            ]
+            text, total = f"{len(packet.payload)} bytes", _packet_sum(packet)
+            return ["Publish", packet.envelope, text, packet.time_ns, source_ns, history, total]
         case events.Replay(_, packets):
             order = [(one.envelope, one.time_ns) for one in packets]
             return ["Replay", "", f"{len(packets)} packets", zlib.crc32(repr(order).encode())]
@@ -215,7 +218,7 @@ def facts_of(effect: events.Effect) -> list[Any]:
         case events.Kill(tip_is_safe):
             return ["Kill", "", "the tip is safe" if tip_is_safe else "the tip is in danger"]
         case events.Delegate(job):
-            return ["Delegate", type(job).__name__, ""]
+            return ["Delegate", type(job).__name__, "", _plain_sum(job)]
 
 
 def _code(response: Response) -> str:
@@ -229,39 +232,54 @@ def _plain_event(event: events.Input) -> list[Any]:
         case events.RequestIn(connection, who, request, user, heard_s):
             return [name, connection, who, _request(request), user, heard_s]
         case events.PacketIn(packet, header):
-            return [name, _plain_packet(packet), to_plain(header)]
+            return [name, _plain_packet(packet, header.message), to_plain(header)]
         case events.Unreadable(who, response):
             return [name, who, [*map(_text, wire.encode_response(response))]]
         case events.TranslatorReply(number, response):
             return [name, number, [*map(_text, wire.encode_response(response))]]
         case events.ReplayRequested(_, prefixes, since_ns):
             return [name, 0, list(prefixes), since_ns]
+        case events.FrameReported(report):
+            return [name, type(report).__name__, to_plain(report, lists=True) if is_dataclass(report) else None]
         case _:
-            # the reports of a coordinate frame's worker have a form of their own, and end the replay
-            return [name, to_plain(event) if isinstance(event, _PLAIN) else None]
+            return [name, to_plain(event)]
 
 
 def _request(request: Request) -> list[str]:
     return [*map(_text, wire.encode_request(request))]
 
 
-def _plain_packet(packet: Packet) -> list[Any]:
-    payload = packet.payload
-    kept = _text(payload) if len(payload) <= INLINE_BYTES else len(payload)
+def _plain_packet(packet: Packet, message: str = "") -> list[Any]:
+    payload, kept = packet.payload, None  # type: Buffer, Any
+    if len(payload) <= INLINE_BYTES:
+        kept = _text(payload)
+    elif (zeros := _with_zeros(message, payload)) is not None:
+        kept = [_text(zlib.compress(zeros, 1))]
+    else:
+        kept = len(payload)
     return [packet.envelope, packet.time_ns, kept]
 
 
 def _packet(plain: Sequence[Any]) -> Packet:
     envelope, time_ns, kept = plain
-    return Packet(envelope, bytes(kept) if isinstance(kept, int) else b64decode(kept), time_ns)
+    if isinstance(kept, int):
+        return Packet(envelope, bytes(kept), time_ns)
+    return Packet(envelope, zlib.decompress(b64decode(kept[0])) if isinstance(kept, list) else b64decode(kept), time_ns)
 
 
-def _short(payload: bytes | memoryview) -> int:
-    return _sum(payload) if len(payload) <= INLINE_BYTES else len(payload)
+def _packet_sum(packet: Packet) -> int:
+    if len(packet.payload) <= INLINE_BYTES:
+        return zlib.crc32(packet.payload)
+    try:
+        message = wire.message_of(packet.envelope)
+    except WireError:  # [cache] mapping may give any envelopes
+        message = ""
+    zeros = _with_zeros(message, packet.payload)
+    return len(packet.payload) if zeros is None else zlib.crc32(zeros)
 
 
-def _sum(payload: bytes | memoryview) -> int:
-    return zlib.crc32(payload)
+def _with_zeros(message: str, payload: Buffer) -> bytes | None:
+    return with_zeros(message, payload) if message and wire.declaration(message).has_values else None
 
 
 def _plain_sum(value: object) -> int:
@@ -280,7 +298,11 @@ def _canonical(value: object) -> str:
         return f"{{{','.join(sorted(map(_canonical, value)))}}}"
     if isinstance(value, list | tuple | deque):
         return f"[{','.join(map(_canonical, value))}]"
-    if value is None or isinstance(value, str | int | float | bytes | bytearray):
+    if isinstance(value, float):
+        return float.__repr__(value)  # a float of numpy has another one
+    if isinstance(value, bytes | bytearray | memoryview):  # a packet that waits may be large
+        return f"{len(value)} bytes, {zlib.crc32(value) if len(value) <= INLINE_BYTES else ''}"
+    if value is None or isinstance(value, str | int):
         return repr(value)
     return type(value).__name__
 

@@ -45,6 +45,24 @@ def without_values(message: str, payload: Buffer) -> bytes:
     return bytes(payload)
 
 
+def with_zeros(message: str, payload: Buffer) -> bytes:
+    """Return a scan, lines or a spectrum of the same length with zeros as values; other messages unchanged.
+
+    Raises:
+        WireError: the bytes are no message.
+    """
+    made = bytearray(payload)
+    found: list[memoryview] = []
+    if message in _VALUES:
+        found = split(memoryview(made), _VALUES[message])[1]
+    elif message == "Spec1d":
+        data = split(memoryview(made), _DATA_OF_SPECTRUM)[1]
+        found = [one for part in data for one in split(part, _VALUES_OF_DATA)[1]]
+    for one in found:
+        one[:] = bytes(len(one))
+    return bytes(made)
+
+
 def with_values(message: str, head: bytes, values: NDArray[np.float64]) -> bytes:
     """Return a message from `without_values` with values: [y, x] of a scan or lines, (points, variables) of a spectrum.
 

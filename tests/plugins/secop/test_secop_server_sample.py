@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import socket
+import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -45,12 +47,12 @@ def loaded() -> ModuleType:
     return module
 
 
-class Bench:
+class SecopBench:
     """The client, connected to the sample server over TCP."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, modules: Mapping[str, str]) -> None:
         self.lines = LineSocket("127.0.0.1", port)
-        self.client = SecopClient({"m.field": "mf", "m.level": "level"})
+        self.client = SecopClient(modules)
         self.lines.send(self.client.connected(time.monotonic()))
 
     def pump(self) -> None:
@@ -82,7 +84,7 @@ def magnet() -> Magnet:
 
 
 @pytest.fixture
-def bench(magnet: Magnet) -> Iterator[Bench]:
+def bench(magnet: Magnet) -> Iterator[SecopBench]:
     sample: Any = loaded()
     modules = {
         "mf": sample.Module("magnet", "T", get=magnet.field, set=magnet.set_field, bounds=(-2.0, 2.0)),
@@ -90,7 +92,7 @@ def bench(magnet: Magnet) -> Iterator[Bench]:
     }
     with sample.Server(modules, port=0) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        made = Bench(server.server_address[1])
+        made = SecopBench(server.server_address[1], {"m.field": "mf", "m.level": "level"})
         made.until(lambda: all(one.value is not None for one in made.readings().values()))
         yield made
         made.lines.close()
@@ -98,7 +100,7 @@ def bench(magnet: Magnet) -> Iterator[Bench]:
         server.shutdown()
 
 
-def test_blocking_driver_is_busy_until_it_has_arrived(bench: Bench, magnet: Magnet) -> None:
+def test_blocking_driver_is_busy_until_it_has_arrived(bench: SecopBench, magnet: Magnet) -> None:
     assert bench.order(1, "m.field", "1000", "mT") == (ControlResponse.SUCCESS, "")
     assert (bench.readings()["m.field"].target, bench.readings()["m.field"].busy) == (1.0, True)
     assert bench.readings()["m.field"].value == 0.5
@@ -108,16 +110,37 @@ def test_blocking_driver_is_busy_until_it_has_arrived(bench: Bench, magnet: Magn
     bench.until(lambda: bench.readings()["m.field"].value == 1.0 and not bench.readings()["m.field"].busy)
 
 
-def test_server_refuses_and_names_the_reason(bench: Bench) -> None:
+def test_server_refuses_and_names_the_reason(bench: SecopBench) -> None:
     assert "must be between -2.0 and 2.0" in bench.order(1, "m.field", "3")[1]
     assert "can only be read" in bench.order(2, "m.level", "3", "%")[1]
     assert "has no unit" in bench.order(4, "m.field", "1", "")[1]
 
 
-def test_error_of_a_driver_makes_its_value_unknown(bench: Bench, magnet: Magnet) -> None:
+def test_error_of_a_driver_makes_its_value_unknown(bench: SecopBench, magnet: Magnet) -> None:
     magnet.let_go.set()
     assert bench.order(1, "m.field", "0.25")[0] == ControlResponse.SUCCESS
     bench.until(lambda: "quench" in bench.readings()["m.field"].reason)
     assert bench.readings()["m.field"].value is None
     magnet.tesla = 1.8
     bench.until(lambda: "ZeroDivisionError" in bench.readings()["m.level"].reason)
+
+
+def test_reset_connection_is_no_error_of_the_server() -> None:
+    errors, is_over = list[object](), threading.Event()
+    sample: Any = loaded()
+    with sample.Server({}, port=0) as server:
+        server.handle_error = lambda *given: errors.append(given)
+        close_request = server.close_request
+
+        def close(request: socket.socket) -> None:
+            close_request(request)
+            is_over.set()
+
+        server.close_request = close
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        client = socket.create_connection(server.server_address)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # close() sends a reset
+        client.close()
+        assert is_over.wait(60)
+        server.shutdown()
+    assert not errors

@@ -9,6 +9,7 @@ from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.model import ProbePosition, Region, Scan, ScanParameters, Spectrum
 from afspm.wire.generated.scan_pb2 import Scan2d
+from afspm.wire.values import with_zeros, without_values
 
 HERE = Region((1e-6, 2e-6), (3e-6, 1e-6), 0.1)
 THERE = Region((-4e-6, 5e-6), (3e-6, 1e-6), 0.3)
@@ -33,6 +34,19 @@ def test_a_scan_whose_values_are_not_packed_keeps_them_too() -> None:
     one = np.ones(1).tobytes()
     unpacked = rest.SerializeToString() + b"".join(bytes([4 << 3 | 1]) + one for _ in range(2))
     assert wire.relocated(name, unpacked, wire.encode_place(HERE)) == payload
+
+
+def test_zeros_replace_values_and_nothing_else() -> None:
+    scan = Scan(HERE, "Height", "m", VALUES, 123_456_789, "a.nc")
+    spectrum = Spectrum((1e-6, 2e-6), "IV", ("V", "I"), ("V", "A"), np.arange(6.0).reshape(3, 2), 7, "b.nc")
+    for one in (scan, spectrum):
+        name, payload = wire.encode(one)
+        zeros = with_zeros(name, payload)
+        assert len(zeros) == len(payload)
+        assert without_values(name, zeros) == without_values(name, payload)
+        np.testing.assert_array_equal(wire.decode(name, zeros).values, np.zeros_like(one.values))
+    name, payload = wire.encode(ProbePosition((0.1, 0.2)))
+    assert with_zeros(name, payload) == payload
 
 
 def test_a_scan_without_values_has_none_afterwards() -> None:

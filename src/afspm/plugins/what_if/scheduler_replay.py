@@ -17,7 +17,7 @@ from afspm.basics.launch import Launch
 from afspm.model.snapshot import restored
 from afspm.plugins.what_if.alignment import Difference, Output, PacketName, aligned
 from afspm.scheduler import events
-from afspm.scheduler.coordinate_frame import TIP_FRAME
+from afspm.scheduler.coordinate_frame import TIP_FRAME, CoordinateFrame
 from afspm.scheduler.saved_state import KIND, VERSION, SavedState
 from afspm.scheduler.scheduler import Scheduler
 from afspm.scheduler.scheduler_core import SchedulerCore
@@ -28,6 +28,7 @@ from afspm.transport.process.context import ProcessActivity, ProcessContext
 from afspm.transport.process.loading import load
 
 MakeCore = Callable[[], SchedulerCore]
+CoreOf = Callable[[Launch], tuple[MakeCore, CoordinateFrame]]
 _REACHING = ("Forward", "Kill")
 
 
@@ -42,6 +43,7 @@ class SchedulerReplay:
         first: the first of them.
         first_step: the step, counted from 1, since which states or effects differ.
         stopped: why the replay ended before the record; empty: it did not.
+        note: what limits the result, in words.
     """
 
     steps: int
@@ -52,32 +54,29 @@ class SchedulerReplay:
     stopped: str = ""
     real_s: float = 0.0
     recorded_s: float = 0.0
+    note: str = ""
 
 
-def read_steps(path: Path) -> Iterator[tuple[Launch, Restored] | Step]:
+def read_steps(path: Path, core_of: CoreOf) -> Iterator[tuple[MakeCore, Restored] | Step]:
     """Yield the beginnings of a scheduler's lives, and their steps.
 
     Raises:
         FileError: the file can't be read, or is not a step log.
+        ConfigError: a scheduler can't be made.
     """
+    frame: CoordinateFrame = TIP_FRAME
     try:
         for kind, *rest in read_lines(path):
             if kind == "life":
                 launch, saved, cached = rest
                 state = None if saved is None else restored(SavedState, saved, KIND, VERSION)
-                yield Launch.from_json(json.dumps(launch)), Restored(state, read_cached(cached))
+                make, frame = core_of(Launch.from_json(json.dumps(launch)))
+                yield make, Restored(state, read_cached(cached))
             elif kind == "step":
                 event, *more = rest
-                yield Step(_event(event), *more)
-    except (IndexError, TypeError, ValueError, WireError) as error:
-        raise FileError(f"is not a step log: {error}", where=str(path)) from error
-
-
-def _event(plain: list[Any] | None) -> events.Input | None:
-    try:
-        return read_event(plain)
-    except KeyError:
-        return events.FrameReported(plain)
+                yield Step(read_event(event, frame.reports), *more)
+    except (IndexError, KeyError, TypeError, ValueError, WireError) as error:
+        raise FileError(f"is not a step log: {error!r}", where=str(path)) from error
 
 
 def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> SchedulerReplay:
@@ -90,19 +89,7 @@ def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> Schedu
         FileError: the file can't be read, or is not a step log.
         ConfigError: the settings can't be used.
     """
-    core: MakeCore = _no_core
-
-    def lives() -> Iterator[tuple[MakeCore, Restored] | Step]:
-        nonlocal core
-        for one in read_steps(path):
-            if isinstance(one, Step):
-                yield one
-            else:
-                launch, beginning = one
-                core = _core_of(launch, settings)
-                yield core, beginning
-
-    return replay(lives())
+    return replay(read_steps(path, lambda launch: _core_of(launch, settings)))
 
 
 def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerReplay:
@@ -113,7 +100,7 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
     """
     before, now = list[Output](), list[Output]()
     core: SchedulerCore | None = None
-    steps, life, stopped = 0, 0, ""
+    steps, life, stopped, note = 0, 0, "", ""
     parted: int | None = None  # step since which the states differ
     first: Difference | None = None
     sums = StateSums()
@@ -131,8 +118,7 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
         steps += 1
         times = [*times[:1], one.now_ns]
         if isinstance(one.event, events.FrameReported):
-            stopped = "the reports of a coordinate frame are not recorded"
-            break
+            note = "results of the coordinate frame's worker are the recorded ones"
         try:
             made = _stepped(core, one)
         except Exception as error:  # changed decisions may fail on inputs of another night, and in any way
@@ -150,9 +136,9 @@ def replay(recorded: Iterable[tuple[MakeCore, Restored] | Step]) -> SchedulerRep
             break
     real_s, recorded_s = time.perf_counter() - began_s, (times[-1] - times[0]) / 1e9 if times else 0.0
     if first is None:
-        return SchedulerReplay(steps, len(before), [], None, None, stopped, real_s, recorded_s)
+        return SchedulerReplay(steps, len(before), [], None, None, stopped, real_s, recorded_s, note)
     same, differences = aligned("scheduler", before, now)
-    return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s)
+    return SchedulerReplay(steps, same, differences, first, parted, stopped, real_s, recorded_s, note)
 
 
 def _stepped(core: SchedulerCore, one: Step) -> list[list[Any]]:
@@ -191,27 +177,16 @@ def _input_name(event: events.Input | None) -> str:
             return type(event).__name__
 
 
-def _no_core() -> SchedulerCore:
-    raise FileError("is not a step log: it begins with a step")
-
-
-def _core_of(launch: Launch, settings: Mapping[str, Any] | None) -> MakeCore:
+def _core_of(launch: Launch, settings: Mapping[str, Any] | None) -> tuple[MakeCore, CoordinateFrame]:
     launch = replace(launch, settings=launch.settings if settings is None else dict(settings), keeps_requests=False)
-
-    def make() -> SchedulerCore:
-        scheduler = load(launch)
-        if not isinstance(scheduler, Scheduler):
-            raise ConfigError(f"{launch.class_} is not afspm's scheduler", where=launch.name)
-        clock = ExperimentClock.real()  # the settings do not depend on it
-        context = ProcessContext(launch, clock, _no_port, logging.getLogger("afspm.what_if"), ProcessActivity(clock))
-        if type(scheduler).coordinates is not Scheduler.coordinates:
-            raise ConfigError(
-                f"the decisions of {type(scheduler).__name__} can't be replayed: its frame has a worker",
-                where=launch.name,
-            )
-        return SchedulerCore(scheduler.settings(context), WireCodec(), TIP_FRAME)
-
-    return make
+    scheduler = load(launch)
+    if not isinstance(scheduler, Scheduler):
+        raise ConfigError(f"{launch.class_} is not afspm's scheduler", where=launch.name)
+    clock = ExperimentClock.real()  # the settings do not depend on it
+    context = ProcessContext(launch, clock, _no_port, logging.getLogger("afspm.what_if"), ProcessActivity(clock))
+    frame = scheduler.coordinates(context, in_process=True).frame  # its worker is never started
+    core_settings = scheduler.settings(context)
+    return (lambda: SchedulerCore(core_settings, WireCodec(), frame)), frame
 
 
 def _no_port(*_: object) -> Any:

@@ -127,11 +127,10 @@ class WhatIf:
         return rows
 
     def _note(self, name: str) -> str:
-        one: ComponentReplay | SchedulerReplay | None = self.components.get(name)
-        if one is None and name == self.scheduler_name:
-            one = self.scheduler
-        control = self.controls.get(name)
+        one, control = self.components.get(name), self.controls.get(name)
         notes = [one.stopped] if one is not None and one.stopped else []
+        if one is None and name == self.scheduler_name and self.scheduler is not None:
+            notes = [text for text in (self.scheduler.stopped, self.scheduler.note) if text]
         if control is not None and control.first is not None:
             notes.append("the unchanged component differs, too")
         elif control is not None:

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, get_args
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.frozen import replace
@@ -68,6 +68,7 @@ class SampleFrame:
     state: DriftState
 
     is_moving: ClassVar[bool] = True
+    reports: ClassVar[tuple[type, ...]] = get_args(WorkerReport)
 
     @classmethod
     def initial(cls, settings: DriftCompensationSettings, codec: DriftCodec, name: str) -> SampleFrame:
