@@ -21,6 +21,7 @@ from afspm.model import ControlMode, ControlState, ProcessCondition, Registratio
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write
 from afspm.record.run import open_run
+from afspm.record.run_json import EXPERIMENT_FILE
 from afspm.record.store import RecordSettings, RecordStore
 from afspm.record.timeline import Span
 
@@ -508,3 +509,22 @@ def test_planned_work_stands_beside_the_measured_work(run: Path) -> None:
     measured = "<td></td><td>measured</td><td>3</td><td>0</td><td>96 µm</td><td>22 min</td>"
     assert f"<tr>{head}</tr><tr>{measured}</tr>" in re.sub(r"\s*\n\s*", "", text)
     assert "tuner" not in text, "it has no estimate to compare"
+
+
+def test_readings_of_an_instrument_lie_on_the_time_line_with_their_band(tmp_path: Path) -> None:
+    folder = recorded(tmp_path)
+    (folder / EXPERIMENT_FILE).write_text(
+        '[conditions.cold]\n"cryo.temperature" = { from = "4.15 K", to = "4.25 K" }\n', encoding="utf-8"
+    )
+    with open_run(folder) as run:
+        shown = story.read(run)
+    for at_s, value in ((100, 4.2), (1000, 4.2), (1200, 4.4), (1400, 4.2), (3000, 4.21)):
+        reading = model.InstrumentReading("cryo.temperature", value, "K")
+        report = model.InstrumentReadings(START + at_s * S, "cryo", (reading,))
+        shown.overview.take("InstrumentReadings", report, report.time_ns, "")
+    html = page.html(shown, [], [], [])
+    drawn = html[html.index("Time line") : html.index("Problems and repairs")]
+    assert "cold allows 4.15 K to 4.25 K" in drawn
+    assert 'class="allowed"' in drawn
+    assert 'class="outside"' in drawn
+    assert drawn.index("lane curve") < drawn.index("lane-axis")

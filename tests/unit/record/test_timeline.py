@@ -4,7 +4,15 @@ import itertools
 import re
 from datetime import UTC
 
-from afspm.record.drawing.timeline import COLUMNS, TimelineCurve, TimelineRow, stretches, time_ticks, timeline_html
+from afspm.record.drawing.timeline import (
+    COLUMNS,
+    AllowedBand,
+    TimelineCurve,
+    TimelineRow,
+    stretches,
+    time_ticks,
+    timeline_html,
+)
 from afspm.record.timeline import Span
 
 S = 1_000_000_000
@@ -55,3 +63,39 @@ def test_curve_whose_newest_value_is_unknown_says_so() -> None:
     row = TimelineRow("control", (Span("series", 0, 60 * S),), lambda _: "")
     curve = TimelineCurve("cryo.t", "K", [0, 15 * S, 30 * S], [4.0, 5.0, float("nan")])
     assert "4 K to 5 K, now unknown" in timeline_html([row], 0, 60 * S, UTC, curves=[curve])
+
+
+COLD = AllowedBand("cold", 4.15, 4.25)
+
+
+def test_allowed_band_is_drawn_with_its_limits_and_marks_the_times_outside() -> None:
+    curve = TimelineCurve("cryo.t", "K", [0, 10 * S, 20 * S, 30 * S, 40 * S], [4.2, 4.2, 4.3, 4.2, 4.2], (COLD,))
+    assert curve.outside() == [(15 * S, 25 * S)]
+    drawn = timeline_html([TimelineRow("control", [Span("series", 0, 40 * S)], str)], 0, 40 * S, UTC, curves=[curve])
+    assert 'class="allowed"' in drawn
+    assert drawn.count("<line ") == 2
+    (mark,) = re.findall(r'class="outside" x="([\d.]+)" y="0" width="([\d.]+)"', drawn)
+    assert mark == (f"{COLUMNS * 15 / 40:.1f}", f"{COLUMNS * 10 / 40:.1f}")
+    assert "cold allows 4.15 K to 4.25 K" in drawn
+    assert "outside for 10 s" in drawn
+
+
+def test_time_outside_ends_where_the_value_becomes_unknown() -> None:
+    nan = float("nan")
+    curve = TimelineCurve("cryo.t", "K", [0, 10 * S, 20 * S, 30 * S, 40 * S], [4.3, 4.3, nan, 4.0, 4.2], (COLD,))
+    assert curve.outside() == [(0, 10 * S), (30 * S, 37_500_000_000)]
+
+
+def test_one_sided_band_has_one_limit() -> None:
+    curve = TimelineCurve("magnet.b", "T", [0, 10 * S], [1.0, 2.0], (AllowedBand("field", 1.5, float("inf")),))
+    assert curve.outside() == [(0, 5 * S)]
+    drawn = timeline_html([TimelineRow("control", [Span("series", 0, 10 * S)], str)], 0, 10 * S, UTC, curves=[curve])
+    assert drawn.count("<line ") == 1
+    assert "field allows at least 1.5 T" in drawn
+
+
+def test_value_between_two_gaps_is_a_dot() -> None:
+    nan = float("nan")
+    curve = TimelineCurve("cryo.t", "K", [0, 10 * S, 20 * S], [nan, 4.2, nan])
+    drawn = timeline_html([TimelineRow("control", [Span("series", 0, 20 * S)], str)], 0, 20 * S, UTC, curves=[curve])
+    assert 'class="dot"' in drawn

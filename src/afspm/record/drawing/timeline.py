@@ -32,10 +32,16 @@ CSS = """
 .strip>div{height:auto;aspect-ratio:14/1;background:none}
 .strip span{background:none;padding:1px}
 .strip img{width:100%;height:100%;object-fit:cover;display:block;border-radius:2px;cursor:pointer}
-.curve>div{height:46px}
-.curve svg{position:absolute;inset:0;width:100%;height:100%}
-.curve polyline{fill:none;stroke:currentColor;stroke-width:1.2;vector-effect:non-scaling-stroke}
-.curve em{position:absolute;left:4px;top:1px;font-size:11px;font-style:normal;color:var(--quiet)}
+.curve>div{height:70px}
+.curve svg{position:absolute;left:0;right:0;top:17px;bottom:0;width:100%;height:53px}
+.curve polyline,.curve line{fill:none;stroke:currentColor;stroke-width:1.3;vector-effect:non-scaling-stroke}
+.curve polyline{stroke-linecap:round}.curve polyline.dot{stroke-width:4}
+.curve line{stroke:#2f8f4e;stroke-dasharray:4 3}
+.curve .allowed{fill:#2f8f4e;fill-opacity:.2}
+.curve .outside{fill:#d0342c;fill-opacity:.3}
+.curve em{display:block;padding:0 4px;font-size:11px;line-height:17px;font-style:normal;color:var(--quiet)}
+.curve em{white-space:nowrap;overflow:hidden;text-overflow:ellipsis}
+.curve em b{display:inline;font:inherit;font-weight:600;color:#d0342c}
 .lane-axis>div{position:relative;height:18px}
 .lane-axis span{position:absolute;top:1px;font-size:11.5px;color:var(--quiet);transform:translateX(-50%)}
 .lanes{font-variant-numeric:tabular-nums}
@@ -66,6 +72,15 @@ class TimelineRow:
 
 
 @dataclass(frozen=True)
+class AllowedBand:
+    """The values that a condition allows; an infinite bound is none."""
+
+    condition: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class TimelineCurve:
     """A value over time under the rows; NaN where it is unknown."""
 
@@ -73,6 +88,25 @@ class TimelineCurve:
     unit: str
     times_ns: Sequence[int]
     values: Sequence[float]
+    bands: Sequence[AllowedBand] = ()
+
+    def outside(self) -> list[tuple[int, int]]:
+        """Return the times in which the value is outside a band: (from, to) in ns, interpolated between values."""
+        low = max((band.low for band in self.bands), default=-math.inf)
+        high = min((band.high for band in self.bands), default=math.inf)
+        found: list[tuple[int, int]] = []
+        points = list(zip(self.times_ns, self.values, strict=True))
+        for (t0, v0), (t1, v1) in zip(points, [*points[1:], points[-1]] if points else [], strict=True):
+            if not math.isfinite(v0):
+                continue
+            if not math.isfinite(v1):
+                t1, v1 = t0, v0  # how the value went on is unknown
+            for part in _outside(t0, v0, t1, v1, low, high):
+                if found and found[-1][1] == part[0]:
+                    found[-1] = (found[-1][0], part[1])
+                else:
+                    found.append(part)
+        return found
 
 
 @dataclass
@@ -194,27 +228,91 @@ def _merge(into: Stretch, one: Stretch) -> None:
     into.count += 1
 
 
+def _outside(t0: int, v0: float, t1: int, v1: float, low: float, high: float) -> list[tuple[int, int]]:
+    # the parts of one straight piece of a curve outside [low, high]
+    parts = []
+    for bound, sign in ((low, -1.0), (high, 1.0)):
+        begin, end = (sign * (v - bound) for v in (v0, v1))  # above zero: outside
+        if not math.isfinite(bound) or (begin <= 0.0 and end <= 0.0):
+            continue
+        crossing = t0 if begin == end else t0 + round((t1 - t0) * begin / (begin - end))
+        parts.append((t0 if begin > 0.0 else crossing, t1 if end > 0.0 else crossing))
+    return sorted(parts)
+
+
 def _curve(curve: TimelineCurve, begin_ns: int, end_ns: int) -> str:
-    # from the lowest value, at the bottom, to the highest; a gap where the value was unknown
-    known = [(t, v) for t, v in zip(curve.times_ns, curve.values, strict=True) if math.isfinite(v)]
+    # the lowest value or limit is at the bottom, the highest on top; a gap where the value was unknown
+    known = [v for v in curve.values if math.isfinite(v)]
     if not known:
         return f'<div class="lane"><b>{escape(curve.name)}</b><div></div></div>'
-    low, high = min(v for _, v in known), max(v for _, v in known)
-    lines, line = list[str](), list[str]()
+    limits = [v for band in curve.bands for v in (band.low, band.high) if math.isfinite(v)]
+    low, high = min(*known, *limits, known[0]), max(*known, *limits, known[0])
+
+    def up(value: float) -> float:
+        if high == low:
+            return 50.0
+        return min(100.0, max(0.0, 96.0 - 92.0 * (value - low) / (high - low)))
+
+    def across(time_ns: int) -> float:
+        return COLUMNS * (time_ns - begin_ns) / (end_ns - begin_ns)
+
+    lines, line = list[list[str]](), list[str]()
     for time_ns, value in zip(curve.times_ns, curve.values, strict=True):
         if not math.isfinite(value):
-            lines, line = [*lines, " ".join(line)], []
+            lines, line = [*lines, line], []
         elif begin_ns <= time_ns <= end_ns:
-            x = COLUMNS * (time_ns - begin_ns) / (end_ns - begin_ns)
-            y = 50.0 if high == low else 96.0 - 92.0 * (value - low) / (high - low)
-            line.append(f"{x:.1f},{y:.1f}")
-    drawn = "".join(f'<polyline points="{points}"/>' for points in (*lines, " ".join(line)) if points)
-    now = quantity(curve.values[-1], curve.unit) if math.isfinite(curve.values[-1]) else "unknown"
-    text = f"{quantity(low, curve.unit)} to {quantity(high, curve.unit)}, now {now}"
-    return (
-        f'<div class="lane curve" title="{escape(f"{curve.name}: {text}")}"><b>{escape(curve.name)}</b><div>'
-        f'<svg viewBox="0 0 {COLUMNS} 100" preserveAspectRatio="none">{drawn}</svg><em>{escape(text)}</em></div></div>'
+            line.append(f"{across(time_ns):.1f},{up(value):.1f}")
+    # a value between two gaps is a dot: a line from a point to itself with round ends
+    drawn = "".join(
+        f'<polyline points="{" ".join(points)}"/>'
+        if len(points) > 1
+        else f'<polyline class="dot" points="{" ".join(points * 2)}"/>'
+        for points in (*lines, line)
+        if points
     )
+    bands = "".join(_drawn_band(up(band.low), up(band.high), band) for band in curve.bands)
+    gone = [(max(a, begin_ns), min(b, end_ns)) for a, b in curve.outside() if a <= end_ns and b >= begin_ns]
+    # at least three columns, so that a short excursion is seen
+    marks = "".join(
+        f'<rect class="outside" x="{across(a):.1f}" y="0" width="{max(3.0, across(b) - across(a)):.1f}" height="100"/>'
+        for a, b in gone
+    )
+    text, alarm = _curve_texts(curve, min(known), max(known), sum(b - a for a, b in gone), len(gone))
+    shown = escape(text) + (f" · <b>{escape(alarm)}</b>" if alarm else "")
+    title = escape(f"{curve.name}: {text}{f'; {alarm}' if alarm else ''}")
+    return (
+        f'<div class="lane curve" title="{title}"><b>{escape(curve.name)}</b><div><em>{shown}</em>'
+        f'<svg viewBox="0 0 {COLUMNS} 100" preserveAspectRatio="none">{bands}{marks}{drawn}</svg></div></div>'
+    )
+
+
+def _drawn_band(below: float, above: float, band: AllowedBand) -> str:
+    # y grows downwards
+    dashes = "".join(
+        f'<line x1="0" x2="{COLUMNS}" y1="{y:.1f}" y2="{y:.1f}"/>'
+        for y, bound in ((below, band.low), (above, band.high))
+        if math.isfinite(bound)
+    )
+    height = max(0.0, below - above)
+    return f'<rect class="allowed" x="0" y="{above:.1f}" width="{COLUMNS}" height="{height:.1f}"/>{dashes}'
+
+
+def _curve_texts(curve: TimelineCurve, low: float, high: float, gone_ns: int, times: int) -> tuple[str, str]:
+    unit = curve.unit
+    now = quantity(curve.values[-1], unit) if math.isfinite(curve.values[-1]) else "unknown"
+    parts = [f"{quantity(low, unit)} to {quantity(high, unit)}, now {now}"]
+    for band in curve.bands:
+        if math.isinf(band.high):
+            allowed = f"at least {quantity(band.low, unit)}"
+        elif math.isinf(band.low):
+            allowed = f"at most {quantity(band.high, unit)}"
+        else:
+            allowed = f"{quantity(band.low, unit)} to {quantity(band.high, unit)}"
+        parts.append(f"{band.condition} allows {allowed}")
+    if not times:
+        return "; ".join(parts), ""
+    often = f", {times} times" if times > 1 else ""
+    return "; ".join(parts), f"outside for {duration_text(gone_ns / NS_PER_S)}{often}"
 
 
 def _row(row: TimelineRow, shown: Sequence[Stretch], begin_ns: int, end_ns: int, zone: tzinfo | None) -> str:

@@ -10,6 +10,7 @@ from afspm.basics.clock import NS_PER_S
 from afspm.basics.formatting import counted, day, duration_text, quantity
 from afspm.model import component_of
 from afspm.model.events import SUPERVISOR
+from afspm.record.allowed_bands import instrument_curves
 from afspm.record.drawing import timeline
 from afspm.record.drawing.image_html import data_url
 from afspm.record.overview import ROUTINE
@@ -54,7 +55,9 @@ def html(
 
 def _timeline(story: RunStory) -> str:
     local = PageTimes(story.start_ns, story.end_ns).is_local
-    return timeline.timeline_html(timeline_rows(story), story.start_ns, story.end_ns, UTC, local_too=local)
+    curves = instrument_curves(story.overview, story.bands)
+    rows = timeline_rows(story)
+    return timeline.timeline_html(rows, story.start_ns, story.end_ns, UTC, local_too=local, curves=curves)
 
 
 def _zones(clock: PageTimes) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from afspm.basics.formatting import counted
 from afspm.model import (
@@ -18,6 +18,7 @@ from afspm.model import (
     ScopeState,
     names,
 )
+from afspm.record.allowed_bands import AllowedBands, allowed_bands
 from afspm.record.drawing.timeline import TimelineRow
 from afspm.record.expected_end import plans_of
 from afspm.record.overview import Overview, ProcessRestart
@@ -62,6 +63,7 @@ class RunStory:
         ledger: totals of what was done to tip and sample.
         comparisons: planned and measured work of each component with a plan.
         agents: the work of each agent.
+        bands: the values of other instruments that measuring needed.
     """
 
     name: str
@@ -82,6 +84,7 @@ class RunStory:
     ledger: TreatmentLedger
     comparisons: Sequence[WorkComparison] = ()
     agents: Sequence[agents.AgentWork] = ()
+    bands: AllowedBands = field(default_factory=dict)
 
     @property
     def end_ns(self) -> int:
@@ -176,6 +179,7 @@ def read(run: Run) -> RunStory:
         seen_late=list({entry.problem: entry for entry in reversed(late)}.values()),
         comparisons=compare(plans_of(run.facts), scans, run.spectra),
         agents=agents.read(run),
+        bands=allowed_bands(run.folder),
     )
 
 

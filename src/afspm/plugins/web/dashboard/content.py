@@ -17,7 +17,8 @@ from afspm.plugins.web.dashboard.charts import Chart, drift_chart
 from afspm.plugins.web.dashboard.flags import Flag, flags
 from afspm.plugins.web.dashboard.sample_map import MapContent, map_html, picture_url
 from afspm.plugins.web.watch import Watch
-from afspm.record.drawing.timeline import TimelineCurve, TimelineRow, timeline_html, tint_class
+from afspm.record.allowed_bands import AllowedBands, instrument_curves
+from afspm.record.drawing.timeline import TimelineRow, timeline_html, tint_class
 from afspm.record.overview import OVER, Overview, ScanSummary
 from afspm.record.timeline import Span, Timeline
 
@@ -77,15 +78,22 @@ class Contents:
         limits: the allowed region of scans, in tip coordinates; None if it is not known.
         adjustable: parameters that a person may set in AUTOMATED, too.
         pictures: the address of small pictures of scans.
+        bands: the values of other instruments that measuring needs.
     """
 
     def __init__(
-        self, watch: Watch, limits: Region | None, adjustable: tuple[str, ...] = (), pictures: str = ""
+        self,
+        watch: Watch,
+        limits: Region | None,
+        adjustable: tuple[str, ...] = (),
+        pictures: str = "",
+        bands: AllowedBands | None = None,
     ) -> None:
         self._watch = watch
         self._adjustable = adjustable
         self._limits = limits
         self._pictures = pictures
+        self._bands = bands or {}
         self._lock = threading.Lock()
         self._content = Content()
         self._made_s = self._drawn_s = -math.inf
@@ -147,7 +155,7 @@ class Contents:
                 None,
                 now_ns,
                 pictures=self._strip(overview),
-                curves=curves_of(overview),
+                curves=instrument_curves(overview, self._bands),
             )
             for unfolded in (False, True)
         )
@@ -205,13 +213,6 @@ def trouble(watch: Watch) -> str:
         why = f" {said[0].upper()}{said[1:]}." if (said := watch.cut_off()) else ""
         return f"The experiment has been silent for {duration_text(silent_s)}: this page is that old.{why}"
     return ""
-
-
-def curves_of(overview: Overview) -> list[TimelineCurve]:
-    """Return a curve for each parameter of other instruments."""
-    return [
-        TimelineCurve(name, one.unit, one.times_ns, one.values) for name, one in sorted(overview.instruments.items())
-    ]
 
 
 def rows_of(overview: Overview, silent: Mapping[str, int], *, unfolded: bool = True) -> Iterator[TimelineRow]:

@@ -34,6 +34,7 @@ from afspm.plugins.web.dashboard.night import Night, NightWatch
 from afspm.plugins.web.dashboard.page import ASSETS, TABS, Page, Services, section
 from afspm.plugins.web.dashboard.pictures import Look, RenderedFrame
 from afspm.plugins.web.frames import ChannelFrame
+from afspm.record.allowed_bands import allowed_bands
 from afspm.record.drawing.palette import DIVERGING
 from afspm.record.drawing.raster import ValueRange, indices, png, value_range
 from afspm.record.notes import append_note
@@ -52,7 +53,8 @@ class NightPage(Page):
     def __init__(self, night: Night, pictures: str, services: Services, visitor: Visitor) -> None:
         self._night = night
         self._watch = NightWatch(night)
-        contents = Contents(self._watch, allowed_region(night.folder), pictures=pictures)
+        limits, bands = allowed_region(night.folder), allowed_bands(night.folder)
+        contents = Contents(self._watch, limits, pictures=pictures, bands=bands)
         ui.add_head_html(_HEAD)
         super().__init__(replace(services, watch=self._watch, contents=contents), replace(visitor, recorded=True))
         ui.on("moment", self._go)
