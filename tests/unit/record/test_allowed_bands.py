@@ -8,8 +8,7 @@ from pathlib import Path
 from afspm.model import ProblemNames
 from afspm.record.allowed_bands import allowed_bands, instrument_curves
 from afspm.record.drawing.timeline import AllowedBand
-from afspm.record.overview import Overview
-from afspm.record.overview import MOST_POINTS, ReadingCurve
+from afspm.record.overview import MOST_POINTS, Overview, ReadingCurve
 from afspm.record.run_json import EXPERIMENT_FILE
 
 
