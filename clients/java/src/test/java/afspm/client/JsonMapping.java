@@ -23,8 +23,8 @@ import java.util.Map;
 final class JsonMapping {
     private static final List<FileDescriptor> FILES = Arrays.asList(
             afspm.Analysis.getDescriptor(), afspm.Control.getDescriptor(), afspm.Drift.getDescriptor(), afspm.Feedback.getDescriptor(),
-            afspm.Geometry.getDescriptor(), afspm.Journal.getDescriptor(), afspm.Lines.getDescriptor(), afspm.Scan.getDescriptor(),
-            afspm.Spectroscopy.getDescriptor());
+            afspm.Geometry.getDescriptor(), afspm.Grants.getDescriptor(), afspm.Instruments.getDescriptor(), afspm.Journal.getDescriptor(),
+            afspm.Lines.getDescriptor(), afspm.Scan.getDescriptor(), afspm.Spectroscopy.getDescriptor());
 
     private JsonMapping() {
     }
