@@ -23,6 +23,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.basics.launch import Launch
+from afspm.basics.plain_data import PlainList
 from afspm.model import (
     CLOCK_REQUEST,
     ControlResponse,
@@ -65,7 +66,7 @@ class Step:
     event: events.Input | None
     now_s: float
     now_ns: int
-    effects: list[list[Any]]
+    effects: list[PlainList]
     state: dict[str, int]
 
 
@@ -183,7 +184,7 @@ def read_event(plain: Sequence[Any] | None) -> events.Input | None:
     return made
 
 
-def facts_of(effect: events.Effect) -> list[Any]:
+def facts_of(effect: events.Effect) -> PlainList:
     """Return an effect as a list of facts: kind, key, text for people, and the rest."""
     match effect:
         case events.Reply(_, name, response, asked):
@@ -223,7 +224,7 @@ def _code(response: Response) -> str:
     return str(response.code) if known is None else ControlResponse(response.code).name
 
 
-def _plain_event(event: events.Input) -> list[Any]:
+def _plain_event(event: events.Input) -> PlainList:
     name = type(event).__name__
     match event:
         case events.RequestIn(connection, who, request, user, heard_s):
@@ -245,7 +246,7 @@ def _request(request: Request) -> list[str]:
     return [*map(_text, wire.encode_request(request))]
 
 
-def _plain_packet(packet: Packet) -> list[Any]:
+def _plain_packet(packet: Packet) -> PlainList:
     payload = packet.payload
     kept = _text(payload) if len(payload) <= INLINE_BYTES else len(payload)
     return [packet.envelope, packet.time_ns, kept]
