@@ -16,7 +16,7 @@ from afspm.model import (
 )
 from afspm.testing.components.memory_network import ControlLine, Feed, Weather
 from afspm.testing.components.scheduler_host import SchedulerHost
-from afspm.testing.components.simulated_process import Alarm, Process
+from afspm.testing.components.simulated_process import Process, ProcessTimer
 from afspm.testing.components.simulated_time import SimulatedTime
 from tests.simulation.codec import TableCodec
 
@@ -70,7 +70,7 @@ class Client(Process):
         self._line: ControlLine | None = None
         self._feed: Feed | None = None
         self._doing: Doing | None = None
-        self._alarm = Alarm(self, self._go_on)
+        self._alarm = ProcessTimer(self, self._go_on)
         self._requests = 0
         self._asked: Request | None = None
         self._answer: Response | None = None

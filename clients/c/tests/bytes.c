@@ -144,6 +144,9 @@ static void nonsense(void) {
   expect(afspm_open("{\"name\": \"c\", \"sockets\": {\"control\": \"tcp://192.0.2.1:9\"}}", &client) == AFSPM_CONFIG,
          "another computer without keys is refused");
   afspm_free(client);
+  expect(afspm_open("{\"name\": \"c\", \"keys\": {\"insecure\": \"true\"}, \"sockets\": {\"control\": \"tcp://192.0.2.1:9\"}}", &client)
+             == AFSPM_OK, "unless the experiment is insecure");
+  afspm_free(client);
   expect(afspm_open("{\"name\": \"c\", \"request_timeout_s\": 0.05, \"request_retries\": 1, "
                     "\"sockets\": {\"control\": \"tcp://127.0.0.1:9\", \"subscribe\": [\"tcp://127.0.0.1:9\"]}}", &client) == AFSPM_OK,
          "a connection is not waited for");

@@ -33,6 +33,9 @@ pub struct Launch {
     #[serde(default = "three")]
     pub request_retries: u32,
     pub keys: Option<Keys>,
+    /// Other computers may be connected without keys: the experiment file says `[security] insecure = true`.
+    #[serde(skip)]
+    pub insecure: bool,
     /// The identity of the run; empty: unknown.
     pub run: String,
     /// True only if the microscope is certainly simulated.
@@ -90,6 +93,8 @@ pub struct Keys {
     pub servers: BTreeMap<String, String>,
     /// All connections are encrypted; else those to `servers`.
     pub everywhere: bool,
+    /// "true" in the keys of an experiment without encryption, which have no pair.
+    insecure: String,
 }
 
 impl std::fmt::Debug for Keys {
@@ -117,7 +122,8 @@ impl Launch {
     pub fn from_json(line: &str) -> Result<Launch> {
         let read: std::result::Result<Launch, _> = serde_json::from_str(line);
         let mut launch = read.map_err(|error| Error::Config(format!("the launch line can't be read: {error}")))?;
-        // `{"insecure": "true"}`: other computers may be connected without keys
+        // an experiment without encryption has `{"insecure": "true"}` there, or null
+        launch.insecure = launch.keys.as_ref().is_some_and(|keys| keys.insecure == "true");
         launch.keys = launch.keys.filter(|keys| !keys.secret.is_empty());
         if launch.name.is_empty() {
             return Err(Error::Config("the launch line names no process".into()));

@@ -61,7 +61,9 @@ export function parseLaunch(line: string): Launch {
     throw new ConfigError(`the launch line is not JSON: ${String(error)} (this program is started by \`afspm run\`)`);
   }
   if (!read?.name || !read.sockets) throw new ConfigError("the launch line has no name or no sockets");
-  return { ...DEFAULTS, ...read, name: read.name, sockets: { ...read.sockets, subscribe: read.sockets.subscribe ?? [] } };
+  // without encryption there is no pair: null, or {"insecure": "true"}
+  const keys = read.keys?.secret ? read.keys : null;
+  return { ...DEFAULTS, ...read, keys, name: read.name, sockets: { ...read.sockets, subscribe: read.sockets.subscribe ?? [] } };
 }
 
 /**

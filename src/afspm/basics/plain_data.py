@@ -13,6 +13,8 @@ Plain: TypeAlias = dict[str, Any]
 """A table that may be changed."""
 PlainMapping: TypeAlias = Mapping[str, Any]
 """A read-only table."""
+PlainList: TypeAlias = list[Any]
+"""A list, such as a line of a log in JSON."""
 
 
 class _Strict:

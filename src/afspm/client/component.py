@@ -157,7 +157,7 @@ class Component:
     def on_end(self) -> None:
         """Finish: the experiment has ended, the process is being stopped, or `run` has returned."""
 
-    def publish(self, message: Any, envelope: str | None = None) -> None:
+    def publish(self, message: object, envelope: str | None = None) -> None:
         """Publish an object of `afspm.model` or a message of your own type.
 
         Args:

@@ -23,10 +23,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from afspm import wire
 from afspm.basics.clock import Clock
+from afspm.basics.plain_data import PlainList
 from afspm.client.keyed_results import kept_in
 from afspm.model import Packet
 from afspm.storage.line_log import REQUESTS_FOLDER, LineLog
@@ -45,7 +45,7 @@ class RecordedClock:
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._thread = threading.get_ident()
-        self._readings: list[Any] = []
+        self._readings: PlainList = []
 
     def now_ns(self) -> int:
         time_ns = self._clock.now_ns()
@@ -70,7 +70,7 @@ class RecordedClock:
     def late(self) -> AbstractContextManager[None]:
         return self._clock.late()
 
-    def taken(self) -> list[Any]:
+    def taken(self) -> PlainList:
         """Return the readings since the last call: kind, value, kind, value …"""
         taken, self._readings = self._readings, []
         return taken
@@ -144,11 +144,11 @@ class RecordedPort:
             self._log.close()
             raise
 
-    def _place(self) -> list[Any] | None:
+    def _place(self) -> PlainList | None:
         packet = self._handled()
         return None if packet is None else [packet.time_ns, packet.envelope]
 
-    def _plain(self, incoming: Incoming) -> list[Any]:
+    def _plain(self, incoming: Incoming) -> PlainList:
         match incoming:
             case PacketReceived(packet, source):
                 return ["packet", packet.envelope, packet.time_ns, source, self._payload(packet)]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 from afspm.basics.errors import ConfigError, InvalidValue, UnitError
 from afspm.basics.formatting import quantity
+from afspm.basics.plain_data import Plain
 from afspm.basics.units import Angle, Length
 from afspm.client.component import Component
 from afspm.components.planned_scans import FRAME, Pixels, pair, shape_of
@@ -62,7 +63,7 @@ class Sweep(Component):
         end_when_done: bool = False,
     ) -> None:
         self.sweep, self.measure, self.end_when_done = _plan(parameters, order, seed), measure, end_when_done
-        self._given: dict[str, Any] = {"parameters": parameters, "order": order, "seed": seed}
+        self._given: Plain = {"parameters": parameters, "order": order, "seed": seed}
         of_scans = {"size": size, "center": center, "angle": angle, "pixels": pixels}
         for name, value in ({"at": at, "kind": kind} if measure == "scan" else of_scans).items():
             if value is not None:
@@ -133,7 +134,7 @@ def value_text(value: SweptValue, unit: str) -> str:
     return value if isinstance(value, str) else quantity(value, unit)
 
 
-def _plan(parameters: dict[str, Any], order: SweepOrder, seed: int) -> SweepPlan:
+def _plan(parameters: Plain, order: SweepOrder, seed: int) -> SweepPlan:
     for name, given in parameters.items():
         try:
             SweepPlan.of({name: given})

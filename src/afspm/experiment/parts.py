@@ -188,7 +188,7 @@ class VariableReferences:
         self._variables = variables
         self.used: set[str] = set()
 
-    def expand(self, value: Any, path: Path) -> Any:
+    def expand(self, value: object, path: Path) -> Any:
         """Return `value`, set at `path`, with all references in it replaced, also within replacements."""
         return self._expand(value, path, ())
 

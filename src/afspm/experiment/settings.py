@@ -97,7 +97,7 @@ def listening(component: type, settings: Table) -> Iterator[tuple[str, str, bool
                 yield name, address, mark.keyed
 
 
-def jsonable(value: Any, folder: Path) -> Any:
+def jsonable(value: object, folder: Path) -> Any:
     """Return `value` in JSON's types; a relative path is resolved against the experiment file's folder."""
     if isinstance(value, Enum):
         return value.value

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,7 +142,7 @@ def roughness(values: Array) -> Roughness | None:
     return Roughness(float(np.sqrt(np.mean(deviation**2))), float(np.mean(np.abs(deviation))))
 
 
-def flat_settings(table: Mapping[str, Any]) -> dict[str, str]:
+def flat_settings(table: Mapping[str, object]) -> dict[str, str]:
     """Return all values of an experiment file as JSON, by dotted key."""
     found: dict[str, str] = {}
     for key, value in table.items():

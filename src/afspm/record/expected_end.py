@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 from afspm.basics.clock import NS_PER_S
+from afspm.basics.plain_data import PlainMapping
 from afspm.model import Progress
 from afspm.model.planned_work import PlannedWork, planned_end_s
 from afspm.record.run_json import PLANNED
@@ -13,7 +13,7 @@ from afspm.record.run_json import PLANNED
 Plans = Mapping[str, PlannedWork | None]
 
 
-def plans_of(facts: Mapping[str, Any]) -> dict[str, PlannedWork | None]:
+def plans_of(facts: PlainMapping) -> dict[str, PlannedWork | None]:
     """Return the plans that run.json keeps, by component; None: no estimate."""
     return {name: data and PlannedWork.from_dict(data) for name, data in (facts.get(PLANNED) or {}).items()}
 

@@ -412,14 +412,14 @@ class Overview:
     def _on_note(self, note: Note, time_ns: int) -> None:
         self.notes.append(note)
 
-    def _on_drift_mapping(self, message: Any, time_ns: int) -> None:
+    def _on_drift_mapping(self, message: object, time_ns: int) -> None:
         self._measured.add_drift(message)
 
     def _on_drift_rescan(self, message: Any, time_ns: int) -> None:
         if message.kind == RescanKind.OPPOSITE:
             self._measured.opposite_ns.append(message.timestamp.ToNanoseconds())
 
-    def _on_spatial_point_with_score_list(self, message: Any, time_ns: int) -> None:
+    def _on_spatial_point_with_score_list(self, message: object, time_ns: int) -> None:
         self._measured.set_places(message)
 
     def _on_scan_parameters(self, parameters: ScanParameters, time_ns: int) -> None:

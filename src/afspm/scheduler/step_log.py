@@ -27,6 +27,7 @@ from typing import Any
 from afspm import wire
 from afspm.basics.errors import WireError
 from afspm.basics.launch import Launch
+from afspm.basics.plain_data import PlainList
 from afspm.model import (
     CLOCK_REQUEST,
     ControlResponse,
@@ -71,7 +72,7 @@ class Step:
     event: events.Input | None
     now_s: float
     now_ns: int
-    effects: list[list[Any]]
+    effects: list[PlainList]
     state: dict[str, int]
 
 
@@ -194,7 +195,7 @@ def read_event(plain: Sequence[Any] | None, reports: Iterable[type] = ()) -> eve
     return made
 
 
-def facts_of(effect: events.Effect) -> list[Any]:
+def facts_of(effect: events.Effect) -> PlainList:
     """Return an effect as a list of facts: kind, key, text for people, and the rest."""
     match effect:
         case events.Reply(_, name, response, asked):
@@ -226,7 +227,7 @@ def _code(response: Response) -> str:
     return str(response.code) if known is None else ControlResponse(response.code).name
 
 
-def _plain_event(event: events.Input) -> list[Any]:
+def _plain_event(event: events.Input) -> PlainList:
     name = type(event).__name__
     match event:
         case events.RequestIn(connection, who, request, user, heard_s):
@@ -249,8 +250,9 @@ def _request(request: Request) -> list[str]:
     return [*map(_text, wire.encode_request(request))]
 
 
-def _plain_packet(packet: Packet, message: str = "") -> list[Any]:
-    payload, kept = packet.payload, None  # type: Buffer, Any
+def _plain_packet(packet: Packet, message: str = "") -> PlainList:
+    payload: Buffer = packet.payload
+    kept: PlainData
     if len(payload) <= INLINE_BYTES:
         kept = _text(payload)
     elif (zeros := _with_zeros(message, payload)) is not None:

@@ -7,9 +7,9 @@ import logging
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from afspm.basics.errors import FileError
+from afspm.basics.plain_data import PlainList
 
 REQUESTS_FOLDER = "requests"
 """Folder of a run with the logs that `[record] requests = true` keeps."""
@@ -35,7 +35,7 @@ class LineLog:
         except OSError as error:
             self._give_up(error)
 
-    def add(self, line: list[Any]) -> None:
+    def add(self, line: PlainList) -> None:
         """Append a line of JSON's types."""
         if self._file is None:
             return
@@ -57,7 +57,7 @@ class LineLog:
         self.close()
 
 
-def read_lines(path: Path) -> Iterator[list[Any]]:
+def read_lines(path: Path) -> Iterator[PlainList]:
     """Yield the lines of a log; an incomplete line, left by a kill, is skipped.
 
     Raises:

@@ -95,7 +95,7 @@ class Memory(MutableMapping[str, Any]):
     def __getitem__(self, key: str) -> Any:
         return self._values[key]
 
-    def __setitem__(self, key: str, value: Any) -> None:
+    def __setitem__(self, key: str, value: object) -> None:
         if not isinstance(key, str):  # JSON turns keys into strings: after a restart the key would be another
             raise InvalidValue(f"a key must be a text, not {key!r}", where="memory")
         self._values[key] = value

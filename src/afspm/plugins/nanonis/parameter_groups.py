@@ -34,7 +34,7 @@ class Group(SettingsGroup):
         return numbers(self._ask, name, *arguments)
 
 
-def numbers(ask: Ask, name: str, *arguments: Any) -> tuple[Any, ...]:
+def numbers(ask: Ask, name: str, *arguments: object) -> tuple[Any, ...]:
     """Return the numbers that a function replies.
 
     Raises:

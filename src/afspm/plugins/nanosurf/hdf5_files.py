@@ -170,7 +170,7 @@ def _frame(attributes: PlainMapping) -> tuple[Region, tuple[int, int]]:
     return Region(center, (width, height), math.radians(angle_deg)), (rows, columns)
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     return hdf5.text(value) if isinstance(value, bytes | str) else getattr(value, "tolist", lambda: value)()
 
 

@@ -178,7 +178,7 @@ def _feedback(subject: object, problems: ProblemNames) -> str:
     return f"feedback: {', '.join(parts)}" if parts else "feedback"
 
 
-def _position(subject: Any, problems: ProblemNames) -> str:
+def _position(subject: object, problems: ProblemNames) -> str:
     if isinstance(subject, ProbePosition):
         return f"probe position: {position_text(subject.xy_m)}"
     if isinstance(subject, PositionChange):
@@ -188,7 +188,7 @@ def _position(subject: Any, problems: ProblemNames) -> str:
     return "probe position"
 
 
-def _mode(subject: Any, problems: ProblemNames) -> str:
+def _mode(subject: object, problems: ProblemNames) -> str:
     name = next((mode.name for mode in ControlMode if mode == subject), subject)
     return f"sets the mode {name}"
 

@@ -8,7 +8,7 @@ from afspm.basics.errors import ConfigError
 from afspm.simulation.settings import build, one_of
 from afspm.simulation.surfaces.ground import Flat, Particles, Rough, Steps
 from afspm.simulation.surfaces.patterns import Lattice, Stamper
-from afspm.simulation.surfaces.picture import Picture
+from afspm.simulation.surfaces.picture import PictureSurface
 from afspm.simulation.surfaces.relief import Relief, Surface
 
 KINDS: dict[str, type[Surface]] = {
@@ -18,7 +18,7 @@ KINDS: dict[str, type[Surface]] = {
     "lattice": Lattice,
     "rough": Rough,
     "flat": Flat,
-    "file": Picture,
+    "file": PictureSurface,
 }
 
 __all__ = ["KINDS", "Relief", "Surface", "surface_from"]
@@ -38,6 +38,6 @@ def surface_from(settings: object, where: str = "surface") -> Surface:
     kind = settings.get("kind", "steps")
     cls = KINDS[one_of(str(kind), KINDS, f"{where}.kind")]
     surface = build(cls, {key: value for key, value in settings.items() if key != "kind"}, where)
-    if isinstance(surface, Picture):
+    if isinstance(surface, PictureSurface):
         surface.load()
     return surface

@@ -84,7 +84,7 @@ def _reader(suffix: str) -> Reader:
 
 
 @dataclass(frozen=True)
-class Picture:
+class PictureSurface:
     """Heights of a file, centred at the origin and mirrored at its borders, so without a seam.
 
     Attributes:
@@ -121,7 +121,7 @@ class Picture:
 
 
 @lru_cache(maxsize=4)
-def _load(picture: Picture) -> tuple[tuple[Array, ...], tuple[float, float]]:
+def _load(picture: PictureSurface) -> tuple[tuple[Array, ...], tuple[float, float]]:
     # the picture with its successive halvings, and its size (x, y) in m
     found = read(Path(picture.path))
     heights, size_m = found.height_m, found.size_m

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from afspm.basics.errors import ConfigError
 from afspm.basics.launch import Launch
+from afspm.basics.plain_data import PlainMapping
 from afspm.client.component import Component
 from afspm.experiment import load as load_experiment
 from afspm.experiment.class_loader import importing_from
@@ -36,7 +36,7 @@ class BenchCast:
     scheduler: Scheduler
     scheduler_launch: Launch
     simulator: type[Simulator]
-    microscope: Mapping[str, Any]
+    microscope: PlainMapping
 
 
 def cast_of(file: str | Path, *overlays: str | Path, component: str, without: Collection[str]) -> BenchCast:

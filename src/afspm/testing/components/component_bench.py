@@ -15,6 +15,7 @@ from afspm import wire
 from afspm.basics.errors import ConfigError
 from afspm.basics.exit_codes import ExitCode
 from afspm.basics.launch import Launch
+from afspm.basics.plain_data import Plain, PlainMapping
 from afspm.basics.units import si
 from afspm.client.component import Component
 from afspm.client.loop import ComponentLoop
@@ -86,7 +87,7 @@ class Bench:
         component: Component,
         *,
         others: Mapping[str, Component] | None = None,
-        microscope: Mapping[str, Any] | None = None,
+        microscope: PlainMapping | None = None,
         problems: Mapping[str, int] | None = None,
         limits: ExperimentLimits | None = None,
         folder: Path | None = None,
@@ -240,7 +241,7 @@ class Bench:
             raise ConfigError(f"{until} has passed: it is {self.now_s:.0f} s after the start", where="Bench.run")
         self._go_to(until_s)
 
-    def at(self, when: Time, do: Callable[..., None], *args: Any) -> None:
+    def at(self, when: Time, do: Callable[..., None], *args: object) -> None:
         """Call `do(*args)` at an experiment time since the start: `bench.at("20 min", bench.kill)`."""
         self._time.at(max(_seconds(when), self.now_s), do, args)
 
@@ -327,12 +328,12 @@ class Bench:
         return self._times[self.name].component
 
     @property
-    def components(self) -> dict[str, Any]:
+    def components(self) -> Plain:
         """All components by name, in their current or last life."""
         return {name: life.component for name, life in self._times.items()}
 
     @property
-    def memory(self) -> dict[str, Any]:
+    def memory(self) -> Plain:
         """The memory of the component."""
         return dict(self.component.memory)
 

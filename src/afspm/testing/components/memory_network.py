@@ -36,7 +36,7 @@ class Host(Protocol):
     def sockets(self) -> dict[Any, None]:
         """The lines that end here; they break when it dies."""
 
-    def take(self, do: Callable[..., None], *args: Any) -> None:
+    def take(self, do: Callable[..., None], *args: object) -> None:
         """Call `do(*args)` now, later if the process is frozen, never if this life of it ends first."""
 
 
@@ -51,7 +51,7 @@ class Pipe:
         self.open = True
         self.silent = False
 
-    def send(self, do: Deliver, *args: Any) -> None:
+    def send(self, do: Deliver, *args: object) -> None:
         if self.silent:
             return
         timeline = self._timeline
@@ -61,7 +61,7 @@ class Pipe:
             self._last_s = time_s
         timeline.at(self._last_s, self._arrive, (do, args))
 
-    def _arrive(self, do: Deliver, args: tuple[Any, ...]) -> None:
+    def _arrive(self, do: Deliver, args: tuple[object, ...]) -> None:
         if self.open:
             self._receiver.take(do, *args)
 

@@ -49,7 +49,7 @@ from afspm.scheduler.scheduler_core import SchedulerCore
 from afspm.scheduler.settings import SchedulerSettings
 from afspm.scheduler.shell import FrameWorker
 from afspm.testing.components.memory_network import ControlLine, Feed, LineServer, PacketSource, Weather
-from afspm.testing.components.simulated_process import Alarm, Process
+from afspm.testing.components.simulated_process import Process, ProcessTimer
 from afspm.testing.components.simulated_time import SimulatedTime
 
 
@@ -143,7 +143,7 @@ class SchedulerHost(Process):
         self._by_connection: dict[int, ControlLine] = {}
         self._by_name: dict[str, ControlLine] = {}
         self._feeds: list[Feed] = []
-        self._ticking = Alarm(self, self._tick)
+        self._ticking = ProcessTimer(self, self._tick)
         self._journal_due = False
         self._replay: tuple[Packet, ...] = ()
 

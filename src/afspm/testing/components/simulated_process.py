@@ -18,7 +18,7 @@ class Cuttable(Protocol):
 _SAME_S = 1e-6
 
 
-class Alarm:
+class ProcessTimer:
     """A call of a process at a time that may be changed often; setting the same time again costs nothing."""
 
     def __init__(self, process: Process, ring: Callable[[], None]) -> None:
@@ -111,7 +111,7 @@ class Process:
 
     # --- for what happens to it ---
 
-    def take(self, do: Callable[..., None], *args: Any) -> None:
+    def take(self, do: Callable[..., None], *args: object) -> None:
         """Call `do(*args)` now, later if frozen, not at all if dead."""
         if not self.alive:
             return
@@ -120,11 +120,11 @@ class Process:
         else:
             do(*args)
 
-    def later(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
+    def later(self, delay_s: float, do: Callable[..., None], *args: object) -> Timer:
         """Call `do` in `delay_s`, if this life lasts that long."""
         return self.timeline.after(delay_s, self._if_same_life, self.life, do, args)
 
-    def _if_same_life(self, life: int, do: Callable[..., None], args: tuple[Any, ...]) -> None:
+    def _if_same_life(self, life: int, do: Callable[..., None], args: tuple[object, ...]) -> None:
         if life == self.life:
             self.take(do, *args)
 

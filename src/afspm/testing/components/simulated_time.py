@@ -6,7 +6,6 @@ import heapq
 import random
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 START_S = 1_750_000_000.0
 """Experiment time at the beginning."""
@@ -24,7 +23,7 @@ class Timer:
 
     __slots__ = ("args", "cancelled", "do")
 
-    def __init__(self, do: Callable[..., None], args: tuple[Any, ...]) -> None:
+    def __init__(self, do: Callable[..., None], args: tuple[object, ...]) -> None:
         self.do = do
         self.args = args
         self.cancelled = False
@@ -74,11 +73,11 @@ class SimulatedTime:
 
     # --- what happens ---
 
-    def after(self, delay_s: float, do: Callable[..., None], *args: Any) -> Timer:
+    def after(self, delay_s: float, do: Callable[..., None], *args: object) -> Timer:
         """Call `do(*args)` in `delay_s` real seconds; calls at the same time happen in the order of registration."""
         return self.at(self._time_s + delay_s if delay_s > 0.0 else self._time_s, do, args)
 
-    def at(self, time_s: float, do: Callable[..., None], args: tuple[Any, ...]) -> Timer:
+    def at(self, time_s: float, do: Callable[..., None], args: tuple[object, ...]) -> Timer:
         """Call `do(*args)` at a time that has not passed."""
         timer = Timer(do, args)
         self._order = order = self._order + 1

@@ -316,7 +316,7 @@ class CommandTree:
     def _span(values: list[float]) -> float:
         return max(map(abs, values), default=1.0) or 1.0
 
-    def _write_wrapper(self, root: Any, name: str, path: str) -> None:
+    def _write_wrapper(self, root: object, name: str, path: str) -> None:
         # The maker's client requests Python classes for the tree, by the path of its own file.
         file = Path(path)
         if not (PureWindowsPath(path).name.startswith("cmd_tree_") and file.suffix == ".py" and file.parent.is_dir()):

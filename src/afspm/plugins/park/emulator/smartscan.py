@@ -155,7 +155,7 @@ class SmartScanProgram(MakerProgram):
 
     # -- methods
 
-    def _set(self, path: str, value: Any) -> None:
+    def _set(self, path: str, value: object) -> None:
         if path not in self._values:
             raise InvalidValue(f"{path} can't be set")
         present = self._values[path]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from afspm.testing.clients.bench import ClientBench, ScriptedRun
 from afspm.testing.clients.checks.measure import require_scans, scan_step
 from afspm.testing.clients.checks.requests import begin_note, published
@@ -67,16 +69,17 @@ def requests_only(bench: ClientBench) -> None:
 @client_check(
     "keys/none",
     "Without keys in the launch line all this works, too.",
-    "`keys` may be `null`.",
+    "`keys` may be `null`, or have no `secret`: connect plain.",
 )
 def none(bench: ClientBench) -> None:
     _works(bench, Security.NONE)
+    _works(bench, Security.NONE, keys=None)
 
 
-def _works(bench: ClientBench, security: Security) -> None:
+def _works(bench: ClientBench, security: Security, **changes: Any) -> None:
     experiment = bench.new_experiment(security)
     try:
-        with bench.client(experiment) as client:
+        with bench.client(experiment, **changes) as client:
             require_scans(experiment, client.program.do("scan", **scan_step()), scan_step())
     finally:
         experiment.close()
