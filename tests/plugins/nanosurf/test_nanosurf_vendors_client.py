@@ -8,7 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
-import time
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -64,12 +64,35 @@ def client(tmp_path: Path) -> Run:
     return run
 
 
-def emulated() -> Emulated:
-    return Emulated(seed=2, start_s=0.01, file_s=0.01)
+class Observed(Emulated):
+    """An emulated Studio that notifies after each of its steps, in which it writes files."""
+
+    def __init__(self) -> None:
+        super().__init__(seed=2, start_s=0.01, file_s=0.01)
+        self._stepped = threading.Condition()
+
+    def tick(self, now_s: float) -> float | None:
+        again_s = super().tick(now_s)
+        with self._stepped:
+            self._stepped.notify_all()
+        return again_s
+
+    def wait_for_files(self, folder: Path, count: int) -> None:
+        """Wait for a number of complete files."""
+        with self._stepped:
+            there = self._stepped.wait_for(lambda: complete_files(folder) == count, DEADLINE_S)
+        assert there, f"there are {list(folder.iterdir())}"
+
+
+def complete_files(folder: Path) -> int:
+    try:
+        return len([afspm.read(path) for path in folder.glob("*.nhf")])
+    except AfspmError:  # half of a file is written
+        return 0
 
 
 def test_client_finds_the_application_and_its_release(tmp_path: Path, client: Run) -> None:
-    with emulated().running(tmp_path / "gallery") as address:
+    with Observed().running(tmp_path / "gallery") as address:
         told = client(
             address,
             """
@@ -81,7 +104,7 @@ print(json.dumps({"version": studio.version(), "list": listed}))
 
 
 def test_client_measures_as_in_the_makers_example(tmp_path: Path, client: Run) -> None:
-    made = emulated()
+    made = Observed()
     with made.running(tmp_path / "gallery") as address:
         told = client(
             address,
@@ -106,7 +129,7 @@ print(json.dumps({
 """,
         )
         assert not made.rig.engaged
-        wait_for_files(tmp_path / "gallery", 2)
+        made.wait_for_files(tmp_path / "gallery", 2)
     assert told == {"head": "SIMULATED", "unit": "°", "points": 24, "setpoint": 0.7, "messages": ["", ""]}
     scan = made.rig.scan
     assert scan is not None
@@ -116,7 +139,7 @@ print(json.dumps({
 
 
 def test_the_makers_demo_runs_to_its_end(tmp_path: Path, client: Run) -> None:
-    made = emulated()
+    made = Observed()
     with made.running(tmp_path / "gallery", ExperimentClock.starting_now(speed=1000.0)) as address:
         told = client(
             address,
@@ -130,7 +153,7 @@ print(json.dumps({{"printed": printed.getvalue()}}))
 """,
             ELSEWHERE,
         )
-        wait_for_files(tmp_path / "gallery", 1)
+        made.wait_for_files(tmp_path / "gallery", 1)
     assert str(told["printed"]).endswith("Session complete.\n"), told
     assert "Studio error" not in str(told["printed"])
     (file,) = (tmp_path / "gallery").glob("demo_20??-??-??_00001.nhf")
@@ -138,7 +161,7 @@ print(json.dumps({{"printed": printed.getvalue()}}))
 
 
 def test_every_cell_of_the_makers_notebook_runs(tmp_path: Path, client: Run) -> None:
-    made = emulated()
+    made = Observed()
     with made.running(tmp_path / "gallery", ExperimentClock.starting_now(speed=1000.0)) as address:
         told = client(
             address,
@@ -183,7 +206,7 @@ print(json.dumps({{
 
 
 def test_values_have_limits_and_the_setpoint_has_units(tmp_path: Path, client: Run) -> None:
-    with emulated().running(tmp_path / "gallery") as address:
+    with Observed().running(tmp_path / "gallery") as address:
         told = client(
             address,
             """
@@ -222,7 +245,7 @@ print(json.dumps({**found, "printed": printed}))
 
 
 def test_script_error_is_raised_by_the_client(tmp_path: Path, client: Run) -> None:
-    with emulated().running(tmp_path / "gallery") as address:
+    with Observed().running(tmp_path / "gallery") as address:
         told = client(
             address,
             """
@@ -240,16 +263,3 @@ print(json.dumps({"printed": printed}))
         "Script Error: imaging.points_per_line: 1000000000.0 is not within 2 to 8192",
         "Script Error: imaging.points_per_line: 0 is not within 2 to 8192",
     ]
-
-
-def wait_for_files(folder: Path, count: int) -> None:
-    """Wait for a number of complete files."""
-    deadline_s = time.monotonic() + DEADLINE_S
-    while time.monotonic() < deadline_s:
-        try:
-            if len([afspm.read(path) for path in folder.glob("*.nhf")]) == count:
-                return
-        except AfspmError:
-            pass
-        time.sleep(0.02)  # another process's files
-    raise AssertionError(f"there are {list(folder.iterdir())}")
