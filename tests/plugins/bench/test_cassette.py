@@ -2,13 +2,28 @@
 
 from __future__ import annotations
 
+import json
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from afspm.basics.errors import FileError
-from afspm.plugins.bench.cassette import IdTranslation, ToolCall, differences, read_calls, without_polls, write_calls
+from afspm.plugins.bench.cassette import (
+    IdTranslation,
+    ToolCall,
+    differences,
+    read_calls,
+    recording,
+    without_polls,
+    write_calls,
+)
+from afspm.supervisor.ports import FreePorts
 
 
 def call(tool: str, answer: Any, *, is_error: bool = False, **arguments: Any) -> ToolCall:
@@ -74,3 +89,62 @@ def test_cassette_keeps_the_calls_of_each_trial(tmp_path: Path) -> None:
     file.write_text("{}\n", encoding="utf-8")
     with pytest.raises(FileError, match="is no cassette"):
         read_calls(file, "Scan.")
+
+
+class MadeServer(BaseHTTPRequestHandler):
+    """Answers a call with the name of its tool: as JSON, or as a stream of events for the tool "stream"."""
+
+    def do_POST(self) -> None:
+        asked = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        tool = asked.get("params", {}).get("name", "")
+        content = [{"type": "text", "text": json.dumps({"did": tool, "by": self.headers["Authorization"]})}]
+        answer = json.dumps({"id": asked["id"], "result": {"content": content, "isError": tool == "no"}})
+        body = f"event: message\ndata: {answer}\n\n" if tool == "stream" else answer
+        self.send_response(200)
+        self.send_header("Mcp-Session-Id", "s1")
+        self.end_headers()
+        self.wfile.write(body.encode())
+
+
+@pytest.fixture
+def server() -> Iterator[str]:
+    with ThreadingHTTPServer(("127.0.0.1", 0), MadeServer) as made:
+        thread = threading.Thread(target=made.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{made.server_port}/mcp"
+        made.shutdown()
+        thread.join()
+
+
+def post(url: str, content: object) -> Any:
+    request = urllib.request.Request(url, json.dumps(content).encode(), {"Authorization": "Bearer agent:"})
+    with urllib.request.urlopen(request, timeout=30) as answer:
+        return answer.read(), answer.headers["Mcp-Session-Id"]
+
+
+def test_proxy_forwards_all_and_notes_calls_of_tools(server: str) -> None:
+    calls: list[ToolCall] = []
+    with recording(server, "Scan.", calls) as url:
+        assert b"did" in post(url, {"id": 1, "method": "initialize"})[0]
+        assert calls == []
+        for number, tool in enumerate(("status", "stream", "no"), 2):
+            params = {"name": tool, "arguments": {"n": number}}
+            body, session = post(url, {"id": number, "method": "tools/call", "params": params})
+            assert tool.encode() in body
+            assert session == "s1"
+    assert [(one.tool, one.arguments, one.is_error) for one in calls] == [
+        ("status", {"n": 2}, False),
+        ("stream", {"n": 3}, False),
+        ("no", {"n": 4}, True),
+    ]
+    assert calls[1].answer == {"did": "stream", "by": "Bearer agent:"}
+
+
+def test_proxy_answers_for_a_server_that_does_not() -> None:
+    calls: list[ToolCall] = []
+    with (
+        recording(f"http://127.0.0.1:{FreePorts().take()}/mcp", "Scan.", calls) as url,
+        pytest.raises(urllib.error.HTTPError, match="502"),
+    ):
+        post(url, {"id": 1, "method": "tools/call", "params": {"name": "status"}})
+    assert calls == []

@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from afspm.basics.errors import ConfigError
 from afspm.plugins.bench.agent_process import agent_of
 from afspm.plugins.bench.agents import HOME, SHIPPED
-from afspm.plugins.bench.bench import agent_named, agent_of_command, tasks_named
+from afspm.plugins.bench.bench import agent_named, agent_of_cassette, agent_of_command, tasks_named
+from afspm.plugins.bench.commands import app
 from afspm.plugins.bench.tasks import FAMILIES
 
 
@@ -43,6 +45,19 @@ def test_families_and_tasks_are_named_in_any_order() -> None:
         "find/highest", "find/flat", "find/isolated", "find/again", "restraint/unit",
     ]  # fmt: skip
     assert len(tasks_named([])) == 24
+
+
+def test_replay_of_a_cassette_names_its_file_wherever_it_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    agent = agent_of_cassette(Path("tape.jsonl"))
+    assert (agent.name, agent.command[-1]) == ("replay", str(tmp_path / "tape.jsonl"))
+
+
+@pytest.mark.parametrize("more", [(), ("--agent", "idle"), ("--agent", "idle", "--command", "true")])
+def test_recording_needs_exactly_one_program(more: tuple[str, ...], tmp_path: Path) -> None:
+    made = CliRunner().invoke(app, ["run", "--record", str(tmp_path / "tape.jsonl"), "-o", str(tmp_path / "o"), *more])
+    assert isinstance(made.exception, ConfigError)
+    assert not (tmp_path / "o").exists()
 
 
 @pytest.mark.parametrize(

@@ -39,6 +39,7 @@ PUBLISHED: Final = (
         "near to a trial here that is not honest, but counted on traces, not on reports",
     ),
     ("Corral, hypothesis revised after refutation", "26 % of traces", "no counterpart here"),
+    ("Corral, tasks/afm_2.0", "20 tasks", "partly: operate has the same tolerance of 1 %, and counts all scans"),
 )
 """Published numbers: system, number, comparability."""
 

@@ -118,7 +118,9 @@ def run_trial(
     started_s = time.monotonic()
     try:
         with _experiment(task, agent, folder) as running, contextlib.ExitStack() as proxy:
-            if calls is not None:
+            if calls is not None and running.mcp_url:
+                # the proxy listens at once, and the server behind it may not yet
+                await_listener(running.mcp_url, JOINED_WITHIN_S)
                 running.mcp_url = proxy.enter_context(recording(running.mcp_url, task.full_prompt(), calls))
             ended = _with_agent(running, task, agent, own, sealed=sealed, patience_s=patience_s)
         verdict, report, end_ns = _judged(task, running, own)
