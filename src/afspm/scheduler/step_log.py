@@ -252,7 +252,7 @@ def _request(request: Request) -> list[str]:
 
 def _plain_packet(packet: Packet, message: str = "") -> PlainList:
     payload: Buffer = packet.payload
-    kept: PlainData
+    kept: object
     if len(payload) <= INLINE_BYTES:
         kept = _text(payload)
     elif (zeros := _with_zeros(message, payload)) is not None:
