@@ -221,6 +221,7 @@ def test_hazards_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         "wall_clock": (lab.WallClock(), "reads the wall clock by time_ns(), instead of self.clock (what_if_lab.py:"),
         "unseeded": (lab.Unseeded(), "draws random numbers without a seed of its own (what_if_lab.py:"),
         "unseeded_numpy": (lab.UnseededNumpy(), "draws random bytes of the operating system (what_if_lab.py:"),
+        "shared_numpy": (lab.SharedNumpy(), "draws random numbers of numpy without a seed of its own"),
         "outside_file": (lab.OutsideFile(), f"reads a file that is not in the record: {outside}"),
     }
     lab.record(night, {name: component for name, (component, _) in planted.items()}, until="25 min")

@@ -87,6 +87,11 @@ class UnseededNumpy(Remarks):
         return f"drew {np.random.default_rng().random()}"
 
 
+class SharedNumpy(Remarks):
+    def remark(self, scan: Scan) -> str:
+        return f"drew {np.random.random()}"
+
+
 class SetOrder(Remarks):
     def remark(self, scan: Scan) -> str:
         return " ".join({f"word{number}" for number in range(30)})
