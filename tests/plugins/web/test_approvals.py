@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from afspm import wire
 from afspm.basics.errors import InvalidValue
-from afspm.model import Approval, GrantedCount, Proposal
-from afspm.plugins.agent.approval import simulated
+from afspm.model import Approval, GrantedCount, GrantedRange, Proposal
+from afspm.plugins.agent.approval import of_table, simulated
 from afspm.plugins.agent.plan import read_plan
-from afspm.plugins.web.dashboard.approvals import in_force, reviewed, title
+from afspm.plugins.web.archive import agents_in
+from afspm.plugins.web.dashboard.approvals import in_force, reviewed, title, waiting
+from afspm.plugins.web.dashboard.grant_dialog import GrantFields
+from afspm.plugins.web.dashboard.steering_panel import drawn_box
+from afspm.record.run_json import EXPERIMENT_FILE
 
 PLAN = read_plan({
     "title": "look <b>here</b>\u202e",
@@ -57,6 +65,76 @@ def test_failed_simulation_is_not_shown_as_harmless() -> None:
 
 def test_approval_in_force_shows_its_person_and_its_end() -> None:
     plan = Approval("agent:claude", "abc", "dashboard:Ada", 0, steps_left=3)
-    assert "agent:claude may carry out plan abc, 3 requests left; approved by Ada until 19" in in_force(plan)
-    grant = Approval("agent:claude", "", "dashboard:Ada", 0, left=(GrantedCount("start-scan", 20),))
-    assert "may measure by itself, left: start-scan: 20; approved by Ada" in in_force(grant)
+    agent, what, details = in_force(plan)
+    assert (agent, what) == ("agent:claude", "may carry out plan abc: 3 requests left")
+    assert details.startswith("approved by Ada until 19")
+
+
+def test_grant_in_force_shows_its_box_and_its_uses() -> None:
+    grant = Approval(
+        "agent:claude", "", "dashboard:Ada", 0, left=(GrantedCount("start-scan", 17),),
+        region_m=(0.0, 0.0, 2e-6, 1e-6), ranges=(GrantedRange("tip-bias-voltage", -0.5, 0.5),),
+        counts=(GrantedCount("start-scan", 20),),
+    )  # fmt: skip
+    _, what, details = in_force(grant)
+    assert what == "may measure by itself, start-scan: 3 of 20 used"
+    assert details.startswith("2 × 1 µm at (0, 0) nm; tip-bias-voltage -500 mV to 500 mV; approved by Ada")
+
+
+def test_waiting_proposal_names_its_agent_its_requests_and_its_simulation() -> None:
+    agent, what, details = waiting(proposal())
+    assert agent == "agent:claude"
+    assert what.startswith("waits for your approval: “look <b>here</b>\\u202e”: set tip-bias-voltage to 0.5 V; ")
+    assert details == simulated(proposal())
+
+
+FIELDS = GrantFields(
+    agent="agent:claude",
+    lasts="2 h",
+    x=("-1 um", "1 um"),
+    y=("-1 um", "1 um"),
+    ranges=[("tip-bias-voltage", "-0.5 V", "0.5 V"), ("", "", "")],
+    counts={"start-scan": "20", "start-spec": "0", "x-pulse": "0"},
+)
+
+
+def test_fields_of_the_dialog_are_the_table_of_the_command_line() -> None:
+    assert FIELDS.table() == {
+        "agent": "agent:claude",
+        "for": "2 h",
+        "region": {"x": ["-1 um", "1 um"], "y": ["-1 um", "1 um"]},
+        "parameters": {"tip-bias-voltage": ["-0.5 V", "0.5 V"]},
+        "counts": {"start-scan": 20},
+    }
+    grant = of_table(FIELDS.table(), {"run": "r", "limits": "l", "now_ns": 1})
+    assert grant.region_m == (0.0, 0.0, 2e-6, 2e-6)
+    assert grant.counts == (GrantedCount("start-scan", 20),)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({"counts": {"start-scan": "many"}}, "not a whole number"),
+        ({"counts": {"start-scan": "-1"}}, "not a whole number"),
+        ({"counts": {"start-scan": "0"}}, "without any action"),
+        ({"ranges": [("", "1 V", "2 V")]}, "no name"),
+        ({"ranges": [("scan-speed", "", "2 um/s")]}, "a lowest and a highest value"),
+        ({"ranges": [("scan-speed", "1 um/s", "2 um/s")] * 2}, "named twice"),
+        ({"x": ("", "")}, "a lowest and a highest value"),
+    ],
+)
+def test_incomplete_fields_are_refused(wrong: dict[str, Any], why: str) -> None:
+    with pytest.raises(InvalidValue, match=why):
+        replace(FIELDS, **wrong).table()
+
+
+def test_drawn_rectangle_of_a_turned_picture_is_the_box_around_it() -> None:
+    box = drawn_box({"x": 1.0, "y": 2.0, "width": 2.0, "height": 1.0, "angle": math.pi / 2})
+    assert box.center_m == (1.0, 2.0)
+    assert box.size_m == pytest.approx((1.0, 2.0))
+
+
+def test_agents_of_the_experiment_file_are_suggested(tmp_path: Path) -> None:
+    text = '[agent]\nclass = "Agent"\n[agent.people]\nclaude = "x"\n[other]\nclass = "Agent"\n[judge]\nclass = "J"\n'
+    (tmp_path / EXPERIMENT_FILE).write_text(text, encoding="utf-8")
+    assert agents_in(tmp_path) == ("agent:claude", "other:")

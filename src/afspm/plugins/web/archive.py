@@ -13,6 +13,7 @@ from afspm.basics.errors import AfspmError
 from afspm.basics.plain_data import Plain
 from afspm.basics.units import si
 from afspm.model import ProblemNames, Region, Scan, Spectrum
+from afspm.model.events import PERSON
 from afspm.plugins.web.frames import ChannelFrame, FrameKey
 from afspm.record.journal import JOURNAL_FILE
 from afspm.record.overview import Overview
@@ -20,6 +21,7 @@ from afspm.record.run import open_run
 from afspm.record.run_json import EXPERIMENT_FILE
 
 KEPT = 6
+_AGENT = "Agent"
 
 
 class Archive:
@@ -95,12 +97,29 @@ def adjustable_parameters(folder: Path) -> tuple[str, ...]:
     return tuple(map(str, offered)) if isinstance(offered, list) else ()
 
 
+def agents_in(folder: Path) -> tuple[str, ...]:
+    """Return names of agents in the expanded experiment file, for suggestions; the scheduler decides which there are.
+
+    A component without `people` admits any name: its suggestion ends with the colon.
+    """
+    found = []
+    for name, section in _sections(folder).items():
+        if isinstance(section, dict) and str(section.get("class", "")).rpartition(".")[2] == _AGENT:
+            people = section.get("people")
+            found += [f"{name}{PERSON}{one}" for one in (people if isinstance(people, dict) and people else ("",))]
+    return tuple(found)
+
+
 def _section(folder: Path, name: str) -> Plain:
+    section = _sections(folder).get(name)
+    return section if isinstance(section, dict) else {}
+
+
+def _sections(folder: Path) -> Plain:
     try:
-        section = tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8")).get(name)
+        return tomllib.loads((folder / EXPERIMENT_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return section if isinstance(section, dict) else {}
 
 
 def _region(box: Plain) -> Region:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,9 +12,10 @@ from dataclasses import dataclass, field
 from afspm import wire
 from afspm.basics.errors import AfspmError, UnitError
 from afspm.basics.formatting import counted, quantity, typeset_position
+from afspm.basics.plain_data import Plain
 from afspm.basics.units import parse_quantity
 from afspm.client.parameter_text import from_parameter
-from afspm.model import GRANT_REQUEST, ControlMode, ControlResponse, Grant, Region, Response, names
+from afspm.model import CLOCK_REQUEST, GRANT_REQUEST, ControlMode, ControlResponse, Grant, Region, Response, names
 from afspm.model.geometry import XY
 from afspm.plugins.web.dashboard.access import Access, Visitor
 from afspm.plugins.web.person_commands import PersonCommands
@@ -77,9 +79,21 @@ class Actions:
         return ActionResult(f"Cleared {counted(len(problems), 'problem')}")
 
     def approve(self, grant: Grant) -> ActionResult:
-        """Approve a plan of an agent, or revoke its approvals."""
-        done = "are revoked" if grant.revokes else f"include {grant.plan}"
+        """Approve a plan of an agent, give it a grant, or revoke its approvals."""
+        done = "are revoked" if grant.revokes else f"include {grant.plan or 'the grant'}"
         return _result(self._commands.request(GRANT_REQUEST, grant), f"The approvals of {grant.agent} {done}")
+
+    def approval_facts(self) -> Plain:
+        """Return the facts that an approval given now is valid for.
+
+        Raises:
+            AfspmError: the scheduler does not give them.
+        """
+        response = self._commands.request(CLOCK_REQUEST)
+        if not response.ok:
+            raise AfspmError(refusal(response))
+        facts: Plain = json.loads(response.payload)
+        return facts
 
     def restart(self, process: str) -> ActionResult:
         return _result(self._commands.restart(process), f"{process} is being restarted")

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import partial
 from html import escape
 
 from nicegui import background_tasks, ui
 
 from afspm.basics.errors import AfspmError
-from afspm.basics.formatting import day_and_time
-from afspm.model import Approval, Frame, Grant, Proposal
+from afspm.basics.formatting import counted, day_and_time, quantity, typeset_area, typeset_position
+from afspm.model import Approval, Frame, Grant, Proposal, names
 from afspm.model.events import PERSON
 from afspm.plugins.agent.approval import of_plan, simulated
+from afspm.plugins.agent.plan import plan_of
 from afspm.plugins.agent.untrusted import escaped
 from afspm.plugins.web.dashboard.actions import ActionResult
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, ask_in_dialog, button
 
 MOST_SHOWN = 5
+STEPS_SHOWN = 3
 
 
 class ApprovalBar:
@@ -47,16 +50,20 @@ class ApprovalBar:
                 self._add_proposal(proposal)
 
     def _add_approval(self, approval: Approval) -> None:
-        with ui.element("div").classes("flag"):
-            ui.label(in_force(approval))
+        with ui.element("div").classes("flag approval"):
+            ui.html(_line_html(*in_force(approval)), sanitize=False)
             if self._session.may_steer:
-                button("Revoke", partial(self._revoke, approval.agent))
+                self._button("Revoke", approval.agent, partial(self._revoke, approval.agent))
 
     def _add_proposal(self, proposal: Proposal) -> None:
-        with ui.element("div").classes("flag"):
-            ui.label(f"{proposal.who} proposes {proposal.id}: “{title(proposal)}”")
+        with ui.element("div").classes("flag waits"):
+            ui.html(_line_html(*waiting(proposal)), sanitize=False)
             if self._session.may_steer:
-                button("Review", partial(self._review, proposal))
+                self._button("Review", proposal.id, partial(self._review, proposal))
+
+    def _button(self, text: str, what: str, on_click: Callable[[], object]) -> None:
+        # as text of properties a name could set others
+        button(text, on_click).props["aria-label"] = f"{text} {what}"
 
     def _revoke(self, agent: str) -> None:
         self._session.do(lambda a: a.approve(Grant(agent)))
@@ -81,16 +88,44 @@ class ApprovalBar:
                 self._session.do(lambda a: a.approve(grant))
 
 
-def in_force(approval: Approval) -> str:
-    """Return an approval in words."""
-    left = ", ".join(f"{one.action}: {one.count}" for one in approval.left) or "no action"
-    what = (
-        f"may carry out plan {approval.plan}, {approval.steps_left} requests left"
-        if approval.plan
-        else f"may measure by itself, left: {left}"
-    )
-    until = day_and_time(approval.until_ns, seconds=False)
-    return f"{approval.agent} {what}; approved by {approval.by.partition(PERSON)[2] or approval.by} until {until}"
+def in_force(approval: Approval) -> tuple[str, str, str]:
+    """Return (agent, what it may do, details) of an approval in force."""
+    by, until = approval.by.partition(PERSON)[2] or approval.by, day_and_time(approval.until_ns, seconds=False)
+    end = f"approved by {by} until {until}"
+    if approval.plan:
+        return approval.agent, f"may carry out plan {approval.plan}: {approval.steps_left} requests left", end
+    total = {one.action: one.count for one in approval.counts}
+    used = [
+        f"{one.action}: {total[one.action] - one.count} of {total[one.action]} used"
+        if one.action in total
+        else f"{one.action}: {one.count} left"
+        for one in approval.left
+    ]
+    region = approval.region
+    where = "at no place" if region is None else f"{typeset_area(region.size_m)} at {typeset_position(region.center_m)}"
+    ranges = [
+        f"{one.parameter} {quantity(one.low, unit)} to {quantity(one.high, unit)}"
+        for one in approval.ranges
+        for unit in (names.BASE_PARAMETERS.get(one.parameter) or "",)
+    ]
+    what = f"may measure by itself, {', '.join(used) or 'no action'}"
+    return approval.agent, what, "; ".join([where, *ranges, end])
+
+
+def waiting(proposal: Proposal) -> tuple[str, str, str]:
+    """Return (agent, its plan in one line, the result of the preflight) of a proposal that waits for a person."""
+    try:
+        plan = plan_of(proposal.plan)
+    except AfspmError as error:
+        return proposal.who, f"proposes {proposal.id}", str(error)
+    steps = [escaped(one.text) for one in plan.requests(Frame.TIP)]
+    more = f" and {counted(len(steps) - STEPS_SHOWN, 'more request')}" if len(steps) > STEPS_SHOWN else ""
+    line = "; ".join(steps[:STEPS_SHOWN]) + more
+    return proposal.who, f"waits for your approval: “{title(proposal)}”: {line}", simulated(proposal)
+
+
+def _line_html(agent: str, what: str, details: str) -> str:
+    return f'<b>{escape(agent)}</b> {escape(what)}<span class="advice">{escape(details)}</span>'
 
 
 def title(proposal: Proposal) -> str:

@@ -68,6 +68,7 @@ class Content:
     log: tuple[LogLine, ...] = ()
     is_manual: bool = False
     adjustable: tuple[str, ...] = ()
+    agents: tuple[str, ...] = ()
     ended: bool = False
 
 
@@ -79,6 +80,7 @@ class Contents:
         adjustable: parameters that a person may set in AUTOMATED, too.
         pictures: the address of small pictures of scans.
         bands: the values of other instruments that measuring needs.
+        agents: names under which agents may act.
     """
 
     def __init__(
@@ -88,12 +90,14 @@ class Contents:
         adjustable: tuple[str, ...] = (),
         pictures: str = "",
         bands: AllowedBands | None = None,
+        agents: tuple[str, ...] = (),
     ) -> None:
         self._watch = watch
         self._adjustable = adjustable
         self._limits = limits
         self._pictures = pictures
         self._bands = bands or {}
+        self._agents = agents
         self._lock = threading.Lock()
         self._content = Content()
         self._made_s = self._drawn_s = -math.inf
@@ -131,6 +135,7 @@ class Contents:
                 log=tuple(overview.log),
                 is_manual=control is not None and control.mode is ControlMode.MANUAL,
                 adjustable=self._adjustable,
+                agents=tuple(dict.fromkeys((*(one.who for one in overview.proposals.values()), *self._agents))),
                 ended=watch.ended,
             )
 

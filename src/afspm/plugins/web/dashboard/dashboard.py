@@ -9,7 +9,7 @@ from typing import Annotated
 
 from afspm.basics.addresses import Listens
 from afspm.basics.clock import ExperimentClock
-from afspm.plugins.web.archive import adjustable_parameters, allowed_region
+from afspm.plugins.web.archive import adjustable_parameters, agents_in, allowed_region
 from afspm.plugins.web.component import WebComponent
 from afspm.plugins.web.dashboard.access import Access
 from afspm.plugins.web.dashboard.sessions import Sessions
@@ -80,6 +80,7 @@ class Dashboard(WebComponent):
                 adjustable_parameters(self.run_dir),
                 f"/live/thumbnail/{secrets.token_hex(4)}",
                 allowed_bands(self.run_dir),
+                agents_in(self.run_dir),
             ),
             self._steering,
             Audience(),

@@ -144,6 +144,7 @@ class Page:
             "trouble": content.trouble,
             "ended": content.ended,
             "may_measure": self._session.may_measure,
+            "may_grant": self._session.may_steer and bool(content.agents),
         }
 
     def _stop(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from html import escape
@@ -9,10 +10,12 @@ from html import escape
 from nicegui import events, ui
 
 from afspm.basics.formatting import time_of_day, typeset_position
-from afspm.model import ControlMode
+from afspm.basics.plain_data import PlainMapping
+from afspm.model import ControlMode, Region
 from afspm.plugins.web.dashboard.actions import Actions
 from afspm.plugins.web.dashboard.content import Content
 from afspm.plugins.web.dashboard.flags import Flag
+from afspm.plugins.web.dashboard.grant_dialog import GrantDialog
 from afspm.plugins.web.dashboard.parameter_form import ParameterForm
 from afspm.plugins.web.dashboard.scan_dialog import ScanDialog
 from afspm.plugins.web.dashboard.steering_session import SteeringSession, asked, button
@@ -106,16 +109,21 @@ class SteeringPanel:
             options = {number: name for name, number in session.watch.problems.items()}
             self._problem = ui.select(options, label="problem", value=next(iter(options))).props("dense outlined")
             button("Flag", lambda: session.do(partial(Actions.flag, problem=int(self._problem.value))))
+        with ui.element("div").classes("acts") as self._agents:
+            button("Give an agent a grant …", self._give_grant)
+        self._agents.set_visibility(False)
         with ui.element("div").classes("acts"):
             button("End the experiment …", self._ask_end, "negative").props("outline")
         ui.on("scan_here", self._ask_scan)
         ui.on("spectrum_here", self._ask_spectrum)
+        ui.on("grant_here", self._ask_grant)
 
     async def show(self, content: Content) -> None:
         """Show the buttons and parameters that apply now."""
         for one in self._by_hand:
             one.set_visibility(content.is_manual)
         self._hint.set_text(_MANUAL if content.is_manual else _ADJUST if content.adjustable else _TAKE_OVER)
+        self._agents.set_visibility(bool(content.agents) and self._session.may_steer)
         await self._parameters.show()
 
     async def _ask_end(self) -> None:
@@ -142,10 +150,23 @@ class SteeringPanel:
         if wanted is not None:
             self._session.do(lambda a: a.scan(*wanted))
 
+    async def _give_grant(self) -> None:
+        await GrantDialog(self._session, self._session.content.agents, None).show()
+
+    async def _ask_grant(self, event: events.GenericEventArguments) -> None:
+        await GrantDialog(self._session, self._session.content.agents, drawn_box(event.args)).show()
+
     async def _ask_spectrum(self, event: events.GenericEventArguments) -> None:
         at_m = (float(event.args["x"]), float(event.args["y"]))
         if await asked("Spectrum here?", f"The probe moves to {typeset_position(at_m)}.", "Take it"):
             self._session.do(lambda a: a.spectrum(at_m))
+
+
+def drawn_box(place: PlainMapping) -> Region:
+    """Return the box along x and y around a rectangle from the picture's script: a grant has no angle."""
+    x, y, width, height, angle = (float(place[name]) for name in ("x", "y", "width", "height", "angle"))
+    cos, sin = abs(math.cos(angle)), abs(math.sin(angle))
+    return Region((x, y), (width * cos + height * sin, width * sin + height * cos))
 
 
 async def ask_restart(session: SteeringSession, name: str) -> None:

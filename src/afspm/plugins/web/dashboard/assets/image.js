@@ -59,10 +59,12 @@ export class ImageView {
     if (channels.join("\n") !== this.#channels().join("\n")) this.#offer(channels);
   }
 
-  /** Whether places for scans and spectra may be chosen here. */
-  setSteering(may) {
+  /** Whether places for scans and spectra may be chosen here, and the place of a grant for an agent. */
+  setSteering(may, mayGrant = false) {
     this.root.classList.toggle("may-measure", may);
-    if (!may && (this.tool === "scan" || this.tool === "spectrum")) this.choose("look");
+    this.root.classList.toggle("may-grant", mayGrant);
+    const lost = (!may && (this.tool === "scan" || this.tool === "spectrum")) || (!mayGrant && this.tool === "grant");
+    if (lost) this.choose("look");
   }
 
   show(head, bitmap) {
@@ -105,6 +107,7 @@ export class ImageView {
       profile: "Drag a line over the picture.",
       scan: "Drag a rectangle to scan, or click for the middle of a scan of the same size.",
       spectrum: "Click where the spectrum is to be taken.",
+      grant: "Drag the rectangle in which an agent may measure.",
     }[tool];
     if (tool !== "profile") this.line = this.profile = null;
     this.find("profile").hidden = tool !== "profile";
@@ -277,7 +280,7 @@ export class ImageView {
 
   /** The rectangle of a scan that is drawn, asked about, or would be taken at the cross: its outline, place and name. */
   #scanRectangle() {
-    if (!this.wanted && this.tool !== "scan") return null;
+    if (!this.wanted && this.tool !== "scan" && this.tool !== "grant") return null;
     const { size: all, angle } = this.head;
     let [centre, size, turn] = [null, all, 0];
     if (this.wanted) {
@@ -358,7 +361,7 @@ export class ImageView {
   #measureAt(place, size = null) {
     const [x, y] = this.geometry.place(place);
     const { size: all, angle, shape } = this.head;
-    const name = this.tool === "scan" ? "scan_here" : "spectrum_here";
+    const name = { scan: "scan_here", spectrum: "spectrum_here", grant: "grant_here" }[this.tool];
     const [width, height] = size ?? all;
     if (this.tool === "scan") this.wanted = { x, y, width, height, angle };
     emitEvent(name, { x, y, width, height, angle, rows: shape[0], columns: shape[1] });
@@ -399,7 +402,7 @@ export class ImageView {
     this.fingers.set(event.pointerId, screen);
     const place = this.geometry.fromScreen(screen);
     this.drag = { screen, place, view: { ...this.view }, moved: false };
-    if (this.tool === "profile" || this.tool === "scan") this.line = [place, place];
+    if (["profile", "scan", "grant"].includes(this.tool)) this.line = [place, place];
     this.#point(screen);
   }
 
@@ -442,7 +445,7 @@ export class ImageView {
     this.drag = null;
     if (!drag || event.type === "pointercancel") return;
     if (this.tool === "spectrum") this.#measureAt(this.geometry.fromScreen([event.offsetX, event.offsetY]));
-    if (this.tool === "scan") {
+    if (this.tool === "scan" || this.tool === "grant") {
       const [a, b] = this.line;
       if (drag.moved) this.#measureAt([(a[0] + b[0]) / 2, (a[1] + b[1]) / 2], [Math.abs(a[0] - b[0]), Math.abs(a[1] - b[1])]);
       else this.#measureAt(a);
