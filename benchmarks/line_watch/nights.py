@@ -10,9 +10,9 @@ noise (rms of a levelled row). A blunt tip on flat terraces is no visible change
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,6 +59,20 @@ class NightOutcome:
     strongest: list[float] = field(default_factory=list)
 
 
+class NightScan(NamedTuple):
+    """A scan of a night.
+
+    Attributes:
+        at_s: time of its start.
+        negative: planted in it; "changed": the tip changes.
+        picture: heights in m of trace and retrace, [y, x].
+    """
+
+    at_s: float
+    negative: str
+    picture: list[Array]
+
+
 class Night:
     """A night of a half, by its seed."""
 
@@ -70,6 +84,7 @@ class Night:
         self.line_s = self._about(2.0)
         self.period_s = ROWS * self.line_s + 30.0
         self.region = Region((0.0, 0.0), (self.size_m, self.size_m))
+        self._at = self.region  # moves where the sample slips below it
         self.flaw = FLAWS[int(self.random.integers(len(FLAWS)))]
         self.row = int(self.random.integers(10, 100))
         self.settings = {
@@ -80,14 +95,27 @@ class Night:
 
     def outcome(self) -> NightOutcome:
         """Judge the night's scans, line by line."""
-        found = NightOutcome(self.surface, self.flaw, self.number, self.line_s, self.row)
-        world, judge = World.from_settings(self.settings, self.seed, 0.0), LineJudge()
-        kind = Kind.of(self.region, (ROWS, ROWS), "")
+        return self.judged(*self.scans())
+
+    def scans(self) -> tuple[list[NightScan], bool]:
+        """Take the scans of the night; return them, and whether the change in the last one is visible."""
+        world = World.from_settings(self.settings, self.seed, 0.0)
         negatives = [str(one) for one in self.random.choice(NEGATIVES, GOOD, replace=False)]
+        taken = []
         for number in range(LEARNT + GOOD):
             at_s = 1.0 + number * self.period_s
             negative = "none" if number < LEARNT else negatives[number - LEARNT]
-            picture = self._scan(world, at_s, negative)
+            taken.append(NightScan(at_s, negative, self._scan(world, at_s, negative)))
+        at_s = 1.0 + (LEARNT + GOOD) * self.period_s
+        changed = self._changed(world, at_s, {})
+        is_visible = self._is_visible(world, at_s)
+        return [*taken, NightScan(at_s, "changed", self._scan(changed, at_s, "none"))], is_visible
+
+    def judged(self, scans: Sequence[NightScan], is_visible: bool) -> NightOutcome:
+        """Judge scans of this night, line by line."""
+        found = NightOutcome(self.surface, self.flaw, self.number, self.line_s, self.row, is_visible=is_visible)
+        judge, kind = LineJudge(), Kind.of(self.region, (ROWS, ROWS), "")
+        for number, (at_s, negative, picture) in enumerate(scans[:-1]):
             judged = None if number < LEARNT else self._begin(judge, kind, at_s)
             if judged is not None:
                 until = ROWS if negative != "setpoint" else self.row + _LINES_UNTIL_TOLD
@@ -96,11 +124,9 @@ class Night:
                 found.strongest.append(strongest)
             if negative != "setpoint" and (judged is None or judged.alarm is None):
                 judge.learn(picture, self.region, kind, at_s + ROWS * self.line_s)
-        at_s = 1.0 + (LEARNT + GOOD) * self.period_s
-        changed = self._changed(world, at_s, {})
-        found.is_visible = self._is_visible(world, at_s)
-        judged = self._begin(judge, kind, at_s)
-        found.alarm_row = None if judged is None else _watch(judged, self._scan(changed, at_s, "none"), ROWS)[0]
+        last = scans[-1]
+        judged = self._begin(judge, kind, last.at_s)
+        found.alarm_row = None if judged is None else _watch(judged, last.picture, ROWS)[0]
         return found
 
     def _begin(self, judge: LineJudge, kind: Kind, at_s: float) -> RunningScan | None:
@@ -123,17 +149,29 @@ class Night:
 
     def _scan(self, world: World, at_s: float, negative: str) -> list[Array]:
         adjusted: list[Adjustment] = []
+        world_before = world.state()
         if negative == "creep":
             # a spectrum two scan widths away, just before
             world.spectrum("IV", (2.0 * self.size_m, self.size_m), at_s - 2.0)
         if negative == "setpoint":
             other = Feedback(setpoint=0.8 * world.settings.feedback.setpoint)
             adjusted = [Adjustment(at_s + self.row * self.line_s, other, 0.1)]
-        scan = world.scan(self.region, (ROWS, ROWS), self.line_s, at_s, adjusted=adjusted)
-        channels = scan.channels()
-        picture = [channels[name][1].copy() for name in ("Height", "Height Retrace")]
-        self._plant(picture, negative)
-        return picture
+        channels = self._taken(world, at_s, adjusted)
+        if negative == "jump":
+            # the sample slips by some pixels, and stays there
+            slipped = World.from_settings(self.settings, self.seed, 0.0)
+            slipped.restore(world_before)
+            pixels = self.random.integers(-4, 5, 2)
+            x, y = (at + self.size_m / ROWS * float(by) for at, by in zip(self._at.center_m, pixels, strict=True))
+            self._at = Region((x, y), self._at.size_m)
+            for picture, after in zip(channels, self._taken(slipped, at_s, adjusted), strict=True):
+                picture[self.row :] = after[self.row :]
+        self._plant(channels, negative)
+        return channels
+
+    def _taken(self, world: World, at_s: float, adjusted: Sequence[Adjustment]) -> list[Array]:
+        channels = world.scan(self._at, (ROWS, ROWS), self.line_s, at_s, adjusted=adjusted).channels()
+        return [channels[name][1].copy() for name in ("Height", "Height Retrace")]
 
     def _plant(self, picture: list[Array], negative: str) -> None:
         rows = self.random.permutation(ROWS)
@@ -145,12 +183,6 @@ class Night:
             if negative == "spikes":
                 where = self.random.integers(0, ROWS, (SPIKES, 2))
                 values[where[:, 0], where[:, 1]] += 6.0 * spread * self.random.standard_normal(SPIKES)
-        if negative == "jump":
-            # the sample slips by some pixels, and stays there
-            down, along = (int(one) for one in self.random.integers(-4, 5, 2))
-            for values in picture:
-                moved = np.roll(values, (down, along), axis=(0, 1))
-                values[self.row :] = moved[self.row :]
 
     def _surface(self) -> dict[str, object]:
         about = self._about

@@ -11,7 +11,7 @@ from typing import Any
 
 from afspm import wire
 from afspm.model import Region, Scan, ScanParameters
-from afspm.record.bad_scans import BAD, VERDICT_MESSAGE, read_verdict
+from afspm.record.bad_scans import BAD, LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
 
 __all__ = [
     "BAD",
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 MESSAGE = VERDICT_MESSAGE
-OF_LINES = "TipVerdict"
+OF_LINES = LINE_VERDICT_MESSAGE
 GOOD, UNCLEAR = 1.0, 0.5
 
 

@@ -10,6 +10,7 @@ from afspm.model import Problem
 BAD = 0.0
 """The score of a scan that was judged to show a bad tip."""
 VERDICT_MESSAGE = "SpatialROIWithScoreList"
+LINE_VERDICT_MESSAGE = "TipVerdict"
 _SAME_SCAN_NS = 1_000_000_000  # the channels of a scan get their times one after the other
 _NOT_OF_A_SCAN = frozenset({int(Problem.THERMAL_DRIFT), int(Problem.DEVICE_MALFUNCTION)})
 """Problems without a verdict on the previous scan: they concern the sample's position or the controller."""

@@ -30,7 +30,7 @@ from afspm.model import (
     Spectrum,
 )
 from afspm.record import journal
-from afspm.record.bad_scans import VERDICT_MESSAGE, read_verdict
+from afspm.record.bad_scans import LINE_VERDICT_MESSAGE, VERDICT_MESSAGE, read_verdict
 from afspm.record.journal import SCHEDULER
 from afspm.record.measured_tables import (
     KeyedTable,
@@ -275,6 +275,20 @@ class Run:
         found = (self._decoded(VERDICT_MESSAGE, payload) for (payload,) in self._query(sql, (VERDICT_MESSAGE,)))
         verdicts = (read_verdict(message) for message in found if message is not None)
         return [verdict for verdict in verdicts if verdict is not None]
+
+    def changed_rows(self) -> dict[int, int]:
+        """Return the first row with a changed tip, as seen in the lines of a running scan, by the time of the scan."""
+        sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
+        found: dict[int, int] = {}
+        for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
+            verdict: Any = self._decoded(LINE_VERDICT_MESSAGE, payload)
+            if verdict is None or not verdict.HasField("timestamp"):
+                continue
+            began_ns = verdict.timestamp.ToNanoseconds()
+            ended_ns = next((row.time_ns for row in self.scans if row.time_ns > began_ns), None)
+            if ended_ns is not None:
+                found[ended_ns] = verdict.since_row
+        return found
 
     # --- everything ---
 

@@ -17,6 +17,7 @@ import pytest
 
 from afspm import model, wire
 from afspm.basics.errors import FileError
+from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import ControlMode, ControlState, ProcessCondition, RegistrationOutcome, ScopeState
 from afspm.record.bad_scans import BAD, VERDICT_MESSAGE
 from afspm.record.report import REPORT_FILE, page, pictures, story, write
@@ -310,6 +311,26 @@ def test_page_and_picture_of_the_night_frame_the_same_scans_by_their_verdicts(ru
         read = story.read(opened)
         record = pictures.night_of(opened, read, pictures.of_scans(opened, read.scans))
     assert record.bad_ns() == {whole[1], whole[4]}
+
+
+def test_row_with_a_changed_tip_is_a_dashed_line_in_its_scan(run: Path) -> None:
+    store = RecordStore(run, RecordSettings({}))
+    with open_run(run) as opened:
+        marked = next(row for row in opened.scans if row.number == 3)
+    assert marked.began_ns is not None
+    assert marked.shape is not None
+    assert marked.region is not None
+    since = marked.shape[0] // 2
+    verdict = LineVerdict(marked.region, marked.shape, "Height", marked.began_ns, since + 1, since, False, 0.9, True)
+    payload = line_verdict_message(verdict).SerializeToString()
+    store.take([(model.Packet(f"{OF_LINES}_line_watch", payload, marked.began_ns + S), "")])
+    store.flush()
+    store.close()
+    text = write(run).read_text(encoding="utf-8")
+    assert text.count('class="change"') == 1
+    figure = text[text.index('<figure id="scan-3"') :].partition("</figure>")[0]
+    assert f'class="change" style="bottom:{100.0 * since / marked.shape[0]:.3f}%"' in figure
+    assert f"row {since}, by the lines" in figure
 
 
 def test_times_of_more_than_a_day_have_the_day(tmp_path: Path) -> None:

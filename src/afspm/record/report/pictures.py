@@ -41,6 +41,7 @@ class TopographyPicture:
         image: in colour, levelled.
         thumbnail: for the figure of the night.
         is_bad: drawn with a frame.
+        changed_row: the first one with a changed tip, by the lines of the running scan; None if none was seen.
     """
 
     row: ScanRow
@@ -49,6 +50,7 @@ class TopographyPicture:
     image: Shown | None = None
     thumbnail: Thumbnail | None = None
     is_bad: bool = False
+    changed_row: int | None = None
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,7 @@ class FigurePicture:
 
 def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) -> list[TopographyPicture]:
     """Return the scans with pictures; `bad_ns`: the times of the bad scans."""
+    changed = run.changed_rows()
     read = [_read(run, row) for row in rows]
     compared: dict[tuple[str, float], list[Array]] = {}
     for one, values in read:
@@ -74,7 +77,8 @@ def of_scans(run: Run, rows: Sequence[ScanRow], bad_ns: Collection[int] = ()) ->
         image = None
         if one.thumbnail is not None and values is not None:
             image = shown(values, LARGEST_PX, small=True, span=spans[one.thumbnail.kind])
-        pictures.append(replace(one, image=image, is_bad=one.row.time_ns in bad_ns))
+        of_ns = one.row.time_ns
+        pictures.append(replace(one, image=image, is_bad=of_ns in bad_ns, changed_row=changed.get(of_ns)))
     return pictures
 
 

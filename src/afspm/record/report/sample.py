@@ -126,7 +126,7 @@ def _figure(
     else:
         shown = (
             f'<img src="{data_url(one.image.image)}" alt="scan {row.number}" style="aspect-ratio:{width / height:.4g}">'
-            f"{scale_bar((width, height))}"
+            f"{scale_bar((width, height))}{_change(one)}"
         )
     mark = " <b>interrupted</b>" if row.interrupted else ""
     if row.registration is not None and row.registration is not RegistrationOutcome.REGISTERED:
@@ -142,6 +142,14 @@ def _figure(
         name_of(row), shown, caption, facts, beside=beside, style="scan bad" if one.is_bad else "scan",
         ratio=width / height,
     )  # fmt: skip
+
+
+def _change(one: TopographyPicture) -> str:
+    if one.changed_row is None or not one.row.shape:
+        return ""
+    # the first row is at the bottom
+    up = 100.0 * one.changed_row / one.row.shape[0]
+    return f'<hr class="change" style="bottom:{up:.3f}%" title="tip changed, row {one.changed_row}">'
 
 
 def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterator[tuple[str, str]]:
@@ -169,6 +177,7 @@ def _facts(one: TopographyPicture, story: RunStory, clock: PageTimes) -> Iterato
     yield "in control", escape(row.holder or "none")
     yield "problems", escape(", ".join(row.problems))
     yield "interrupted", "yes" if row.interrupted else ""
+    yield "tip changed", "" if one.changed_row is None else f"row {one.changed_row}, by the lines of the running scan"
     notes = [note for note in story.notes if note.scan == row.number]
     yield "notes", "<br>".join(f"{escape(note.text)} ({escape(note.who)})" for note in notes)
     yield "file", escape(row.file)

@@ -54,6 +54,8 @@ border:1.5px solid #fff;outline:1px solid #000}
 .sheet .open{display:block;position:relative;color:inherit;text-decoration:none}
 .sheet img{width:100%;display:block;image-rendering:pixelated}
 .sheet .open svg{width:100%!important;background:var(--panel)}
+.change{position:absolute;left:0;right:0;margin:0;border:0;height:2px;
+background:repeating-linear-gradient(90deg,#fff 0 5px,#000 5px 9px)}
 .bad .open{outline:2px solid var(--problem)}
 .none{aspect-ratio:1;background:var(--panel);color:var(--soft);display:grid;place-items:center;font-size:.75rem}
 .wide{grid-template-columns:repeat(auto-fill,minmax(min(240px,100%),1fr))}
