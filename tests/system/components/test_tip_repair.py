@@ -14,6 +14,7 @@ from systems import PATIENCE
 
 from afspm.model import Problem
 from afspm.record.night_record import NightRecord
+from afspm.record.run import open_run
 
 SAMPLE = Path(__file__).parents[3] / "experiments" / "tip_repair" / "experiment.toml"
 SHORTER = """
@@ -83,6 +84,20 @@ def test_each_requested_scan_is_in_the_table_once(night: Path) -> None:
     assert tests
     assert {row["problems"] for row in tests} == {"tip-shape-changed"}
     assert all(Path(row["filename"]).exists() for row in heights)
+
+
+def test_ledger_of_the_record_equals_the_truth(night: Path) -> None:
+    truth = [json.loads(line) for line in (night / "truth.jsonl").read_text(encoding="utf-8").splitlines()]
+    pulses = [one for one in truth if one["event"] == "pulse"]
+    crashes = [one for one in truth if one["event"] == "crash"]
+    with open_run(night) as run:
+        ledger = run.ledger()
+    assert ledger.treatments
+    assert (ledger.pulses, ledger.crashes, ledger.unknown) == (len(pulses), len(crashes), 0)
+    assert ledger.pulse_v_s == pytest.approx(sum(abs(one["voltage_v"]) * one["duration_s"] for one in pulses))
+    assert ledger.crash_depth_m == pytest.approx(sum(one["depth_m"] for one in crashes))
+    assert ledger.by == {"tip_corrector": ledger.treatments}
+    assert f"<td>tip_corrector {ledger.treatments}</td>" in (night / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_night_is_drawn(night: Path) -> None:

@@ -109,13 +109,15 @@ class Workplace:
         self.experiment, self.simulated, self.run_dir = experiment, simulated, run_dir
         self.approvals = Approvals()
         self.proposals: dict[str, Proposal] = {}
-        self._memory = Memory(file)
+        # on the event loop, where `stop` must not wait for a hanging disk
+        self._memory = Memory(file, synced=False)
         self.runs: dict[str, Run] = {}
+        self._saved: dict[str, dict[str, object]] = {}
         for facts in self._memory.get("runs", ()):
             run = Run(**facts)
             # control has been lost with the process, and an approved plan is for one run
             run.state = "interrupted" if run.state == "running" else run.state
-            self.runs[run.id] = run
+            self.runs[run.id], self._saved[run.id] = run, asdict(run)
         self._tasks: dict[str, asyncio.Task[None]] = {}
 
     # --- published messages: from the component's thread ---
@@ -187,7 +189,7 @@ class Workplace:
         number = max((int(one) for one in self.runs), default=0) + 1
         run = Run(str(number), who, proposal, len(plan.steps))
         self.runs[run.id] = run
-        self._save()
+        self._save(run)
         self._tasks[run.id] = asyncio.ensure_future(self._carry_out(person, run, plan))
         self._tasks[run.id].add_done_callback(lambda _: self._tasks.pop(run.id, None))
         return run
@@ -224,7 +226,7 @@ class Workplace:
             await self._renew(person)
             for step in plan.steps:
                 run.step += 1
-                self._save()
+                self._save(run)
                 await self._step(person, run, step)
             run.state = "done"
         except RefusedRequest as error:
@@ -235,7 +237,7 @@ class Workplace:
             _log.exception("a run of %s failed", run.who)
             run.state, run.refusal = "failed", of_error(error).model.model_dump(mode="json")
         finally:
-            self._save()
+            self._save(run)
         try:
             await self.do(person, lambda commands: commands.release_control())
         except RefusedRequest as error:  # the lease ends it
@@ -273,13 +275,16 @@ class Workplace:
         if not response.ok and response.code != ControlResponse.NO_RESPONSE:
             raise refused(response)
 
-    def _save(self) -> None:
+    def _save(self, changed: Run) -> None:
+        # only the changed run is turned into plain data: up to MOST_RUNS are kept, and each step of a run saves
+        self._saved[changed.id] = asdict(changed)
         while len(self.runs) > MOST_RUNS:
             oldest = next((one for one in self.runs.values() if one.state != "running"), None)
             if oldest is None:
                 break
             del self.runs[oldest.id]
-        self._memory["runs"] = [asdict(one) for one in self.runs.values()]
+            del self._saved[oldest.id]
+        self._memory["runs"] = list(self._saved.values())
         self._memory.save(synced=False)
 
 
