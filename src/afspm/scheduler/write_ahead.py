@@ -1,6 +1,6 @@
 """The write-ahead log: state and packets are on disk before the scheduler publishes them.
 
-The state is a small file of JSON lines of which the last one is valid.
+The state is a small file of JSON lines; the last one is valid.
 """
 
 from __future__ import annotations

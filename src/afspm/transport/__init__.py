@@ -3,7 +3,7 @@
 **Theory of operation.** Packets flow one way, requests the other.
 
     comes in      packets of one publisher (`subscriber`), requests (`router`, `zmq_server`), answers (`control_client`,
-                  `translator_link`)
+                  `scheduler_sockets`)
     state         the connected peers and their names; for each subscriber, the time up to which it has all packets
     goes out      events of a port (`port`): PacketReceived, RequestReceived, ParentGone …, in one poller per process
     always holds  each packet arrives once and in order, or the subscriber detects the gap; no send waits

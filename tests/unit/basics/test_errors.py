@@ -9,7 +9,7 @@ import pytest
 
 from afspm import Region
 from afspm.basics.errors import AfspmError, Interrupted, InvalidValue
-from afspm.client.experiment_link import Interrupts
+from afspm.client.interrupts import Interrupts
 from afspm.model import Scan, ScanSet
 
 CELL = "def frame(height):\n    return Region((0, 0), (1e-6, height))\n\nframe(0)\n"

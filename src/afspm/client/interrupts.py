@@ -1,0 +1,58 @@
+"""Ctrl-C and a notebook's stop button during a call: `KeyboardInterrupt` is raised where the call waits."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from afspm.basics.errors import Interrupted
+from afspm.transport.port import Port
+from afspm.transport.process import signals
+
+
+class Interrupts:
+    """The interrupts (Ctrl-C, the stop button of a notebook) during calls over one port.
+
+    An interrupt is raised where a call waits, so that no request or answer is left half done. A program that handles or
+    ignores SIGINT itself, as components do, is left alone.
+    """
+
+    def __init__(self, port: Port) -> None:
+        self._port = port
+        self._is_deferred = False
+        self._has_come = False
+
+    @contextmanager
+    def heeded(self) -> Iterator[None]:
+        """Raise KeyboardInterrupt in this block only where `heed` is called, and at its end."""
+        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+            yield  # components handle SIGINT themselves, as does an outer block of this kind
+            return
+        self._has_come = False
+        with signals.caught(self._come, self._port.wakeup_fileno(), signals.CTRL_C):
+            yield
+            self.heed()
+
+    @contextmanager
+    def deferred(self) -> Iterator[None]:
+        """Finish this block, which must be short; further interrupts during it are dropped."""
+        self._is_deferred = True
+        try:
+            yield
+        finally:
+            self._is_deferred = self._has_come = False
+
+    def heed(self) -> None:
+        """Raise KeyboardInterrupt after an interrupt."""
+        if self._has_come and not self._is_deferred:
+            self._has_come = False
+            raise Interrupted
+
+    def interrupt(self) -> None:
+        """Interrupt the present or next call, as Ctrl-C does. From any thread."""
+        self._has_come = True
+        self._port.wake_up()
+
+    def _come(self, _number: int) -> None:
+        self._has_come = True
