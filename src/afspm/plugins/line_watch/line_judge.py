@@ -51,6 +51,7 @@ SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measur
 MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
 FEWEST_SUSPECT = 6  # rows since a change before an alarm: fewer don't show whether the sample has jumped
+FEWEST_STOP = 10  # the same before a scan is stopped, after a second search for a jump with more lines
 LOOK = 0.6  # share of the threshold
 GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
 FEWEST_PAIRS = 2  # of good scans, before such scans are judged
@@ -324,10 +325,10 @@ class RunningScan:
         return self.alarm
 
     def _level(self) -> AlarmLevel | None:
-        enough = sum(self._is_suspect(row) for row, _ in self._recent) >= FEWEST_SUSPECT
-        if self.evidence >= 1.0 and enough:
+        suspects = sum(self._is_suspect(row) for row, _ in self._recent)
+        if self.evidence >= 1.0 and suspects >= FEWEST_STOP:
             return AlarmLevel.STOP
-        return AlarmLevel.LOOK if self.evidence >= LOOK and enough else None
+        return AlarmLevel.LOOK if self.evidence >= LOOK and suspects >= FEWEST_SUSPECT else None
 
     def _has_jumped(self) -> bool:
         if self._jumps >= MOST_JUMPS:
