@@ -207,7 +207,7 @@ def likely_shifts(
             for one in (template.heights[places], steepness[places], inside)
         )
         off = line - heights
-        # the tilt of a single noisy line is known badly, so that of the difference is taken, by the halves' medians
+        # the tilt of a single noisy line is known badly, so the tilt of the difference is taken, by the halves' medians
         left, right = (np.median(half, axis=-1) for half in (off[..., : nx // 2], off[..., -(nx // 2) :]))
         off -= ((left + right) / 2.0)[..., None] + ((right - left) / 2.0)[..., None] * ends
         # between whole pixels a flank differs by half a pixel of slope at most
