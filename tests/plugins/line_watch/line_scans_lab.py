@@ -18,8 +18,8 @@ CHANNELS = ("Height", "Height Retrace")
 Picture = Mapping[str, np.ndarray[tuple[int, int], np.dtype[np.float64]]]
 
 
-def scan_at(world: World, number: int, direction: str) -> Picture:
-    scan = world.scan(HOME, (ROWS, ROWS), LINE_S, number * PERIOD_S, direction=direction)
+def scan_at(world: World, number: int, direction: str, region: Region = HOME) -> Picture:
+    scan = world.scan(region, (ROWS, ROWS), LINE_S, number * PERIOD_S, direction=direction)
     return {name: scan.channels()[name][1] for name in CHANNELS}
 
 
@@ -38,6 +38,19 @@ def night(flaw: str = "double", direction: str = "up") -> tuple[Picture, ...]:
     """Return three scans to learn from, one more good one, and one with a change in its middle."""
     world = world_with(flaw, (LEARNT + 1) * PERIOD_S + CHANGED_ROW * LINE_S)
     return tuple(scan_at(world, number, direction) for number in range(LEARNT + 2))
+
+
+def steps(jump: tuple[int, int]) -> tuple[Picture, ...]:
+    """Return scans of steps: three to learn from, one in which the sample jumps by (rows, columns), one after it."""
+    settings = {"surface": {"kind": "steps", "angle_deg": 87.0}, "drift": {"velocity_m_per_s": [0.02e-9, 0.0, 0.0]}}
+    world, jumped = (World.from_settings(settings, 5, 0.0) for _ in range(2))
+    pixel_m = HOME.size_m[0] / ROWS
+    region = Region((jump[1] * pixel_m, jump[0] * pixel_m), HOME.size_m)
+    before = [scan_at(world, number, "up") for number in range(LEARNT + 1)]
+    after = [scan_at(jumped, number, "up", region) for number in range(LEARNT + 2)]
+    upper = np.arange(ROWS)[:, None] >= CHANGED_ROW
+    jumping = {name: np.where(upper, after[LEARNT][name], before[LEARNT][name]) for name in CHANNELS}
+    return (*before[:LEARNT], jumping, after[-1])
 
 
 def began_ns(number: int) -> int:

@@ -15,10 +15,11 @@ from tests.plugins.line_watch.line_scans_lab import (
     ROWS,
     Picture,
     night,
+    steps,
 )
 
 from afspm.model import Region
-from afspm.plugins.line_watch.line_judge import Alarm, AlarmLevel, Kind, LineJudge
+from afspm.plugins.line_watch.line_judge import FLOOR, Alarm, AlarmLevel, Kind, LineJudge
 
 Heights = list[np.ndarray[tuple[int, int], np.dtype[np.float64]]]
 KIND = Kind.of(HOME, (ROWS, ROWS), "")
@@ -104,6 +105,23 @@ def test_sample_that_jumps_is_registered_again() -> None:
         values[30:] = np.roll(values, (-4, 6), axis=(0, 1))[30:]
         values[-4:] = np.nan
     assert stopped(taught(), picture) is None
+
+
+@pytest.mark.parametrize("jump", [(-4, 6), (9, -12)])
+def test_sample_that_jumps_along_flat_steps_is_registered_again(jump: tuple[int, int]) -> None:
+    # edges almost parallel to the rows: the slopes of a row hardly show its place
+    pictures = steps(jump)
+    assert stopped(taught(pictures), heights(pictures[LEARNT])) is None
+
+
+def test_scan_with_a_jump_is_a_measure_of_the_next_one() -> None:
+    pictures = steps((-4, 6))
+    judge = taught(pictures)
+    judge.learn(heights(pictures[LEARNT]), HOME, KIND, LEARNT * PERIOD_S)
+    running = judge.begin(HOME, KIND, (LEARNT + 1) * PERIOD_S, channels=2)
+    assert running is not None
+    assert running.threshold == FLOOR
+    assert stopped(judge, heights(pictures[-1]), (LEARNT + 1) * PERIOD_S) is None
 
 
 def test_rows_from_the_last_to_the_first_are_judged_alike() -> None:

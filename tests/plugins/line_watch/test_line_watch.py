@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import partial
 from pathlib import Path
 
+import pytest
 from tests.plugins.line_watch.line_scans_lab import (
     CHANGED_ROW,
     HOME,
@@ -72,6 +73,21 @@ def test_look_publishes_the_row_and_flags_nothing() -> None:
     assert flags(lab) == 0
     assert verdicts(lab)
     assert not any(one.stops for one in verdicts(lab))
+
+
+def test_reason_why_nothing_is_judged_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab("line_watch")
+    for number, picture in enumerate(night()[: LEARNT + 1]):
+        tell(lab, number, picture)
+    lab.at(900.0, lab.kill)
+    with caplog.at_level("INFO"):
+        run(LineWatch(), lab)
+    reasons = [one.getMessage() for one in caplog.records if "not judged" in one.getMessage()]
+    assert [reason.partition(": ")[2] for reason in reasons] == [
+        "no earlier scan of this size, angle, pixels and feedback shows the place",
+        "1 of 3 good scans of its kind are known",
+        "2 of 3 good scans of its kind are known",
+    ]
 
 
 def test_scan_during_which_the_setpoint_was_changed_is_not_judged() -> None:

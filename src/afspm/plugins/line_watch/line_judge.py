@@ -31,21 +31,27 @@ from afspm.plugins.line_watch.registration import (
     RowTemplate,
     Shift,
     levelled,
+    likely_shifts,
     robust_spread,
 )
 
 ACQUIRE = 6  # lines that only find the shift, before the first is judged
 REACH = (3, 5)  # rows and columns about the predicted shift
 JUMP_REACH = (12, 16)  # the same for a sample that has jumped
+NEAR = (1, 2)  # the same about a shift that a search has found
 MOST_JUMPS = 3  # in one scan
-REMEMBERED = 12  # lines for the search after a jump
+REMEMBERED = 24  # lines for the search after a jump
+EXPLAINED = 1.5  # standard deviations beyond the usual, by the median of these lines, up to which a jump explains them
+NEWEST = 4  # lines since a change that a jump must explain, at least
+PER_PIXEL = 0.03  # standard deviations that a pixel of a jump costs: short jumps are likelier than long ones
 DRIFT = 1.0  # standard deviations that a line must exceed the usual by, for the sum to grow
 LEAST_PER_SLOPE = 0.06  # pixels: two scans without drift between them show too small a misfit of steep flanks
 SPIKE = 6.0  # the same for a single pixel
 SCAR = 4.0  # standard deviations beyond which a row of a good scan is no measure of later ones
 MOST = 6.0  # standard deviations that one line adds at most
 FLOOR, FACTOR = 15.0, 2.0  # least threshold, and its ratio to the highest sum of good scans
-FEWEST_SUSPECT = 6  # rows since a change before a scan is stopped: fewer don't show whether the sample has jumped
+FEWEST_SUSPECT = 6  # rows since a change before an alarm: fewer don't show whether the sample has jumped
+FEWEST_STOP = 10  # the same before a scan is stopped, after a second search for a jump with more lines
 LOOK = 0.6  # share of the threshold
 GOOD_DECAY = 5.0  # assumed, not fitted: of the share of good scans that reach some evidence
 FEWEST_PAIRS = 2  # of good scans, before such scans are judged
@@ -222,6 +228,7 @@ class LineStatistic:
             float(np.median([getattr(pair, name) for pair in pairs]))
             for name in ("flat_m", "per_slope", "usual", "spread")
         )
+        self.pairs = len(pairs)
         highest = sorted(pair.highest for pair in pairs)
         # the highest of many may be of a scan whose tip had changed without an alarm
         self.threshold = max(FLOOR, FACTOR * highest[-2 if len(highest) >= FEWEST_PAIRS + 2 else -1])
@@ -264,20 +271,28 @@ class RunningScan:
 
     Attributes:
         alarm: the last one.
+        fitted: by row, what its template does not explain.
     """
 
     def __init__(self, comparer: _Comparer, statistic: LineStatistic, what: str) -> None:
         self.alarm: Alarm | None = None
+        self.fitted: dict[int, list[RowFit]] = {}
         self._comparer, self._statistic, self._what = comparer, statistic, what
         self._cusum = Cusum()
+        self._home = comparer.registration.shift
         self._followed = 0
         self._recent: list[tuple[int, list[Array]]] = []
         self._jumps = 0
 
     @property
+    def threshold(self) -> float:
+        """Return the sum of the CUSUM at which a scan is stopped."""
+        return self._statistic.threshold
+
+    @property
     def evidence(self) -> float:
         """Return the sum of the CUSUM relative to the threshold."""
-        return self._cusum.value / self._statistic.threshold
+        return self._cusum.value / self.threshold
 
     def add(self, row: int, line: Sequence[Array]) -> Alarm | None:
         """Judge a line; return an alarm of a higher level than before.
@@ -296,6 +311,7 @@ class RunningScan:
         fits = self._comparer.fits(row, level) if self._followed > ACQUIRE else []
         if not fits:
             return None
+        self.fitted[row] = fits
         self._cusum.add(row, self._statistic.sigmas(fits))
         found = self._level()
         if found is None or (self.alarm is not None and self.alarm.level in (found, AlarmLevel.STOP)):
@@ -304,34 +320,47 @@ class RunningScan:
             self._cusum = Cusum()
             return None
         since = row if self._cusum.since is None else self._cusum.since
-        self.alarm = Alarm(found, row, since, self.evidence, f"{self._what} since row {since}")
+        basis = f"{self.evidence:.1f} times the threshold from {self._statistic.pairs} good pairs of scans"
+        self.alarm = Alarm(found, row, since, self.evidence, f"{self._what} since row {since} ({basis})")
         return self.alarm
 
     def _level(self) -> AlarmLevel | None:
-        if self.evidence >= 1.0 and sum(self._is_suspect(row) for row, _ in self._recent) >= FEWEST_SUSPECT:
+        suspects = sum(self._is_suspect(row) for row, _ in self._recent)
+        if self.evidence >= 1.0 and suspects >= FEWEST_STOP:
             return AlarmLevel.STOP
-        return AlarmLevel.LOOK if self.evidence >= LOOK else None
+        return AlarmLevel.LOOK if self.evidence >= LOOK and suspects >= FEWEST_SUSPECT else None
 
     def _has_jumped(self) -> bool:
-        place, registration = self._comparer.place, self._comparer.registration
         if self._jumps >= MOST_JUMPS:
             return False
         # since the change, for a sample that has jumped; all lines, for a lattice that was matched one period away
         suspects = [(row, line) for row, line in self._recent if self._is_suspect(row)]
-        for lines in (suspects, self._recent):
-            wide = RowRegistration(place.templates[0], registration.shift, JUMP_REACH, steady=1.0)
-            for row, line in lines:
-                wide.follow(row, line[0])
-            again = _Comparer(place, wide)
-            sigmas = [self._statistic.sigmas(fits) for row, line in lines if (fits := again.fits(row, line))]
-            newer = len(sigmas) // 2  # the older half may lie before the jump
-            if sigmas and float(np.median(sigmas[newer:])) < DRIFT:
-                self._jumps += 1
-                self._comparer.registration = RowRegistration(place.templates[0], wide.shift, REACH)
-                for row, line in lines[newer:]:
-                    self._comparer.follow(row, line)
-                return True
-        return False
+        # the older half may lie before the jump
+        newest = suspects[-max(NEWEST, (len(suspects) + 1) // 2) :]
+        template, statistic = self._comparer.place.templates[0], self._statistic
+        found: list[tuple[float, RowRegistration]] = []
+        for lines in (newest, self._recent):
+            traces = [(row, line[0]) for row, line in lines]
+            about = self._comparer.registration.shift
+            likely = likely_shifts(template, traces, about, JUMP_REACH, statistic.flat_m)
+            # an earlier jump may have been none, and an earlier scan may itself have jumped back on its way
+            for shift in (*likely, self._home):
+                again = _Comparer(self._comparer.place, RowRegistration(template, shift, NEAR, steady=1.0))
+                for row, line in lines:
+                    again.follow(row, line)
+                sigmas = [statistic.sigmas(fits) for row, line in newest if (fits := again.fits(row, line))]
+                if 2 * len(sigmas) > len(newest) and (off := float(np.median(sigmas))) < EXPLAINED:
+                    far = math.dist(again.registration.shift, self._home)
+                    found.append((max(0.0, off) + PER_PIXEL * far, again.registration))
+        if not found:
+            return False
+        self._jumps += 1
+        shift = min(found, key=lambda one: one[0])[1].shift
+        self._comparer.registration = RowRegistration(template, shift, REACH)
+        for row, line in newest:
+            self._comparer.follow(row, line)
+            self.fitted[row] = self._comparer.fits(row, line)
+        return True
 
     def _is_suspect(self, row: int) -> bool:
         numbers = [number for number, _ in self._recent]
@@ -375,7 +404,7 @@ class LineJudge:
         return 0 if known is None else len(known.pairs)
 
     def begin(self, region: Region, kind: Kind, at_s: float, *, channels: int) -> RunningScan | None:
-        """Return the judge of a scan that begins at `at_s`; None while too little is known of its kind.
+        """Return the judge of a scan that begins at `at_s`; None if it can't be judged (see `lacking`).
 
         Args:
             channels: 2 with retrace, 1 without.
@@ -389,6 +418,15 @@ class LineJudge:
             what = "lines differ from the earlier scan of this place"
             return RunningScan(_Comparer(place, registration), LineStatistic(known.pairs), what)
         return None
+
+    def lacking(self, region: Region, kind: Kind) -> str:
+        """Return the reason, for people, why the lines of a scan can't be judged; empty if they can."""
+        known = self._known(kind)
+        if known is None or known.place(region) is None:
+            return "no earlier scan of this size, angle, pixels and feedback shows the place"
+        if len(known.pairs) < FEWEST_PAIRS:
+            return f"{len(known.pairs) + 1} of {FEWEST_PAIRS + 1} good scans of its kind are known"
+        return ""
 
     def learn(
         self,
@@ -436,9 +474,9 @@ class LineJudge:
         if len(lines) <= ACQUIRE:
             return odd
         if place is not None and len(place.templates) == len(picture):
-            registration = RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH)
-            _append(known.pairs, _statistics(_Comparer(place, registration), lines, known.pairs, odd))
-            known.note_shift(place, region, at_s, registration.shift)
+            comparer = _Comparer(place, RowRegistration(place.templates[0], known.shift(place, region, at_s), REACH))
+            _append(known.pairs, _statistics(comparer, lines, known.pairs, odd))
+            known.note_shift(place, region, at_s, comparer.registration.shift)
         return odd
 
     def state(self) -> Plain:
@@ -477,12 +515,18 @@ def _statistics(
     before: Sequence[PairStatistics],
     odd: _OddRows,
 ) -> PairStatistics | None:
-    fitted: list[tuple[int, list[RowFit]]] = []
-    for number, (row, line) in enumerate(lines):
-        comparer.follow(row, line)
-        if number >= ACQUIRE:
-            fitted.append((row, comparer.fits(row, line)))
-    fitted = [(row, fits) for row, fits in fitted if fits]
+    if before:
+        # as a running scan: a sample that jumps is registered again
+        running = RunningScan(comparer, LineStatistic(before), "")
+        for row, line in lines:
+            running.add(row, line)
+        fitted = [(row, fits) for row, fits in running.fitted.items() if fits]
+    else:
+        fitted = []
+        for number, (row, line) in enumerate(lines):
+            comparer.follow(row, line)
+            if number >= ACQUIRE and (fits := comparer.fits(row, line)):
+                fitted.append((row, fits))
     if len(fitted) < len(lines) // 2:
         return None
     flat_m, per_slope = _expected([fit for _, fits in fitted for fit in fits])

@@ -68,7 +68,9 @@ class LineWatch(Component):
     must be good then: scans are judged from the fourth of a place on. It learns nothing from a scan with an alarm, from
     one during which a problem was flagged or the feedback was changed, or from one that a `TipClassifier` calls bad.
 
-    It publishes a `TipVerdict` with the row of the alarm and the first row with the change. A `ScanSeries` with
+    It publishes a `TipVerdict` with the row of the alarm, the first row with the change, and a confidence. The
+    confidence is 1 - exp(-5 evidence), where the evidence is relative to the threshold: an assumed decay, which ranks
+    alarms and is no measured probability. A `ScanSeries` with
     `missed = "rest"` then measures only the rest of the scan. The microscope must publish lines of running scans. After
     an alarm, a component that judges complete scans (the `TipClassifier`) finds when the tip is good again.
 
@@ -100,6 +102,7 @@ class LineWatch(Component):
         self._problems: tuple[int, ...] | None = None  # not known yet
         self._condition = ""
         self._refused: set[str] = set()
+        self._not_judged: set[str] = set()  # reasons that were logged
 
     def on_start(self) -> None:
         self.expected = MissingChannels(self.channels, self.log)
@@ -180,6 +183,10 @@ class LineWatch(Component):
             self._lines.judge = self.judge.begin(
                 lines.region, kind, self._time_s(lines.began_ns), channels=len(self.channels)
             )
+            lacking = self.judge.lacking(lines.region, kind)
+            if lacking and lacking not in self._not_judged:
+                self._not_judged.add(lacking)
+                self.log.info("the lines of this scan, and of others alike, are not judged: %s", lacking)
 
     def _judge(self, lines: ScanLines, running: _Lines) -> None:
         # a line is judged when all its channels have come; lines come in the order of the scan

@@ -1,0 +1,99 @@
+"""`LineWatch` on the lines that the translators of emulated controllers publish."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+from tests.plugins.gxsm.gxsm_bench import Bench as GxsmBench
+from tests.plugins.line_watch.test_line_watch import flags, verdicts
+from tests.plugins.nanonis.nanonis_bench import Bench as NanonisBench
+from tests.plugins.vendor_bench import VendorBench, benches, ready
+from tests.unit.client.client_lab import Lab, run
+
+from afspm.model import Region, Scan, ScanLines, ScopeState, ScopeStatus, names
+from afspm.plugins.line_watch.line_judge import FEWEST_PAIRS
+from afspm.plugins.line_watch.line_watch import LineWatch
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]  # six scans each, at the pace of a controller
+
+REGION, SHAPE = Region((0.0, 0.0), (1e-6, 1e-6)), (64, 64)
+LEARNT = FEWEST_PAIRS + 1
+Packets = list[ScanLines | Scan]
+
+
+class Maker(NamedTuple):
+    bench: type[VendorBench[Any]]
+    channels: tuple[str, str]
+    emulator: Mapping[str, Any] = {}
+
+
+MAKERS = {
+    "nanonis": Maker(NanonisBench, ("Z Forward", "Z Backward")),
+    "gxsm": Maker(GxsmBench, ("Topo", "Topo Backward"), {"version": 3}),
+}
+
+
+@pytest.fixture(params=MAKERS)
+def maker(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Maker:
+    for name in ("HOME", "USERPROFILE", "TMPDIR"):  # of the secret of Gxsm's bridge, and of its lock
+        monkeypatch.setenv(name, str(tmp_path))
+    return MAKERS[request.param]
+
+
+@pytest.fixture
+def bench(maker: Maker, tmp_path: Path) -> Iterator[Callable[..., VendorBench[Any]]]:
+    yield from benches(maker.bench, tmp_path)
+
+
+def test_changed_tip_stops_the_scan_of_a_maker_and_a_good_scan_goes_on(
+    maker: Maker, bench: Callable[..., VendorBench[Any]]
+) -> None:
+    made = bench(speed=20.0, surface={"kind": "particles"}, **maker.emulator)
+    peer = made.start(live_lines_s=1.0)
+    ready(peer, REGION, SHAPE)
+    assert peer.set(names.SCAN_SPEED, 3, "um/s").ok
+
+    def scanned() -> Packets:
+        response = peer.act(names.START_SCAN)
+        assert response.ok, response.reason
+        return [
+            one
+            for one in [*peer.until(ScopeState.SCANNING), *peer.until(ScopeState.FREE)]
+            if isinstance(one, ScanLines | Scan) and one.channel in maker.channels
+        ]
+
+    scanned()  # Gxsm publishes no lines of the first one: only its file has the names of the channels
+    night = [scanned() for _ in range(LEARNT + 1)]
+    # on a busy computer the scan begins later, and more of it is with the changed tip
+    half_s = (ended_ns(night[-1]) - began_ns(night[-1])) / 2e9
+    made.at_panel(lambda emulator: emulator.rig.world.change_tip("double", made.clock.now_s() + half_s))
+    changed = scanned()
+
+    lab = Lab("line_watch")
+    for number, packets in enumerate([*night, changed]):
+        at_s = 100.0 * (1.0 + number)
+        lab.at(at_s, partial(lab.publish, ScopeStatus(ScopeState.SCANNING)))
+        for packet in packets:
+            if isinstance(packet, ScanLines) or packets is not changed:
+                lab.at(at_s, partial(lab.publish, packet))
+    lab.at(2000.0, lab.kill)
+    run(LineWatch(*maker.channels, action="stop"), lab)
+    assert [one.began_ns for one in verdicts(lab) if one.stops] == [began_ns(changed)]
+    assert {one.began_ns for one in verdicts(lab)} == {began_ns(changed)}
+    assert flags(lab) == 1
+
+
+def began_ns(packets: Packets) -> int:
+    found = next(one.began_ns for one in packets if isinstance(one, ScanLines))
+    assert found is not None
+    return found
+
+
+def ended_ns(packets: Packets) -> int:
+    found = next(one.time_ns for one in packets if isinstance(one, Scan))
+    assert found is not None
+    return found
