@@ -174,10 +174,10 @@ class _Connections:
         guest = None if experiment.keys_folder else self._guest()
         if guest is not None or asking is None or written is None:
             return guest
-        told = None if asking.keys is None else {**asking.keys, written: self._scheduler}
+        known_keys = None if asking.keys is None else {**asking.keys, written: self._scheduler}
         sockets = Sockets(subscribe=(written,), control=asking.sockets.control)
         name, messages = f"{self._owner_of_key()}:doctor-{os.getpid()}", experiment.resolved.messages
-        return replace(asking, name=name, sockets=sockets, keys=told, messages=messages)
+        return replace(asking, name=name, sockets=sockets, keys=known_keys, messages=messages)
 
     def _guest(self) -> Launch | None:
         try:
@@ -232,16 +232,20 @@ class _Connections:
         finally:
             port.close()
         self._into.heard = [Heard(name, counts[name], sizes[name], listen_s) for name in sorted(counts)]
-        told = diagnosis.of_publisher(launch.sockets.subscribe[0], self._into.heard, caught_up=caught_up_s is not None)
-        self._into.found.append(told)
+        diagnosed = diagnosis.of_publisher(
+            launch.sockets.subscribe[0], self._into.heard, caught_up=caught_up_s is not None
+        )
+        self._into.found.append(diagnosed)
 
-    def _compare(self, told: Plain, asked_s: float, answered_s: float) -> None:
-        if not told.get("waits"):  # simulated time that waits for late processes does not show real time
-            now_s, start_s, origin_s, speed = (float(told[name]) for name in ("now_ns", "start_s", "origin_s", "speed"))
+    def _compare(self, answer: Plain, asked_s: float, answered_s: float) -> None:
+        if not answer.get("waits"):  # simulated time that waits for late processes does not show real time
+            now_s, start_s, origin_s, speed = (
+                float(answer[name]) for name in ("now_ns", "start_s", "origin_s", "speed")
+            )
             real_s = origin_s + (now_s / NS_PER_S - start_s) / speed
             ahead_s, uncertain_s = (asked_s + answered_s) / 2 - real_s, (answered_s - asked_s) / 2
             self._into.found.append(diagnosis.of_clock(ahead_s, uncertain_s))
-        versions = told.get("versions")
+        versions = answer.get("versions")
         theirs = Versions(**versions) if isinstance(versions, dict) else None
         self._into.found.append(diagnosis.of_versions(probe.versions_here(), theirs))
 

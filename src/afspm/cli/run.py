@@ -103,8 +103,8 @@ def run(
     )
     if resume is not None:
         if files or only or without or speed or dry_run or ask:
-            said = "a run is resumed as it was started: of other options only --dashboard is possible"
-            raise typer.BadParameter(said, param_hint="--resume")
+            refusal = "a run is resumed as it was started: of other options only --dashboard is possible"
+            raise typer.BadParameter(refusal, param_hint="--resume")
         found = resuming.find(resume)
         if dashboard:
             found = _page().resumed_with_page(found)

@@ -79,8 +79,8 @@ class StatusText:
 
         lines = [self._head()]
         if silent_s > OLD_S:
-            told = f"no news for {duration_text(silent_s)}: the scheduler is restarting, or can't be reached"
-            lines.append(Text(told, "bold yellow"))
+            warning = f"no news for {duration_text(silent_s)}: the scheduler is restarting, or can't be reached"
+            lines.append(Text(warning, "bold yellow"))
         lines += [self._control(), *self._problems(), self._scanning(), *self._progress(), *self._end(), *self._drift()]
         lines += self._processes()
         lines += self._refusals()
@@ -287,12 +287,12 @@ def _label(name: str) -> Text:
 
 
 def _well(state: ProcessState) -> str:
-    told = []
+    facts = []
     if state.condition is ProcessCondition.BUSY and state.step_age_s >= 1.0:
-        told.append(f"busy for {duration_text(state.step_age_s)}")
+        facts.append(f"busy for {duration_text(state.step_age_s)}")
     if state.starts > 1:
-        told.append(f"started {state.starts} times")
-    return f"{state.name} ({', '.join(told)})" if told else state.name
+        facts.append(f"started {state.starts} times")
+    return f"{state.name} ({', '.join(facts)})" if facts else state.name
 
 
 def _seconds(ns: int | None) -> float | None:

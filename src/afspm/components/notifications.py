@@ -56,9 +56,9 @@ class Notification:
     def body(self) -> bytes:
         """Return the notification as JSON: what, experiment, run, time (ISO 8601, UTC), text, simulated."""
         time = utc_time(self.time_ns).isoformat()
-        told = {**asdict(self), "time": time}
-        del told["time_ns"]
-        return json.dumps(told, ensure_ascii=False).encode()
+        fields = {**asdict(self), "time": time}
+        del fields["time_ns"]
+        return json.dumps(fields, ensure_ascii=False).encode()
 
 
 @dataclass(frozen=True)

@@ -144,10 +144,10 @@ class PlannedScans(Component):
         elif self.missed == "catch-up":
             self._add("owed", rounds)
         count = rounds * len(self.plan.regions)
-        told = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
-        self.log.warning("%s", told)
+        message = f"missed {count} scan{'s' if count > 1 else ''} while it could not scan; {_MISSED[self.missed]}"
+        self.log.warning("%s", message)
         with suppress(RequestError):  # a scheduler of another make may have no notes
-            self.scope.note(told)
+            self.scope.note(message)
 
     def _add(self, counter: str, rounds: int) -> None:
         self.memory[counter] = int(self.memory.get(counter, 0)) + rounds

@@ -165,10 +165,10 @@ class TipCorrector(Component):
             if self.scope.is_flagged(self.problem) and self.scope.is_flagged(Problem.DEVICE_MALFUNCTION):
                 return
             self.log.info("a person cleared the problem: the tip may be repaired again")
-            self._begin_anew()
+            self._reset_repair()
         if not self.scope.is_flagged(self.problem):
             if "region" in self.memory:
-                self._begin_anew()
+                self._reset_repair()
             if self.judge is not None:
                 self.judge.trust()
             return
@@ -430,7 +430,7 @@ class TipCorrector(Component):
         # an older ControlState must not be taken for a change
         self.scope.wait_until(lambda: self.scope.is_flagged(problem) is flagged, timeout_s=VERDICT_WITHIN_S)
 
-    def _begin_anew(self) -> None:
+    def _reset_repair(self) -> None:
         for key in ("tried", "region", "judged_bad", "given_up", "flaw", "pending"):
             self.memory.pop(key, None)
         self.memory.save()

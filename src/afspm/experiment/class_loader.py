@@ -203,10 +203,10 @@ def _search_paths(parent: str) -> list[str]:
 def _error_line(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
-    said = str(error)
+    message = str(error)
     if isinstance(error, SyntaxError) and error.filename:
-        place, said = f" ({Path(error.filename).name}:{error.lineno})", error.msg
-    return f"{type(error).__name__}: {said}{place}"
+        place, message = f" ({Path(error.filename).name}:{error.lineno})", error.msg
+    return f"{type(error).__name__}: {message}{place}"
 
 
 def _public_classes(module: ModuleType) -> list[str]:

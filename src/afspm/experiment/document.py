@@ -118,7 +118,9 @@ _SYNTAX_HINTS = (
 
 
 def _syntax_hint(what: str, written: str) -> str:
-    return next((hint for said, line, hint in _SYNTAX_HINTS if what.startswith(said) and re.search(line, written)), "")
+    return next(
+        (hint for beginning, line, hint in _SYNTAX_HINTS if what.startswith(beginning) and re.search(line, written)), ""
+    )
 
 
 def _lay_over(document: Document, data: Settings, where: dict[toml_lines.Path, SourceLocation]) -> None:

@@ -114,11 +114,11 @@ class _Drawing:
     # --- contents ------------------------------------------------------------------------------------------
 
     def _box(self, part: ExperimentPart) -> ProcessBox:
-        said = self.resolved.processes[part.name].declared
+        declared = self.resolved.processes[part.name].declared
         what = part.class_path.rpartition(".")[2] if part.class_path else " ".join(part.command)
         lines = [(what if len(what) <= 34 else what[:33] + "…", GREY)]
-        lines += [(f"flags {problem}", RED) for problem in said.flags]
-        lines += [(f"solves {problem}", GREEN) for problem in said.solves]
+        lines += [(f"flags {problem}", RED) for problem in declared.flags]
+        lines += [(f"solves {problem}", GREEN) for problem in declared.solves]
         labels = self._from_scheduler(part)
         if len(labels) > MOST_LABELS:
             labels = [*labels[: MOST_LABELS - 1], f"and {len(labels) - MOST_LABELS + 1} more"]
@@ -232,13 +232,13 @@ class _Drawing:
         self._addresses(part.name, self.bar_x + 14, self.bar_x + self.bar_width - 14, self.bar_y + 27)
 
     def _addresses(self, name: str, left: float, right: float, y: float) -> None:
-        for use, said, x, anchor, colour in (
+        for use, label, x, anchor, colour in (
             ("publish", "publishes", left, "start", ENVELOPES),
             ("serve", "answers", right, "end", CONTROL),
         ):
             slot = self.resolved.net.slots.get(f"{name}/{use}")
             if slot is not None:
-                self.svg.text(x, y, said, size=TEXT_SIZE, fill=colour, anchor=anchor)
+                self.svg.text(x, y, label, size=TEXT_SIZE, fill=colour, anchor=anchor)
                 self.svg.text(x, y + LINE, _at(slot.address), size=TEXT_SIZE, fill=GREY, anchor=anchor)
 
     def _translator(self, box: ProcessBox) -> float:
@@ -267,10 +267,10 @@ class _Drawing:
 
     def _legend(self, y: float) -> None:
         x = MARGIN
-        for colour, said in ((ENVELOPES, "published envelopes"), (CONTROL, "requests, each with its response")):
+        for colour, label in ((ENVELOPES, "published envelopes"), (CONTROL, "requests, each with its response")):
             self.svg.line([(x, y - 4), (x + 34, y - 4)], stroke=colour)
-            self.svg.text(x + 42, y, said, size=LABEL_SIZE, fill=GREY, anchor="start")
-            x += 42 + text_width(said, LABEL_SIZE) + 30
+            self.svg.text(x + 42, y, label, size=LABEL_SIZE, fill=GREY, anchor="start")
+            x += 42 + text_width(label, LABEL_SIZE) + 30
 
 
 def _at(address: str | None) -> str:

@@ -31,14 +31,15 @@ DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_action
 
 @dataclass(frozen=True)
 class ExperimentPart:
-    """One process as it is in the file, references replaced.
+    """One process of the experiment file, with references replaced.
 
     Attributes:
-        class_path: as written (converted, if it was of another form); empty for a command.
+        class_path: the class as written, or converted from another form of file; empty for a command.
         command: program and arguments; empty for a Python class.
         settings: arguments of the constructor, still with units.
-        own: keys of the table that are afspm's (wiring, envelopes, role …).
-        implied: whether it is not in the file, but part of every experiment; it runs where the scheduler does.
+        own: the table's keys that belong to afspm (wiring, envelopes, role …).
+        implied: whether the process is part of every experiment instead of the file; it runs on the scheduler's
+            computer.
     """
 
     name: str

@@ -102,15 +102,15 @@ def _add(part: ExperimentPart, resolved: ResolvedExperiment) -> None:
 
 def _declared(component: type, part: ExperimentPart) -> ComponentDeclaration:
     # a setting `problem` replaces its default value in what the class solves and flags
-    said = ComponentDeclaration.of_class(component)
+    declaration = ComponentDeclaration.of_class(component)
     default, given = settings.default_of(component, "problem"), part.settings.get("problem")
     if not isinstance(given, str) or not isinstance(default, str):
-        return said
+        return declaration
 
     def put(problems: tuple[str, ...]) -> tuple[str, ...]:
         return tuple(given if problem == default else problem for problem in problems)
 
-    return replace(said, solves=put(said.solves), flags=put(said.flags))
+    return replace(declaration, solves=put(declaration.solves), flags=put(declaration.flags))
 
 
 def _resolve_sections(resolved: ResolvedExperiment) -> None:
@@ -192,8 +192,8 @@ def _report_errors_inside(process: ResolvedProcess, component: type, resolved: R
 
 def _report(name: str, error: AfspmError, resolved: ResolvedExperiment) -> None:
     inside = _inside(error)
-    said = f"{validation_messages.name_of((name, *inside))}{':' if inside else ''} {error.what}"
-    resolved.document.error(said, name, *inside, hint=error.hint)
+    message = f"{validation_messages.name_of((name, *inside))}{':' if inside else ''} {error.what}"
+    resolved.document.error(message, name, *inside, hint=error.hint)
 
 
 def _inside(error: AfspmError) -> tuple[str | int, ...]:

@@ -337,10 +337,10 @@ def check_needs(resolved: ResolvedExperiment) -> None:
         if has is None:
             continue
         for name, process in resolved.processes.items():
-            said = process.declared
+            declared = process.declared
             for kind, needed, offered in (
-                ("action", said.needs_actions, has.actions),
-                ("parameter", said.needs_parameters, has.parameters),
+                ("action", declared.needs_actions, has.actions),
+                ("parameter", declared.needs_parameters, has.parameters),
             ):
                 for one in [one for one in needed if one not in offered]:
                     what = f"[{name}] needs the {kind} {one!r}, which [{translator.name}] does not have"

@@ -106,8 +106,8 @@ def _sentence(errors: Sequence[ErrorDetails], shown: str, known: Iterable[str]) 
         near = closest(str(given), re.findall(r"'(.*?)'", " ".join(wanted)))
         hint = f"did you mean {near!r}?" if near else ""
         return f"{shown} is {' or '.join(dict.fromkeys(wanted))}, not {given!r}", hint
-    said = last["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
-    return f"{shown}: {said[:1].lower()}{said[1:]}, not {given!r}", ""
+    message = last["msg"].removeprefix("Value error, ").replace("Input should be", "it should be")
+    return f"{shown}: {message[:1].lower()}{message[1:]}, not {given!r}", ""
 
 
 def _cause(one: ErrorDetails) -> AfspmError | None:

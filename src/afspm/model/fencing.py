@@ -66,10 +66,10 @@ class SchedulerFence:
         """
         if epoch is not None and epoch.simulated and not self._simulated:
             return NOT_SIMULATED
-        told = epoch.run if epoch is not None else run
-        if told and self._run and told != self._run:
+        run_of_sender = epoch.run if epoch is not None else run
+        if run_of_sender and self._run and run_of_sender != self._run:
             return ANOTHER
-        if self._obeyed is None or self._obeyed.is_followed_by(epoch, told):
+        if self._obeyed is None or self._obeyed.is_followed_by(epoch, run_of_sender):
             self._obeyed = epoch or self._obeyed
             return ""
         if is_connected():

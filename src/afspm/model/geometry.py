@@ -137,7 +137,7 @@ class Region:
 
 @dataclass(frozen=True)
 class RegionChange:
-    """Some fields of a region, as a request may give them, in m and rad before the rotation; None stays unchanged."""
+    """A request to change some fields of a region, in m and rad before the rotation; None stays unchanged."""
 
     left_m: float | None = None
     low_m: float | None = None

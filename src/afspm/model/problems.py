@@ -1,4 +1,4 @@
-"""Problems by name: those on the wire, and those that an experiment file adds."""
+"""Problems by name: the problems on the wire, and further problems of an experiment file."""
 
 from __future__ import annotations
 

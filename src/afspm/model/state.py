@@ -50,7 +50,7 @@ class ScopeStatus:
 
 @dataclass(frozen=True)
 class Feedback:
-    """The z feedback. None: unknown, or in a request unchanged.
+    """The z feedback. A field is None if unknown, or unchanged by a request.
 
     Attributes:
         on: whether the feedback regulates.

@@ -127,11 +127,11 @@ class CoordinateFrame(Protocol):
         """Return the move that an action needs before it, to happen at its place; None: no move."""
         ...
 
-    def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> CoordinateFrame:
+    def carried_out(self, sent: Request, reported: Parameter | None, now_ns: int) -> CoordinateFrame:
         """Store a success of the microscope, and the parameter value in its answer."""
         ...
 
-    def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
+    def answer(self, asked: Request, reported: Parameter | None, now_ns: int) -> Parameter | None:
         """Return the parameter value for the client; None: the value in the microscope's answer."""
         ...
 
@@ -187,10 +187,10 @@ class TipFrame:
     def move_before(self, action: str, now_ns: int) -> tuple[CoordinateFrame, MappedRequest | None]:
         return self, None
 
-    def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> CoordinateFrame:
+    def carried_out(self, sent: Request, reported: Parameter | None, now_ns: int) -> CoordinateFrame:
         return self
 
-    def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
+    def answer(self, asked: Request, reported: Parameter | None, now_ns: int) -> Parameter | None:
         return None
 
     def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[CoordinateFrame, Packet]:

@@ -404,9 +404,9 @@ def _run_watchdog(draft: StateDraft) -> bool:
     if not _is_due(draft.watchdog.due_s, draft.now_s):
         return False
     is_seen_to = draft.control.sees_to_tip
-    draft.watchdog, told = draft.watchdog.look_again(draft.microscope, draft.now_s, is_seen_to=is_seen_to)
-    if told is not None:
-        draft.log("CRITICAL", told)
+    draft.watchdog, notice = draft.watchdog.look_again(draft.microscope, draft.now_s, is_seen_to=is_seen_to)
+    if notice is not None:
+        draft.log("CRITICAL", notice)
     safety_commands.send(draft)
     return True
 

@@ -1,8 +1,8 @@
 """Imaging by a tip of a given shape: grey dilation, band limit, and the value at any position.
 
 The path of the tip's apex over a surface is the grey dilation of the surface by the reflected tip (Villarrubia 1997).
-A convex tip that is a paraboloid first and a cone further out is the infimal convolution of both, so dilating by one
-and then by the other is exact; each is again done one axis after the other.
+A convex tip, a paraboloid that continues as a cone, is the infimal convolution of both shapes. So a dilation by the
+paraboloid and then by the cone is exact; each is done axis by axis.
 """
 
 from __future__ import annotations

@@ -75,23 +75,23 @@ def follow(
 
 def summary(outcome: RunOutcome, folder: Path) -> list[str]:
     """Return the summary: why the run ended, processes that ran, restarts, processes given up, and the folder."""
-    told = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
-    told.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
+    lines = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
+    lines.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
         if (restarts := report.starts - 1 - report.ordered) > 0:
-            told.append(f"{report.name} was restarted {_times(restarts)}")
+            lines.append(f"{report.name} was restarted {_times(restarts)}")
         if report.ordered:
-            told.append(f"{report.name} was restarted {_times(report.ordered)}, as ordered")
+            lines.append(f"{report.name} was restarted {_times(report.ordered)}, as ordered")
         if report.given_up:
-            told.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
+            lines.append(f"{report.name} was GIVEN UP: {report.last_exit or 'it never started'}")
     try:
-        told += run_bounded(lambda: _counts_of_record(folder) or _counts_of_table(folder / TABLE), COUNTED_WITHIN_S)
+        lines += run_bounded(lambda: _counts_of_record(folder) or _counts_of_table(folder / TABLE), COUNTED_WITHIN_S)
     except DiskTimeout as error:
-        told.append(f"what was measured can't be counted: {error}")
-    told.append(f"everything is in {folder}")
+        lines.append(f"what was measured can't be counted: {error}")
+    lines.append(f"everything is in {folder}")
     if outcome.why in (EndReason.STOPPED, EndReason.PLANS_LOST):
-        told.append(f"{resume_command(folder)} goes on with it")
-    return told
+        lines.append(f"{resume_command(folder)} goes on with it")
+    return lines
 
 
 def _counts_of_record(folder: Path) -> list[str]:

@@ -288,8 +288,8 @@ class _OpenRequest:
 def _in_use(response: Response) -> str | None:
     # empty: not in use; None: an older scheduler, which has no such answer
     try:
-        told = json.loads(response.payload) if response.ok else {}
-        return str(told["in_use"])
+        answer = json.loads(response.payload) if response.ok else {}
+        return str(answer["in_use"])
     except (ValueError, KeyError, TypeError):  # an older scheduler
         return None
 

@@ -82,13 +82,13 @@ def _identity_in(response: Response, asked_s: float, answered_s: float, where: s
     if not response.ok:
         raise ConfigError(f"the scheduler does not answer with its time: {response.reason}", where=where)
     try:
-        told = json.loads(response.payload)
-        run, simulated = str(told.pop("run", "")), told.pop("simulated", False) is True
-        now_s = int(told.pop("now_ns")) / NS_PER_S
-        clock = ExperimentClock.from_dict(told)
+        answer = json.loads(response.payload)
+        run, simulated = str(answer.pop("run", "")), answer.pop("simulated", False) is True
+        now_s = int(answer.pop("now_ns")) / NS_PER_S
+        clock = ExperimentClock.from_dict(answer)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise WireError(f"the scheduler's time can't be read: {error!r}", where=where) from error
-    if told.get("waits"):
+    if answer.get("waits"):
         return RunIdentity(clock, run, simulated)
     real_s = (asked_s + answered_s) / 2
     shown_s = clock.start_s + (real_s - clock.origin_s) * clock.speed

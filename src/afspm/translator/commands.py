@@ -109,8 +109,8 @@ class Commands:
         done = self._success(request)
         done.steps = steps
         if request.kind == ControlRequest.PARAM:
-            told = (message for message in _ANNOUNCED.values() if set(of_message(message)) & values.keys())
-            done.announce = tuple(told)
+            messages = (message for message in _ANNOUNCED.values() if set(of_message(message)) & values.keys())
+            done.announce = tuple(messages)
         else:
             done.announce = (_ANNOUNCED[ControlRequest(request.kind)],)
         return done

@@ -60,9 +60,9 @@ def _open_and_lock(path: Path, address: str) -> BinaryIO:
         except FileNotFoundError:
             continue  # its former holder has just deleted it
         except OSError as error:
-            told = f"the lock file of this controller can't be opened: {error.strerror or error}"
+            message = f"the lock file of this controller can't be opened: {error.strerror or error}"
             raise ControllerTaken(
-                told, where=str(path), hint="find out which program made it, then delete it"
+                message, where=str(path), hint="find out which program made it, then delete it"
             ) from error
         try:
             lock(file)
@@ -73,9 +73,9 @@ def _open_and_lock(path: Path, address: str) -> BinaryIO:
             pass
         except OSError as error:
             file.close()
-            told = f"another run already commands this controller: {_holder(path)}"
+            message = f"another run already commands this controller: {_holder(path)}"
             raise ControllerTaken(
-                told, where=address, hint="a controller takes commands from one run at a time: end that run first"
+                message, where=address, hint="a controller takes commands from one run at a time: end that run first"
             ) from error
         file.close()
 
@@ -115,8 +115,10 @@ def _lock_folder() -> Path:
         if not stat.S_ISDIR(folder.lstat().st_mode):
             raise NotADirectoryError(errno.ENOTDIR, "it is not a folder")
     except OSError as error:
-        told = f"the folder of the controllers' lock files can't be made: {error.strerror or error}"
-        raise ControllerTaken(told, where=str(folder), hint="find out which program made it, then delete it") from error
+        message = f"the folder of the controllers' lock files can't be made: {error.strerror or error}"
+        raise ControllerTaken(
+            message, where=str(folder), hint="find out which program made it, then delete it"
+        ) from error
     return folder
 
 

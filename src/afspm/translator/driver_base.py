@@ -401,13 +401,15 @@ class DriverBase(ABC):
         Raises:
             InvalidValue: the controller returned a number that is not finite, which can't be published.
         """
-        found, told = self.read(wanted), self._last_written
+        found, written = self.read(wanted), self._last_written
         for name in wanted:
             value = found[name]
             if isinstance(value, float) and not math.isfinite(value):
                 raise InvalidValue(f"the controller returned {value} for {name}")
         return {
-            name: told[name] if name in told and self.same(name, found[name], told[name], found) else found[name]
+            name: written[name]
+            if name in written and self.same(name, found[name], written[name], found)
+            else found[name]
             for name in wanted
         }
 

@@ -312,8 +312,8 @@ def _row(known: ParameterSpec, given: PlainMapping, where: str, *, translated: b
             errors.add(ConfigError(f"unknown attribute {key!r}", where=at, hint=hint))
         if translated and key in _OF_THE_CONTROLLER:
             hint = "to translate it differently, derive a driver class from this one"
-            told = f"{key} has no effect: the driver's code translates this parameter"
-            errors.add(ConfigError(told, where=at, hint=hint))
+            message = f"{key} has no effect: the driver's code translates this parameter"
+            errors.add(ConfigError(message, where=at, hint=hint))
     errors.raise_all()
     values = dict(given)
     for key in ("vendor", "unit", "type"):

@@ -1,7 +1,7 @@
-"""The time between two looks at a controller: short when a measurement is about to end, long otherwise. Pure.
+"""The polling interval of a controller: short near the expected end of a measurement, long otherwise. Pure.
 
 The end of a scan has to be noticed within 20 ms of the controller's report. A controller that serves one request after
-the other must not be kept busy by polling meanwhile. So the time between two looks shrinks in proportion to the time
+the other must not be kept busy by polling meanwhile. So the interval shrinks in proportion to the time
 left until the expected end, and grows again in proportion to the time since.
 """
 

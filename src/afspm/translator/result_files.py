@@ -133,14 +133,14 @@ class FilePrecision:
         return replace(one, kind=measured["what"], position_m=position_m, time_ns=time_ns)
 
     def _position_m(
-        self, told: tuple[float, float] | None, place: Sequence[float] | None
+        self, reported: tuple[float, float] | None, place: Sequence[float] | None
     ) -> tuple[float, float] | None:
         if place is None:
-            return told
+            return reported
         x, y = place
         slack_m = 10 * self.part * max(abs(x), abs(y)) + 1e-12
-        elsewhere = self.positions and told is not None and math.dist(told, (x, y)) > slack_m
-        return told if elsewhere else (x, y)
+        elsewhere = self.positions and reported is not None and math.dist(reported, (x, y)) > slack_m
+        return reported if elsewhere else (x, y)
 
 
 def read_result(path: Path | str) -> FileContent:

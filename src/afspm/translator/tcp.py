@@ -1,4 +1,4 @@
-"""A TCP connection to a controller that answers one question after the other, and sends nothing unasked."""
+"""A TCP connection to a controller that answers one request at a time, and sends nothing unrequested."""
 
 from __future__ import annotations
 
@@ -156,12 +156,12 @@ class TcpConnection:
             return do()
         except TimeoutError as error:
             self.close()
-            told = f"no answer to {what} within {timeout_s:g} s"
-            raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
+            message = f"no answer to {what} within {timeout_s:g} s"
+            raise ControllerLost(message, where=self.where, hint=self._silent_hint) from error
         except OSError as error:
             self.close()
-            told = f"the connection was lost during {what}: {error}"
-            raise ControllerLost(told, where=self.where, hint=self._silent_hint) from error
+            message = f"the connection was lost during {what}: {error}"
+            raise ControllerLost(message, where=self.where, hint=self._silent_hint) from error
         except ControllerLost as error:
             self.close()
             error.where = error.where or self.where

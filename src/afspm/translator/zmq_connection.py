@@ -124,8 +124,8 @@ class ZmqConnection:
     def _await_reply(self, what: str, until_s: float) -> None:
         left_s = until_s - self._monotonic_s()
         if left_s <= 0.0 or not self._socket.poll(math.ceil(left_s * 1000.0)):
-            told = f"no reply to {what} within {self._timeout_s:g} s"
-            raise ControllerLost(told, where=self._address, hint=self._hints[2])
+            message = f"no reply to {what} within {self._timeout_s:g} s"
+            raise ControllerLost(message, where=self._address, hint=self._hints[2])
 
     def _taken(self, traced: TracedAnswer) -> bytes:
         frames = self._socket.recv_multipart()

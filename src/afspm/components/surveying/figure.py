@@ -95,8 +95,8 @@ class _Picture:
         targets = (
             f"{measured} of {counted(len(record.visits), 'target')} measured" if record.visits else "no target found"
         )
-        said = ", ".join(filter(None, (title, scan.channel, typeset_area(scan.region.size_m), when, targets)))
-        self._figure.text(_LEFT_IN / self._width_in, y, said, size=9, va="center")
+        title_text = ", ".join(filter(None, (title, scan.channel, typeset_area(scan.region.size_m), when, targets)))
+        self._figure.text(_LEFT_IN / self._width_in, y, title_text, size=9, va="center")
         if simulated:
             right = 1 - _LEFT_IN / self._width_in
             self._figure.text(right, y, "SIMULATED", size=10, weight="bold", color=PROBLEM, ha="right", va="center")
@@ -155,15 +155,15 @@ class _Picture:
             self._legend()
 
     def _label(self, axes: Axes, visit: Visit) -> None:
-        said = _SAYS.get(self._record.outcome(visit), "")
+        label = _SAYS.get(self._record.outcome(visit), "")
         axes.text(0.04, 0.95, f"{visit.number}", transform=axes.transAxes, size=9, weight="bold", va="top",
                   color="white", path_effects=_OUTLINE)  # fmt: skip
         if visit.registration is not None and not visit.registration.is_registered:
             sd = "" if visit.position_sd_m is None else f" ± {typeset_length(float(f'{visit.position_sd_m:.2g}'))}"
             axes.text(0.96, 0.95, f"dead reckoning{sd}", transform=axes.transAxes, size=_TEXT, ha="right", va="top",
                       color="white", path_effects=_OUTLINE)  # fmt: skip
-        if said:
-            axes.text(0.5, 0.5, said, transform=axes.transAxes, size=_TEXT, ha="center", va="center",
+        if label:
+            axes.text(0.5, 0.5, label, transform=axes.transAxes, size=_TEXT, ha="center", va="center",
                       bbox={"facecolor": "white", "alpha": 0.8, "pad": 2.0, "edgecolor": "none"})  # fmt: skip
 
     def _mark_curves(self, axes: Axes, visit: Visit) -> None:

@@ -82,8 +82,8 @@ def replay(where: Path, options: ReplayOptions, tell: Callable[[str], None]) -> 
                 signals.caught(lambda _: replayer.stop(), replayer.wakeup_fileno()),
                 _folder(run, options.runs, guest, clock, publish, serve) as folder,
             ):
-                told = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"
-                tell(f"{told}\npublished at {publish}, requests are refused at {serve}; Ctrl-C ends it")
+                message = f"replay of {run.folder.name} at {clock.speed:g} experiment seconds a second, in {folder}"
+                tell(f"{message}\npublished at {publish}, requests are refused at {serve}; Ctrl-C ends it")
                 replayer.run(stay=options.stay)
         finally:
             replayer.close()
@@ -106,8 +106,8 @@ def _clock(run: Run, speed: float | None, first_ns: int) -> ExperimentClock:
 
 def _addresses(run: Run, options: ReplayOptions) -> tuple[str, str]:
     ports = FreePorts()
-    said = _addresses_of_file(run)
-    return options.publish or said[0] or ports.address(), options.serve or said[1] or ports.address()
+    addresses = _addresses_of_file(run)
+    return options.publish or addresses[0] or ports.address(), options.serve or addresses[1] or ports.address()
 
 
 def _addresses_of_file(run: Run) -> tuple[str | None, str | None]:

@@ -131,8 +131,8 @@ class Replayer:
         except WireError as error:
             return Response(error.response, reason=str(error))
         if request.kind == CLOCK_REQUEST:
-            told = {**self._clock.as_dict(), "now_ns": self._clock.now_ns()}
-            return Response(int(ControlResponse.SUCCESS), json.dumps(told).encode(), "", request.id)
+            clock = {**self._clock.as_dict(), "now_ns": self._clock.now_ns()}
+            return Response(int(ControlResponse.SUCCESS), json.dumps(clock).encode(), "", request.id)
         if request.kind == RELAY_REQUEST:  # a supervisor of the replay's components: nothing is published for it
             return Response(int(ControlResponse.SUCCESS), wire.encode_orders(()), "", request.id)
         return Response(int(ControlResponse.FAILURE), reason=REASON, id=request.id)

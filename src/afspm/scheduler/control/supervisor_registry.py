@@ -154,34 +154,34 @@ class Announcement:
 
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
     """Check a message that a process asks the scheduler to publish: each sender may only publish about itself."""
-    told = event.request.subject
-    if not isinstance(told, RelayedMessage):
+    subject = event.request.subject
+    if not isinstance(subject, RelayedMessage):
         return Announcement("", "an empty announcement")
-    if len(told.payload) > LONGEST_ANNOUNCEMENT:
-        return Announcement("", f"an announcement of {len(told.payload)} bytes: at most {LONGEST_ANNOUNCEMENT}")
-    thing = codec.decode_packet(told.message, told.payload)
-    if isinstance(thing, Progress) and told.message == "Progress":
+    if len(subject.payload) > LONGEST_ANNOUNCEMENT:
+        return Announcement("", f"an announcement of {len(subject.payload)} bytes: at most {LONGEST_ANNOUNCEMENT}")
+    thing = codec.decode_packet(subject.message, subject.payload)
+    if isinstance(thing, Progress) and subject.message == "Progress":
         mine = thing.name in (event.name, component_of(event.name))
-        return _named(told.message, thing.name) if mine else Announcement("", f"{event.name} is not {thing.name}")
-    if isinstance(thing, Note) and told.message == "Note":
+        return _named(subject.message, thing.name) if mine else Announcement("", f"{event.name} is not {thing.name}")
+    if isinstance(thing, Note) and subject.message == "Note":
         mine = thing.who == event.name
-        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
-    if isinstance(thing, Proposal) and told.message == "Proposal":
+        return Announcement(subject.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if isinstance(thing, Proposal) and subject.message == "Proposal":
         mine = thing.who == event.name
-        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
-    if isinstance(thing, MeasurementSettings) and told.message == "MeasurementSettings":
+        return Announcement(subject.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if isinstance(thing, MeasurementSettings) and subject.message == "MeasurementSettings":
         mine = thing.who == event.name
-        return Announcement(told.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
-    if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != told.message:
-        return Announcement("", f"a {told.message[:80]} can't be relayed, or can't be read")
+        return Announcement(subject.message) if mine else Announcement("", f"{event.name} is not {thing.who[:80]!r}")
+    if not isinstance(thing, ProcessStates | LogLines) or type(thing).__name__ != subject.message:
+        return Announcement("", f"a {subject.message[:80]} can't be relayed, or can't be read")
     if event.user not in (None, SUPERVISOR):
         return Announcement("", f"only the key of {SUPERVISOR!r} may report processes, not the key of {event.user}")
     spoken_of = thing.lines if isinstance(thing, LogLines) else thing.processes
     if wrong := [one.name for one in spoken_of if not is_process_name(one.name)]:
         return Announcement("", f"{wrong[0][:LONGEST_PROCESS_NAME]!r} can't be the name of a process")
     if isinstance(thing, LogLines):
-        return Announcement(told.message)
-    named = _named(told.message, thing.supervisor)
+        return Announcement(subject.message)
+    named = _named(subject.message, thing.supervisor)
     return named if named.why else replace(named, states=thing.processes)
 
 

@@ -89,8 +89,10 @@ class PacketCache:
             return None
         if source_ns is not None and first_ns is not None:
             return self._keep_again(Packet(envelope, packet.payload, first_ns), source_ns, history)
-        said = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
-        out = Packet(envelope, packet.payload, self._next_ns(source_ns if said and source_ns is not None else now_ns))
+        has_time = source_ns is not None and source_ns <= now_ns + _FUTURE_NS
+        out = Packet(
+            envelope, packet.payload, self._next_ns(source_ns if has_time and source_ns is not None else now_ns)
+        )
         kept = self._keep(out, source_ns, history)
         if source_ns is not None and out.time_ns is not None and history:
             self._recent.append((source_ns, out.time_ns))

@@ -106,7 +106,7 @@ class SentStart:
     """The start of a measurement, saved before it is forwarded: its entry gives the measurement its key.
 
     Attributes:
-        sent_ns: when it was first forwarded.
+        sent_ns: time of its first forwarding.
     """
 
     who: str
@@ -115,7 +115,7 @@ class SentStart:
     sent_ns: int
 
     def entry(self, now_ns: int) -> JournalEntry:
-        """Return the entry of a start whose answer was lost when the scheduler was killed."""
+        """Return the journal entry of a start whose answer a kill of the scheduler lost."""
         return JournalEntry(
             now_ns,
             REQUEST,

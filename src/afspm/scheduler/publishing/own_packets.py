@@ -34,22 +34,22 @@ def publish_entries(draft: StateDraft) -> None:
 
 def publish_for_process(draft: StateDraft, event: RequestIn) -> None:
     """Publish a message for a process. The answer to a supervisor carries its orders."""
-    told = announcement(event, draft.env.codec)
-    if not told.envelope:
-        answers.answer(draft, event, ControlResponse.FAILURE, told.why)
+    announced = announcement(event, draft.env.codec)
+    if not announced.envelope:
+        answers.answer(draft, event, ControlResponse.FAILURE, announced.why)
         return
-    if draft.control.ended and told.envelope == NOTE.name:  # on this refusal its author writes it into the record
+    if draft.control.ended and announced.envelope == NOTE.name:  # on this refusal its author writes it into the record
         ended = ResponseDetail.EXPERIMENT_ENDED
         answers.answer(draft, event, ControlResponse.FAILURE, HAS_ENDED, detail=ended)
         return
-    if told.states is not None:
-        _replace_supervisors(draft, draft.peers.supervisors.reported(event.name, told.states, draft.now_s))
+    if announced.states is not None:
+        _replace_supervisors(draft, draft.peers.supervisors.reported(event.name, announced.states, draft.now_s))
     supervisors, orders = draft.peers.supervisors.orders_for(event.name)
     _replace_supervisors(draft, supervisors)
     payload = event.request.subject.payload
     # a retry of a message that was published already: a kill came before its answer
-    if not draft.env.cache.holds(told.envelope, payload):
-        publish(draft, told.envelope, payload)
+    if not draft.env.cache.holds(announced.envelope, payload):
+        publish(draft, announced.envelope, payload)
     answers.answer(draft, event, ControlResponse.SUCCESS, payload=wire.encode_orders(orders))
     draft.end = draft.end.processes_reported(draft.peers.supervisors.states_of(event.name), draft.now_s)
 

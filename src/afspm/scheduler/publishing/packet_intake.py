@@ -33,17 +33,17 @@ def take_packet(draft: StateDraft, event: PacketIn) -> None:
     """Publish a packet, and update the state of the microscope from it."""
     message, codec, move = event.header.message, draft.env.codec, draft.pending.move
     # only states are decoded: no decision depends on other messages, and scans are large
-    told = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
-    if move is not None and move.hides(told):
+    reported = codec.decode_packet(message, event.packet.payload) if _is_state(message) else None
+    if move is not None and move.hides(reported):
         if draft.env.cache.pass_over(event.packet):
-            _update_state(draft, told)
+            _update_state(draft, reported)
         return
     published = _published(draft, event.packet, event.header)
     if published is None:
         return
     draft.effects.append(published)
-    if told is not None:
-        _update_state(draft, told)
+    if reported is not None:
+        _update_state(draft, reported)
 
 
 def _is_state(message: str) -> bool:
@@ -71,17 +71,17 @@ def _log_once(draft: StateDraft, level: str, text: str) -> None:
         draft.log(level, text)
 
 
-def _update_state(draft: StateDraft, told: object) -> None:
-    if isinstance(told, ScopeStatus):
-        _update_scope_state(draft, told.state)
-    elif isinstance(told, Feedback):
-        before, draft.microscope = draft.microscope, draft.microscope.with_feedback(told)
+def _update_state(draft: StateDraft, published: object) -> None:
+    if isinstance(published, ScopeStatus):
+        _update_scope_state(draft, published.state)
+    elif isinstance(published, Feedback):
+        before, draft.microscope = draft.microscope, draft.microscope.with_feedback(published)
         is_manual = draft.control.mode is ControlMode.MANUAL
-        draft.by_hand = draft.by_hand.published(told, is_manual=is_manual)
+        draft.by_hand = draft.by_hand.published(published, is_manual=is_manual)
         if draft.microscope.risk != before.risk:
             safety_commands.send(draft)
-    if isinstance(told, Feedback | ScanParameters | ProbePosition):
-        draft.limits = draft.limits.published(told, draft.now_ns)
+    if isinstance(published, Feedback | ScanParameters | ProbePosition):
+        draft.limits = draft.limits.published(published, draft.now_ns)
 
 
 def _update_scope_state(draft: StateDraft, state: ScopeState) -> None:

@@ -88,12 +88,12 @@ def _part(reading: InstrumentReading, part: str) -> str | None:
 
 def report_in(draft: StateDraft, event: RequestIn) -> InstrumentReadings | None:
     """Return the report in a request; None: it is none, or not about its sender."""
-    told = event.request.subject
-    if event.request.kind != RELAY_REQUEST or not isinstance(told, RelayedMessage):
+    subject = event.request.subject
+    if event.request.kind != RELAY_REQUEST or not isinstance(subject, RelayedMessage):
         return None
-    if told.message != INSTRUMENT_READINGS.name:
+    if subject.message != INSTRUMENT_READINGS.name:
         return None
-    report = draft.env.codec.decode_packet(told.message, told.payload)
+    report = draft.env.codec.decode_packet(subject.message, subject.payload)
     if not isinstance(report, InstrumentReadings):
         return None
     owner = component_of(event.name)
@@ -102,7 +102,7 @@ def report_in(draft: StateDraft, event: RequestIn) -> InstrumentReadings | None:
 
 
 def take_report(draft: StateDraft, event: RequestIn, report: InstrumentReadings, may_send: MaySend) -> None:
-    """Store a report, settle the orders in it, and answer with the next one."""
+    """Store a report, settle its orders, and answer with the next orders."""
     name = report.instrument
     draft.instruments = draft.instruments.reported(report, draft.now_s, draft.now_ns)
     for outcome in report.outcomes:

@@ -30,12 +30,12 @@ class PrePositioner:
     states_seen: int
     settled_at_s: float | None = None
 
-    def hides(self, told: object) -> bool:
+    def hides(self, published: object) -> bool:
         """Return whether a state belongs to the move only, and is not published.
 
         To the client the action is under way, and would seem to be over before it began.
         """
-        return isinstance(told, ScopeStatus) and told.state in (ScopeState.MOVING, ScopeState.FREE)
+        return isinstance(published, ScopeStatus) and published.state in (ScopeState.MOVING, ScopeState.FREE)
 
     def moved(self, now_s: float) -> PrePositioner:
         """Wait until the microscope is free: the move has succeeded."""
@@ -68,9 +68,9 @@ class Turn:
     def reading(self, names: frozenset[str]) -> Turn:
         return replace(self, awaited=names, values={})
 
-    def was_read(self, name: str, told: Parameter | None) -> Turn:
+    def was_read(self, name: str, answered: Parameter | None) -> Turn:
         """Store the value of a parameter; None: the microscope answered without a value."""
-        return replace(self.lacks(name), values={**self.values, name: told})
+        return replace(self.lacks(name), values={**self.values, name: answered})
 
     def lacks(self, name: str) -> Turn:
         """Continue without a parameter that the microscope does not have."""

@@ -227,8 +227,8 @@ def _answer_clock_request(draft: StateDraft, event: RequestIn) -> None:
         "in_use": _reason_to_stay(draft),
         **approvals.facts(draft),
     }
-    told = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
-    response = Response(int(ControlResponse.SUCCESS), told, "", event.request.id)
+    metadata = json.dumps({**run.clock, **common, "versions": dict(run.versions)}).encode()
+    response = Response(int(ControlResponse.SUCCESS), metadata, "", event.request.id)
     draft.effects.append(Reply(event.connection, event.name, response, CLOCK_REQUEST))
 
 
@@ -434,9 +434,9 @@ def _take_read_value(draft: StateDraft, number: int, name: str, response: Respon
         draft.limits = draft.limits.forget(name)
         draft.pending = replace(draft.pending, turn=turn.lacks(name))
     else:
-        told = draft.env.codec.decode_parameter(response.payload) if response.ok and response.payload else None
-        told = told if told is not None and told.name == name else None
-        draft.pending = replace(draft.pending, turn=turn.was_read(name, told))
+        answered = draft.env.codec.decode_parameter(response.payload) if response.ok and response.payload else None
+        answered = answered if answered is not None and answered.name == name else None
+        draft.pending = replace(draft.pending, turn=turn.was_read(name, answered))
 
 
 def _apply_read_values(draft: StateDraft, turn: Turn) -> None:
@@ -570,14 +570,14 @@ def _track_feedback(draft: StateDraft, job: ForwardedRequest, response: Response
 
 def _apply_success(draft: StateDraft, job: ForwardedRequest, response: Response) -> Response:
     request, now_ns = job.request, draft.now_ns
-    told = None
+    answered = None
     if request.kind == _PARAM and response.payload:
-        told = draft.env.codec.decode_parameter(response.payload)
-    draft.limits = draft.limits.carried_out(job.outgoing, now_ns, told, _names_meant(job), job.client)
-    draft.frame = draft.frame.carried_out(job.outgoing, told, now_ns)
+        answered = draft.env.codec.decode_parameter(response.payload)
+    draft.limits = draft.limits.carried_out(job.outgoing, now_ns, answered, _names_meant(job), job.client)
+    draft.frame = draft.frame.carried_out(job.outgoing, answered, now_ns)
     # not for the scheduler's own reads: limits are in the coordinates of the microscope
     is_asked = request.kind == _PARAM and bool(job.client)
-    if is_asked and (mapped := draft.frame.answer(request, told, now_ns)) is not None:
+    if is_asked and (mapped := draft.frame.answer(request, answered, now_ns)) is not None:
         response = replace(response, payload=draft.env.codec.encode(mapped))
     if request.kind == _ACTION:
         _action_started(draft, job, is_certain=True)

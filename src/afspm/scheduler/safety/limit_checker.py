@@ -138,7 +138,7 @@ class LimitChecker:
         Args:
             values: None where the microscope answered without a value. A parameter that it does not have is left out.
         """
-        numbers_read = {name: None if told is None else self._number(told) for name, told in values.items()}
+        numbers_read = {name: None if reported is None else self._number(reported) for name, reported in values.items()}
         usage = self.state.usage
         for name, value in numbers_read.items():
             if value is None:
@@ -263,8 +263,8 @@ class LimitChecker:
         except ParameterValueError:
             return []
 
-    def _number(self, told: Parameter) -> float | None:
-        return next((value.number for value in self._valid_values(told)), None)
+    def _number(self, reported: Parameter) -> float | None:
+        return next((value.number for value in self._valid_values(reported)), None)
 
     # --- checks ---
 
@@ -324,22 +324,22 @@ class LimitChecker:
         def text(amount: float, digits: int = 6) -> str:
             return quantity(amount, limit.unit or BASE_PARAMETERS.get(name) or "", digits)
 
-        said = f"{name} = {text(value)}"
+        setting = f"{name} = {text(value)}"
         if limit.low is not None and value < limit.low - abs(limit.low) * _REACH:
-            raise _param_error(f"{said} is below the lowest allowed, {text(limit.low)} ({limit.source})")
+            raise _param_error(f"{setting} is below the lowest allowed, {text(limit.low)} ({limit.source})")
         if limit.high is not None and value > limit.high + abs(limit.high) * _REACH:
-            raise _param_error(f"{said} is above the highest allowed, {text(limit.high)} ({limit.source})")
+            raise _param_error(f"{setting} is above the highest allowed, {text(limit.high)} ({limit.source})")
         if not limit.bounds_changes:
             return
         known = self.state.usage.known.get(name)
         if known is None:
             raise _param_error(
-                f"{said}: the microscope reports no value now, so the step can't be checked ({limit.source})"
+                f"{setting}: the microscope reports no value now, so the step can't be checked ({limit.source})"
             )
         change = abs(value - known.value)
         if limit.step is not None and change > limit.step * (1 + _REACH):
             raise _param_error(
-                f"{said} is a step of {text(change)}, the largest allowed is {text(limit.step)} ({limit.source})"
+                f"{setting} is a step of {text(change)}, the largest allowed is {text(limit.step)} ({limit.source})"
             )
         if limit.rate_per_s is None:
             return
@@ -348,7 +348,7 @@ class LimitChecker:
         if moved_since > allowed * (1 + _REACH):
             ago_s = (now_ns - known.since_ns) / 1e9
             raise _param_error(
-                f"{said} changes by {text(moved_since)} within {ago_s:.3g} s, allowed is at most {text(allowed, 3)},"
+                f"{setting} changes by {text(moved_since)} within {ago_s:.3g} s, allowed is at most {text(allowed, 3)},"
                 f" at {text(limit.rate_per_s)} per second ({limit.source})"
             )
 
@@ -430,5 +430,5 @@ def is_get(request: Request) -> bool:
     return isinstance(request.subject, Parameter) and request.subject.value is None
 
 
-def _has_value_of(told: Parameter, asked: Parameter) -> bool:
-    return told.value is not None and told.name == asked.name
+def _has_value_of(reported: Parameter, asked: Parameter) -> bool:
+    return reported.value is not None and reported.name == asked.name

@@ -371,8 +371,8 @@ class Watchdog:
         if not is_refused and dog._waits_for_stop(microscope):
             return replace(dog, unstoppable=True), "the microscope does not stop, although a stop was sent"
         why = "the microscope is never free for that" if is_refused else "its translator is not there"
-        told = None if dog.retries else f"the tip was left in danger and can't be retracted: {why}"
-        return dog._retract_later(now_s), told
+        warning = None if dog.retries else f"the tip was left in danger and can't be retracted: {why}"
+        return dog._retract_later(now_s), warning
 
     @property
     def _wait_s(self) -> float:

@@ -113,8 +113,10 @@ class Playback:
         return [file for _, file in due]
 
     def _last_before(self, line: int, file: TracedFile) -> int:
-        said = [entry for exchanges in self._recorded for entry in exchanges]
-        return max((number for number, one in said if number < line and one.at_s + one.took_s <= file.at_s), default=0)
+        entries = [entry for exchanges in self._recorded for entry in exchanges]
+        return max(
+            (number for number, one in entries if number < line and one.at_s + one.took_s <= file.at_s), default=0
+        )
 
     def _has_passed(self, connection: int, after: int, line: int) -> bool:
         # the order between connections is part of the recording

@@ -67,7 +67,7 @@ class ClientBench:
     def experiment(self) -> JudgedExperiment:
         """A real, encrypted experiment that several checks share; replaced once it has ended."""
         if self._experiment is not None and self._experiment.ended:
-            self.begin_anew()
+            self.restart_experiment()
         if self._experiment is None:
             self._experiment = self.new_experiment()
         return self._experiment
@@ -94,10 +94,10 @@ class ClientBench:
 
     def explain(self, check: Check, failure: Failed) -> tuple[str, ...]:
         """Return the remedy; the next check gets a new experiment."""
-        self.begin_anew()
+        self.restart_experiment()
         return (f"→ {check.remedy}",)
 
-    def begin_anew(self) -> None:
+    def restart_experiment(self) -> None:
         """End the shared experiment, so that its history does not affect the next check."""
         if self._experiment is not None:
             self._experiment.close()
@@ -107,7 +107,7 @@ class ClientBench:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.begin_anew()
+        self.restart_experiment()
 
     @contextmanager
     def client(self, experiment: JudgedExperiment, *, ready: bool = True, **changes: Any) -> Iterator[JudgedClient]:

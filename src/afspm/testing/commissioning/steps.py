@@ -276,8 +276,8 @@ def _stop(guide: Guide) -> str:
 def _stop_at_panel(guide: Guide) -> str:
     client = guide.kit.client
     mark = guide.kit.begin_long_scan(guide.kit.frames.other)
-    said = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
-    if said.strip():
+    reply = guide.prompts.text("Stop the scan at the panel, then press Enter (u: it can't be stopped there)")
+    if reply.strip():
         client.come_to_rest()
         raise Skipped("not stopped at the panel")
     client.wait_state(ScopeState.FREE, mark, client.real_s(60.0))

@@ -90,9 +90,9 @@ def _figures(run: DriftRun, title: str) -> Iterator[tuple[str, Figure]]:
     for part in run.parts:
         if part.estimates is None or len(part.estimates) < 2:
             continue
-        told = f"{part.title}: first scan against each later one"
-        yield _named("estimates", part), draw_estimates(part.estimates, title=told, truth_m=_left_over(run, part))
-        yield _named("histogram", part), draw_histogram(part.estimates, title=told)
+        caption = f"{part.title}: first scan against each later one"
+        yield _named("estimates", part), draw_estimates(part.estimates, title=caption, truth_m=_left_over(run, part))
+        yield _named("histogram", part), draw_histogram(part.estimates, title=caption)
     if run.matched is not None and run.matched[2].matches is not None:
         first, second, found = run.matched
         yield "features", draw_features(run.scans[first], run.scans[second], found.matches)

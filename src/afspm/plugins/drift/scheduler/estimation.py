@@ -84,10 +84,10 @@ class Estimation:
         Raises:
             ConfigError: the tracker can't take this into account.
         """
-        told = getattr(self._tracker, "compensated", None)
-        if told is None:
+        compensated = getattr(self._tracker, "compensated", None)
+        if compensated is None:
             raise ConfigError("the tracker can't follow a controller that compensates", hint='tracker = "bank"')
-        told(time_s, velocity_m_s)
+        compensated(time_s, velocity_m_s)
         self._keep()
 
     def _keep(self) -> None:

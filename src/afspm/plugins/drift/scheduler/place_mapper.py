@@ -280,7 +280,7 @@ class PlaceMapper:
 
     # --- what the microscope answers ---
 
-    def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> None:
+    def carried_out(self, sent: Request, reported: Parameter | None, now_ns: int) -> None:
         if sent.kind == _SET_SCAN:
             self.region = self.region.was_set(sent.payload)
             if isinstance(sent.subject, ScanParameters) and isinstance(sent.subject.shape, tuple):
@@ -288,23 +288,23 @@ class PlaceMapper:
         elif sent.kind == _SET_PROBE:
             self.probe = self.probe.was_set(sent.payload)
         elif isinstance(sent.subject, Parameter):
-            parameter = told or sent.subject
+            parameter = reported or sent.subject
             if parameter.name == names.SCAN_SPEED and sent.subject.value is not None:
                 self.durations = ScanDurations()
             elif parameter.name == names.SCAN_DIRECTION and parameter.value is not None:
                 self.upwards = {names.UP: True, names.DOWN: False}.get(parameter.value)
 
-    def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
+    def answer(self, asked: Request, reported: Parameter | None, now_ns: int) -> Parameter | None:
         subject, mapping = asked.subject, self._mapping_at(now_ns * 1e-9)
         if mapping is None or not isinstance(subject, Parameter) or _place_of(asked) is None:
             return None
         if subject.value is not None:
             return subject  # set with the whole place, whose answer has no value
-        tip_value = None if told is None else number_of(told)
+        tip_value = None if reported is None else number_of(reported)
         if tip_value is None:
             return None
         sample_value = self._in_sample(subject.name, tip_value, mapping)
-        return None if sample_value is None else in_reported_unit(subject.name, sample_value, told)
+        return None if sample_value is None else in_reported_unit(subject.name, sample_value, reported)
 
     def _in_sample(self, name: str, tip_value: float, mapping: Mapping) -> float | None:
         if name in PROBE_CHANGES:
@@ -337,28 +337,28 @@ class PlaceMapper:
         }.get(header.message)
         if handler is None:
             return packet
-        told = self._codec.decode_packet(header.message, packet.payload)
-        payload = handler(told, packet.payload, (header.time_ns or now_ns) * 1e-9)
+        message = self._codec.decode_packet(header.message, packet.payload)
+        payload = handler(message, packet.payload, (header.time_ns or now_ns) * 1e-9)
         return packet if payload is None else Packet(packet.envelope, payload, packet.time_ns)
 
-    def _map_region(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
-        if not isinstance(told, ScanParameters) or not isinstance(told.region, Region):
+    def _map_region(self, message: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        if not isinstance(message, ScanParameters) or not isinstance(message.region, Region):
             return None
-        if isinstance(told.shape, tuple):
-            self.shape = told.shape
-        mapping, known = self._mapping_at(time_s), self.region.published(told.region)
+        if isinstance(message.shape, tuple):
+            self.shape = message.shape
+        mapping, known = self._mapping_at(time_s), self.region.published(message.region)
         if known is None or mapping is None:
-            sample = told.region if mapping is None else mapping.to_sample(told.region)
-            place = PositionPair(sample, self._codec.encode(ScanParameters(sample)), told.region, bytes(payload))
+            sample = message.region if mapping is None else mapping.to_sample(message.region)
+            place = PositionPair(sample, self._codec.encode(ScanParameters(sample)), message.region, bytes(payload))
             known = self.region.at(place)
         self.region = known
         if mapping is None or known.current is None:
             return None
         return self._codec.relocated("ScanParameters2d", payload, known.current.requested)
 
-    def _map_lines(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+    def _map_lines(self, message: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         # lines get the place of the frame in force; the finished scan will get its measured place
-        region, mapping = getattr(told, "region", None), self._mapping_at(time_s)
+        region, mapping = getattr(message, "region", None), self._mapping_at(time_s)
         if region is None or mapping is None:
             return None
         known = self.region.published(region)
@@ -368,21 +368,21 @@ class PlaceMapper:
             self.region, requested = known, known.current.requested
         return self._codec.relocated("ScanLines", payload, requested)
 
-    def _map_probe(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
-        if not isinstance(told, ProbePosition):
+    def _map_probe(self, message: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+        if not isinstance(message, ProbePosition):
             return None
-        mapping, known = self._mapping_at(time_s), self.probe.published(told)
+        mapping, known = self._mapping_at(time_s), self.probe.published(message)
         if known is None or mapping is None:
-            sample = told if mapping is None else _position(mapping, told.xy_m)
-            known = self.probe.at(PositionPair(sample, self._codec.encode(sample), told, bytes(payload)))
+            sample = message if mapping is None else _position(mapping, message.xy_m)
+            known = self.probe.at(PositionPair(sample, self._codec.encode(sample), message, bytes(payload)))
         self.probe = known
         if mapping is None or known.current is None:
             return None
         return self._codec.relocated("ProbePosition", payload, known.current.requested)
 
-    def _map_spectrum(self, told: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
+    def _map_spectrum(self, message: object, payload: bytes | memoryview, time_s: float) -> bytes | None:
         # mapped for its own time: the sample may have drifted since the probe was moved
-        mapping, position_m = self._mapping_at(time_s), getattr(told, "position_m", None)
+        mapping, position_m = self._mapping_at(time_s), getattr(message, "position_m", None)
         if mapping is None or position_m is None:
             return None
         return self._codec.relocated("Spec1d", payload, self._codec.encode(_position(mapping, position_m)))

@@ -101,9 +101,9 @@ def value_in(name: str, region: Region) -> float:
     return float(_VALUES[name](region))
 
 
-def in_reported_unit(name: str, value: float, told: Parameter | None) -> Parameter:
+def in_reported_unit(name: str, value: float, reported: Parameter | None) -> Parameter:
     """Return a value in SI as a parameter in the unit that the microscope uses for it."""
-    unit = _unit(told or Parameter(name))
+    unit = _unit(reported or Parameter(name))
     # 15 digits: a value set as 0.1 nm reads as 0.1, not as 0.09999999999999999
     return Parameter(name, f"{convert(value, BASE_PARAMETERS[name] or '', unit):.15g}", unit)
 

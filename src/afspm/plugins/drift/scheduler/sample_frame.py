@@ -146,13 +146,13 @@ class SampleFrame:
         move = mapper.move_before(action, now_ns)
         return self._mapped(mapper), move
 
-    def carried_out(self, sent: Request, told: Parameter | None, now_ns: int) -> SampleFrame:
+    def carried_out(self, sent: Request, reported: Parameter | None, now_ns: int) -> SampleFrame:
         mapper = self._mapper()
-        mapper.carried_out(sent, told, now_ns)
+        mapper.carried_out(sent, reported, now_ns)
         return self._mapped(mapper)
 
-    def answer(self, asked: Request, told: Parameter | None, now_ns: int) -> Parameter | None:
-        return self._mapper().answer(asked, told, now_ns)
+    def answer(self, asked: Request, reported: Parameter | None, now_ns: int) -> Parameter | None:
+        return self._mapper().answer(asked, reported, now_ns)
 
     def incoming(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[SampleFrame, Packet]:
         mapper = self._mapper()

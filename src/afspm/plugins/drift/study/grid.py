@@ -63,12 +63,12 @@ class SettingsGrid:
                     f"{name} has no effect: no night has an estimator or tracker {part!r}",
                     hint='name it as well, e.g. tracker = "paper" and paper.queue = 5',
                 )
-        told: list[NightSettings] = []
+        varied: list[NightSettings] = []
         for chosen, settings in nights:
             in_force = [name for name in chosen if _is_in_force(name, settings)]
             label = " ".join(f"{name}={chosen[name]}" for name in in_force) or "defaults"
-            if settings not in told:
-                told.append(settings)
+            if settings not in varied:
+                varied.append(settings)
                 yield label, settings
 
     def _combinations(self) -> Iterator[dict[str, object]]:
