@@ -1,4 +1,4 @@
-"""A person gives an agent a grant on the page, sees its uses, and revokes it; the scheduler is the real one."""
+"""A person gives an agent a grant on the page, and revokes it; the scheduler is the real one."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def approvals(night: Night) -> Any:
     return night.follower.overview.approvals.approvals
 
 
-def test_grant_is_given_used_and_revoked_on_the_page(night: Night, page: Any, keep: Any) -> None:
+def test_grant_is_given_in_the_dialog_and_ends_with_manual(night: Night, page: Any, keep: Any) -> None:
     page.click("button:has-text('Give an agent a grant')")
     page.wait_for_selector(".question.grant")
     assert page.input_value(".question input[aria-label='x-pulse']") == "0"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.units import si
-from afspm.record.drawing.timeline import AllowedBand, TimelineCurve
+from afspm.record.drawing.timeline import DrawnBand, TimelineCurve
 from afspm.record.overview import Overview
 from afspm.record.run_json import EXPERIMENT_FILE
 
@@ -53,7 +53,7 @@ def instrument_curves(overview: Overview, bands: AllowedBands) -> list[TimelineC
     return curves
 
 
-def _converted(band: WrittenBand, unit: str) -> AllowedBand | None:
+def _converted(band: WrittenBand, unit: str) -> DrawnBand | None:
     # None: no band in this unit; a drawing without a band is better than none, and the scheduler refuses such a file
     found = []
     for bound, unbounded in ((band.low, -math.inf), (band.high, math.inf)):
@@ -62,4 +62,4 @@ def _converted(band: WrittenBand, unit: str) -> AllowedBand | None:
         except AfspmError:
             return None
     low, high = found
-    return AllowedBand(band.condition, low, high) if low < high else None
+    return DrawnBand(band.condition, low, high) if low < high else None

@@ -127,6 +127,7 @@ def test_grant_of_a_table() -> None:
     "wrong",
     [
         {"for": 2},
+        {"for": "2"},
         {"for": "0 s"},
         {"counts": {"start-scan": True}},
         {"counts": {"start-scan": 1.5}},

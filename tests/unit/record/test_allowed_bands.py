@@ -7,7 +7,7 @@ from pathlib import Path
 
 from afspm.model import ProblemNames
 from afspm.record.allowed_bands import allowed_bands, instrument_curves
-from afspm.record.drawing.timeline import AllowedBand
+from afspm.record.drawing.timeline import DrawnBand
 from afspm.record.overview import MOST_POINTS, Overview, ReadingCurve
 from afspm.record.run_json import EXPERIMENT_FILE
 
@@ -31,9 +31,9 @@ def test_bands_of_the_experiment_file_are_in_the_units_of_the_curves(tmp_path: P
         overview.instruments[name] = ReadingCurve(unit, [0], [1.0])
     bands = {one.name: one.bands for one in instrument_curves(overview, allowed_bands(tmp_path))}
     assert bands == {
-        "cryo.temperature": [AllowedBand("cold", 4.15, 4.25)],
+        "cryo.temperature": [DrawnBand("cold", 4.15, 4.25)],
         "gas.pressure": [],
-        "magnet.field": [AllowedBand("settled", 1.9, math.inf)],
+        "magnet.field": [DrawnBand("settled", 1.9, math.inf)],
     }
 
 

@@ -6,7 +6,7 @@ from datetime import UTC
 
 from afspm.record.drawing.timeline import (
     COLUMNS,
-    AllowedBand,
+    DrawnBand,
     TimelineCurve,
     TimelineRow,
     stretches,
@@ -65,7 +65,7 @@ def test_curve_whose_newest_value_is_unknown_says_so() -> None:
     assert "4 K to 5 K, now unknown" in timeline_html([row], 0, 60 * S, UTC, curves=[curve])
 
 
-COLD = AllowedBand("cold", 4.15, 4.25)
+COLD = DrawnBand("cold", 4.15, 4.25)
 
 
 def test_allowed_band_is_drawn_with_its_limits_and_marks_the_times_outside() -> None:
@@ -87,7 +87,7 @@ def test_time_outside_ends_where_the_value_becomes_unknown() -> None:
 
 
 def test_one_sided_band_has_one_limit() -> None:
-    curve = TimelineCurve("magnet.b", "T", [0, 10 * S], [1.0, 2.0], (AllowedBand("field", 1.5, float("inf")),))
+    curve = TimelineCurve("magnet.b", "T", [0, 10 * S], [1.0, 2.0], (DrawnBand("field", 1.5, float("inf")),))
     assert curve.outside() == [(0, 5 * S)]
     drawn = timeline_html([TimelineRow("control", [Span("series", 0, 10 * S)], str)], 0, 10 * S, UTC, curves=[curve])
     assert drawn.count("<line ") == 1

@@ -9,7 +9,7 @@ from dataclasses import replace
 from afspm.basics.errors import InvalidValue
 from afspm.basics.formatting import duration_text, quantity
 from afspm.basics.plain_data import Plain
-from afspm.basics.units import si
+from afspm.basics.units import parse_quantity, si
 from afspm.model import Frame, Grant, GrantedCount, GrantedRange, Proposal, names
 from afspm.plugins.agent.plan import Plan, ScanStep, plan_of
 from afspm.plugins.agent.untrusted import escaped
@@ -89,7 +89,8 @@ def of_table(table: Mapping[str, object], facts: Plain) -> Grant:
         (left, right), (low, high) = (tuple(si(one, "m") for one in _pair(region[axis], axis)) for axis in "xy")
         region_m = ((left + right) / 2, (low + high) / 2, right - left, high - low)
     lasts = table["for"]
-    if not isinstance(lasts, str):
+    # a plain "2" would be two seconds, which no person means
+    if not isinstance(lasts, str) or not parse_quantity(lasts)[1]:
         raise InvalidValue('`for` is a time with its unit, as in "2 h"', where="grant, for")
     grant = Grant(
         str(table["agent"]), region_m=region_m, ranges=tuple(ranges), counts=tuple(counts), lasts_s=si(lasts, "s")

@@ -72,7 +72,7 @@ class TimelineRow:
 
 
 @dataclass(frozen=True)
-class AllowedBand:
+class DrawnBand:
     """The values that a condition allows; an infinite bound is none."""
 
     condition: str
@@ -88,7 +88,7 @@ class TimelineCurve:
     unit: str
     times_ns: Sequence[int]
     values: Sequence[float]
-    bands: Sequence[AllowedBand] = ()
+    bands: Sequence[DrawnBand] = ()
 
     def outside(self) -> list[tuple[int, int]]:
         """Return the times in which the value is outside a band: (from, to) in ns, interpolated between values."""
@@ -286,7 +286,7 @@ def _curve(curve: TimelineCurve, begin_ns: int, end_ns: int) -> str:
     )
 
 
-def _drawn_band(below: float, above: float, band: AllowedBand) -> str:
+def _drawn_band(below: float, above: float, band: DrawnBand) -> str:
     # y grows downwards
     dashes = "".join(
         f'<line x1="0" x2="{COLUMNS}" y1="{y:.1f}" y2="{y:.1f}"/>'

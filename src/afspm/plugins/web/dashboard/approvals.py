@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from html import escape
 
@@ -11,9 +11,10 @@ from nicegui import background_tasks, ui
 
 from afspm.basics.errors import AfspmError
 from afspm.basics.formatting import counted, day_and_time, quantity, typeset_area, typeset_position
+from afspm.basics.plain_data import Plain
 from afspm.model import Approval, Frame, Grant, Proposal, names
 from afspm.model.events import PERSON
-from afspm.plugins.agent.approval import of_plan, simulated
+from afspm.plugins.agent.approval import of_plan, of_table, simulated
 from afspm.plugins.agent.plan import plan_of
 from afspm.plugins.agent.untrusted import escaped
 from afspm.plugins.web.dashboard.actions import ActionResult
@@ -126,6 +127,11 @@ def waiting(proposal: Proposal) -> tuple[str, str, str]:
 
 def _line_html(agent: str, what: str, details: str) -> str:
     return f'<b>{escape(agent)}</b> {escape(what)}<span class="advice">{escape(details)}</span>'
+
+
+def grant_of(table: Mapping[str, object], facts: Plain) -> Grant:
+    """Return a grant from the table that `afspm approve --grant` reads; errors as of `of_table`."""
+    return of_table(table, facts)
 
 
 def title(proposal: Proposal) -> str:

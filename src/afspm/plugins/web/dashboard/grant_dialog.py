@@ -15,8 +15,8 @@ from afspm.basics.errors import AfspmError, InvalidValue
 from afspm.basics.formatting import quantity
 from afspm.basics.plain_data import Plain
 from afspm.model import Region, names
-from afspm.plugins.agent.approval import of_table
 from afspm.plugins.web.dashboard.actions import ActionResult, Actions
+from afspm.plugins.web.dashboard.approvals import grant_of
 from afspm.plugins.web.dashboard.steering_session import SteeringSession
 
 MEASURED = {names.START_SCAN: 10, names.START_SPEC: 0}
@@ -137,11 +137,11 @@ class GrantDialog:
     async def _give(self) -> None:
         try:
             table = self._read()
-            of_table(table, self._facts)  # before it is sent, and once more with it
+            grant_of(table, self._facts)  # before it is sent, and once more with it
         except AfspmError as error:
             self._refusal.set_text(str(error))
             return
-        result = await self._session.carry_out(lambda actions: actions.approve(of_table(table, self._facts)))
+        result = await self._session.carry_out(lambda actions: actions.approve(grant_of(table, self._facts)))
         if self._dialog.is_deleted:
             return
         if result.ok:
