@@ -18,7 +18,7 @@ from afspm.basics.launch import Sockets
 from afspm.model import ControlRequest, ControlResponse, Region, Request, Response, Scan, ScopeState, ScopeStatus
 from afspm.supervisor.ports import FreePorts
 from afspm.transport import keys
-from afspm.wire.generated import control_pb2
+from afspm.wire.generated import control_pb2, scan_pb2
 
 SUCCESS = int(ControlResponse.SUCCESS)
 PAUSE_S = 0.4
@@ -71,7 +71,8 @@ def test_a_late_peer_receives_the_last_packet_of_each_envelope(rig: BridgedRig, 
         for value in (1.0, 2.0):
             region = Region((0.0, 0.0), (size_m, size_m))
             rig.publish_packet(*wire.encode(Scan(region, "Height", "m", np.full((2, 2), value), 1)))
-    rig.until(lambda: "Scan2d_2000.0_Height" in early.cache and early.cache["Scan2d_2000.0_Height"].values[0] == 2.0)
+    newest = scan_pb2.Scan2d(values=[2.0] * 4)
+    rig.until(lambda: getattr(early.cache.get("Scan2d_2000.0_Height"), "values", []) == newest.values)
     late = plain(zmq.SUB)
     late.setsockopt(zmq.SUBSCRIBE, b"Scan2d")
     late.connect(rig.publish)
