@@ -8,6 +8,7 @@ import pytest
 
 from afspm import wire
 from afspm.basics.clock import ExperimentClock
+from afspm.components.tip_verdict import OF_LINES, LineVerdict, line_verdict_message
 from afspm.model import (
     ControlMode,
     ControlState,
@@ -70,6 +71,23 @@ def test_the_past_is_read_from_the_record(tmp_path: Path) -> None:
         ("free", 5),
     ]
     assert watch.overview.timelines.control.now is None
+
+
+def test_a_recorded_frame_has_the_row_since_which_the_lines_show_another_tip(tmp_path: Path) -> None:
+    store = RecordStore(tmp_path, RecordSettings())
+    region = Region((0.0, 0.0), (1e-6, 1e-6))
+    verdict = LineVerdict(region, (4, 4), "Height", 2 * S, 3, 2, False, 0.9, True)
+    payloads = [
+        ("Scan2d_1000.0_Height", wire.encode(Scan(region, "Height", "m", np.zeros((4, 4)), S))[1]),
+        (f"{OF_LINES}_line_watch", line_verdict_message(verdict).SerializeToString()),
+        ("Scan2d_1000.0_Height", wire.encode(Scan(region, "Height", "m", np.ones((4, 4)), 4 * S))[1]),
+    ]
+    store.take((Packet(name, payload, at * S), SCHEDULER) for at, (name, payload) in enumerate(payloads, 1))
+    store.flush()
+    store.close()
+    archive = Archive(tmp_path)
+    frames = [archive.frame(time_ns, "Height") for time_ns in (S, 4 * S)]
+    assert [frame and frame.changed_row for frame in frames] == [None, 2]
 
 
 def test_a_run_without_a_record_and_a_replay_have_no_past(tmp_path: Path) -> None:

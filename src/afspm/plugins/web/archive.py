@@ -133,10 +133,14 @@ def _region(box: Plain) -> Region:
 def _find(folder: Path, time_ns: int, channel: str) -> ChannelFrame | None:
     with open_run(folder) as run:
         row = run.scan_at(time_ns, channel)
-        return None if row is None or not row.file else _frame(run.scan(row)[channel], time_ns)
+        if row is None or not row.file:
+            return None
+        return _frame(run.scan(row)[channel], time_ns, run.changed_rows().get(time_ns))
 
 
-def _frame(scan: Scan, time_ns: int) -> ChannelFrame:
+def _frame(scan: Scan, time_ns: int, changed_row: int | None) -> ChannelFrame:
     # negative, unlike the numbers of live frames, and always the same for the same scan
     number = -1 - (hash((time_ns, scan.channel)) & (2**52 - 1))
-    return ChannelFrame(number, scan.channel, scan.unit, scan.region, scan.values, time_ns, None, scan.shape[0])
+    return ChannelFrame(
+        number, scan.channel, scan.unit, scan.region, scan.values, time_ns, None, scan.shape[0], changed_row=changed_row
+    )
