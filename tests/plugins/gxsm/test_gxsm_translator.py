@@ -524,13 +524,15 @@ def test_scans_repeated_at_the_panel_are_published_one_by_one_and_a_stopped_one_
 
     def begin(emulator: Any) -> None:
         emulator.program.panel.repeats = True
-        hold_scan(emulator.program, 4)
+        hold_scan(emulator.program, 1, 2, 3, 4)
         emulator.program.start_scan()
 
     made.at_panel(begin)
     found: list[str] = []
     for number in (1, 2, 3):
-        received = peer.until(FREE)
+        received = peer.until(ScopeState.SCANNING)
+        made.at_panel(lambda emulator: scan_until_line(emulator.program, 1))
+        received += peer.until(FREE)
         assert states(received) == ["SCANNING", "FREE"]
         assert {Path(scan.filename).name[4:7] for scan in scans(received)} == {f"00{number}"}
         found += [scan.channel for scan in scans(received)]
@@ -551,14 +553,14 @@ HELD = 1e4
 """Factor of a held scan's line time: the scan outlasts the test on however busy a computer."""
 
 
-def hold_scan(program: Any, number: int) -> None:
-    """Let the n-th scan from now on take so long per line that it is at its first line until `scan_until_line`."""
+def hold_scan(program: Any, *numbers: int) -> None:
+    """Let scans, counted from now, take so long per line that each is at its first line until `scan_until_line`."""
     start, begun = program.start_scan, itertools.count(1)
 
     def start_scan() -> None:
         before = program.scan.activity
         start()
-        if program.scan.activity is not before and next(begun) == number:
+        if program.scan.activity is not before and next(begun) in numbers:
             program.scan.activity.line_s *= HELD
 
     program.start_scan = start_scan
