@@ -1,4 +1,4 @@
-"""Published messages one after the other, for scripts that look at every message."""
+"""Iteration over published messages, for scripts that need every message."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class PublishedEvent:
     Attributes:
         envelope: its topic.
         message: an object of `afspm.model`, or a generated message.
-        time_ns: its time in the experiment; None if the publisher gives none.
+        time_ns: experiment time of the message; None if the publisher gives no time.
     """
 
     envelope: str
@@ -85,7 +85,7 @@ class Events(Iterator[PublishedEvent]):
         return PublishedEvent(packet.envelope, message, packet.time_ns)
 
     def close(self) -> None:
-        """Drop all waiting messages, and keep no more."""
+        """Drop all waiting messages, and stop collecting new ones."""
         self._forget()
         self._backlog.close()
 

@@ -1,4 +1,4 @@
-"""The loop of a component: one thread that waits in one place and calls one handler at a time."""
+"""The main loop of a component: one thread, which waits in one place and calls one handler at a time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ AT_ONCE = 16  # packets handled between two polls of the port: a KILL must not w
 
 
 class ComponentLoop:
-    """The loop of one component until the experiment ends, the process is stopped, or `run` returns.
+    """The main loop of one component, until the experiment ends, the process is stopped, or `run` returns.
 
     Args:
         base: class with the empty handlers that the component overrides.
