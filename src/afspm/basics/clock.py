@@ -45,7 +45,7 @@ def iso_utc(time_ns: int | None) -> str:
 
 
 class Clock(Protocol):
-    """A source of time."""
+    """Interface of a run's clock."""
 
     def now_ns(self) -> int:
         """Return the experiment time in ns since the Unix epoch."""

@@ -182,7 +182,7 @@ class Refused(RequestError):
 
 
 class NoResponse(RequestError):
-    """A request without an answer in time: it may or may not have been carried out."""
+    """A request without an answer in time, which may or may not have been carried out."""
 
     code = "no-response"
 

@@ -72,7 +72,7 @@ class Launch:
     simulated: bool = False
     """True only if the microscope is certainly simulated: by its translator, or by `controller`."""
     controller: str = ""
-    """For a translator: the run's emulator, then the only controller that it may connect to; empty: none."""
+    """For a translator: the emulator of this run, as the only controller to connect to; empty: no emulator."""
     sample_coordinates: bool = False
     """Positions are sample coordinates, which the scheduler maps to tip coordinates."""
     retracts: bool = False
