@@ -48,8 +48,8 @@ def check_translator(
 ) -> None:
     """Check each base operation of a translator from outside, with the tip withdrawn.
 
-    Starts translator and scheduler (and an emulated controller, if there is one), or joins running ones. What the
-    microscope does not support is skipped and listed. Ends with 0 if nothing was wrong.
+    Starts translator and scheduler (and an emulated controller, if the file has one), or joins running processes.
+    Operations that the microscope does not support are skipped and listed. Ends with 0 if nothing was wrong.
     """
     import sys
 
