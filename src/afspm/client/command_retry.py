@@ -58,7 +58,7 @@ class CommandRetry:
         self._control = control
 
     def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
-        """Send a command until it succeeds, inside a block with control; wait for control if it is lost.
+        """Send a command until it succeeds, inside a block with control; if control is lost, wait for it.
 
         In an unbroken block, lost control is an error: other components may have changed the microscope meanwhile.
 

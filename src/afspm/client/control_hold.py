@@ -1,4 +1,4 @@
-"""Control of the microscope: requesting it, waiting for it, noticing its loss, releasing it."""
+"""Control of the microscope: request, wait, detection of a loss, and release."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ class PublishedEvent:
     """A published message.
 
     Attributes:
-        envelope: its topic.
+        envelope: topic of the message.
         message: an object of `afspm.model`, or a generated message.
         time_ns: experiment time of the message; None if the publisher gives no time.
     """

@@ -112,7 +112,7 @@ class RequestTracker:
         self.answer: Response | None = None
 
     def next_id(self) -> str:
-        """Return an id for a request, unique over all lives of this component."""
+        """Return an id for a request, unique over all restarts of this component."""
         self._requests += 1
         return f"{self._name}/{self._session}/{self._requests}"
 
@@ -283,7 +283,7 @@ class ExperimentLink:
         return self._source in self._caught_up if self._source else bool(self._caught_up)
 
     def until(self, timeout_s: float | None) -> float | None:
-        """Return the end of a timeout in monotonic time."""
+        """Return the end of a timeout in monotonic time; None for no timeout."""
         return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
 
     def earlier(self, timeout_s: float, until_s: float | None) -> float:

@@ -89,7 +89,7 @@ class KeyedResults:
         self._memory.save()
 
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:
-        """Return the saved result of a key, from an earlier call or from before a restart; None if there is none.
+        """Return the saved result of a key, from an earlier call or before a restart; None without a result.
 
         Raises:
             InvalidValue: the key was used for another measurement.

@@ -216,12 +216,12 @@ class _Ticker:
         self._next = now()
 
     def due_in_s(self) -> float:
-        """Return the real seconds until the next tick; at most 0 if it is due."""
+        """Return the real seconds until the next tick; 0 if a tick is due."""
         left = self._next - self._now()
         return self._real_s(left) if left > 0 else 0.0
 
     def done(self) -> None:
-        """Count a tick, and skip those missed meanwhile."""
+        """Schedule the next tick, and skip missed ticks."""
         missed = max(0, self._now() - self._next) // self._period
         self._next += (missed + 1) * self._period
 

@@ -38,7 +38,7 @@ MOST_FAILURES = 5  # unexplained ones in a row, before a person has to look
 
 
 class _Watch:
-    """A cycle that takes in published packets until it is closed."""
+    """A subscription that passes published packets to a `Cycle` until closed."""
 
     def __init__(self, link: ExperimentLink, target: Target, cycle: Cycle) -> None:
         self._link = link

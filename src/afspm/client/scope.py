@@ -63,8 +63,8 @@ ANSWER_S = 60.0  # default of readings; calls that wait for control or a measure
 class Scope(ExperimentView):
     """The handle for scans, spectra, settings and actions; each call returns when it is done.
 
-    A call requests control and releases it afterwards; `with scope.control():` keeps it over several calls. Without
-    control, calls wait until it is given. Timeouts are in real seconds; None waits for ever.
+    A call requests control and releases it afterwards; `with scope.control():` keeps control over several calls.
+    Without control, calls wait until control is given. Timeouts are in real seconds; None waits for ever.
 
     Every call may raise:
         Refused: the scheduler, a limit or the microscope refused; `reason` gives the reason.
@@ -113,8 +113,8 @@ class Scope(ExperimentView):
         `ScanSet.interruptions` gives times and reasons.
 
         Args:
-            region: region to scan; None: the present one.
-            shape: (rows, columns); None: the present one.
+            region: region to scan; None: the present region.
+            shape: (rows, columns); None: the present shape.
             key: take this scan only once in this run: after a restart the component gets the saved scan. Each
                 measurement of a component needs its own key. A saved scan takes space on disk until `forget`.
             repeat: False: if control is lost during the scan, raise ControlLost instead of taking the scan again.
@@ -292,12 +292,12 @@ class Scope(ExperimentView):
         setpoint: float | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Set the given fields of the z feedback, and return when `feedback` shows them; the others stay unchanged.
+        """Set the given fields of the z feedback, and return when `feedback` shows them; other fields stay unchanged.
 
         Args:
-            on: whether the feedback regulates; off, the tip is held at its height.
-            proportional_gain, integral_gain: in the controller's own units.
-            setpoint: in the unit of the operating mode: A for a tunnelling current, V, m, Hz or N in force microscopy.
+            on: whether the feedback regulates; if False, the tip is held at its height.
+            proportional_gain, integral_gain: gains in the controller's own units.
+            setpoint: in the unit of the operating mode: A for a tunnelling current; V, m, Hz or N in force microscopy.
         """
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
@@ -422,7 +422,7 @@ class Scope(ExperimentView):
             self._ask_scheduler(ControlRequest.END_EXPERIMENT, None)
 
     def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
-        """Publish the progress of the component, for people who watch. Never waits.
+        """Publish the progress of the component, for display. Never waits.
 
         Args:
             done, of: number of finished parts, and of all parts.
