@@ -19,8 +19,8 @@ class Document:
     """Merged tables, and the place where each key was last set.
 
     Attributes:
-        homes: folders for relative file names and modules; empty: those of the files. (An expanded file lies in the run
-            folder, but names files beside the original.)
+        homes: folders for relative file names and modules; empty: the folders of the files. (An expanded file lies in
+            the run folder, but names files beside the original.)
         is_whole: whether all files could be read.
         findings: errors and warnings so far.
     """

@@ -60,7 +60,7 @@ class Experiment:
 
     @property
     def files(self) -> list[Path]:
-        """Files of the experiment, absolute; each overrides those before it."""
+        """Files of the experiment, absolute; each file overrides the files before."""
         return [file.resolve() for file in self._document.files]
 
     @property
@@ -76,7 +76,7 @@ class Experiment:
 
     @property
     def recorders(self) -> list[str]:
-        """Names of the recorders; by default there is one."""
+        """Names of the recorders, by default one."""
         return self.resolved.declaring(RECORDS)
 
     def check(self, only: Collection[str] = (), without: Collection[str] = ()) -> list[Finding]:

@@ -73,7 +73,7 @@ class ProcessBox:
 
 @dataclass(frozen=True)
 class PublisherLane:
-    """Envelopes that one component publishes to others."""
+    """The drawn lane of the envelopes from one component to other components."""
 
     publisher: ProcessBox
     listeners: tuple[ProcessBox, ...]

@@ -52,7 +52,7 @@ class ExperimentPart:
 
 @dataclass
 class ExperimentParts:
-    """The file, sorted and expanded."""
+    """The tables of an experiment file, sorted by kind, with references replaced."""
 
     variables: Settings = field(default_factory=dict)
     sections: dict[str, Settings] = field(default_factory=dict)

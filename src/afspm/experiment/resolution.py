@@ -44,7 +44,7 @@ _EXAMPLE_HEADERS = (
 )
 """Packet headers for a trial of the user's mapping from packets to envelopes."""
 DRIFT = "DriftMapping"
-"""Envelope that a scheduler publishes if it corrects drift."""
+"""Envelope that a drift-correcting scheduler publishes."""
 
 
 def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:

@@ -98,7 +98,7 @@ class MetadataSection(Section):
     """[metadata]: entries written into every file of the run; None: unknown."""
 
     technique: Literal["STM", "STS", "AFM"] | None = None
-    """STM, STS or AFM; filled in by the class of a microscope that has only one."""
+    """STM, STS or AFM; filled in by the class of a microscope with one technique."""
     sample: str | None = None
     person: str | None = None
     orcid: Orcid | None = None

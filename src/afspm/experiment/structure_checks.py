@@ -272,7 +272,7 @@ def check_clock(resolved: ResolvedExperiment) -> None:
 
 
 def check_names_of_people(resolved: ResolvedExperiment) -> None:
-    """Require that roles name components, or people who have a key."""
+    """Require that roles name components, or people with a key."""
     names, keys, security = set(resolved.processes), resolved.keys_folder, resolved.sections.security
     if keys is not None:
         names |= {file.stem for file in (keys / "public").glob("*.key")}

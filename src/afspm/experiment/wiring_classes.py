@@ -60,7 +60,7 @@ def wire_of(table: object) -> WiringClass | None:
 
 @dataclass(frozen=True)
 class BoundSocket:
-    """A socket that a process binds: the address that the file gives under `key`, or None if it is left open."""
+    """A socket that a process binds, at the address that the file gives under `key`; None if left open."""
 
     owner: str
     use: str
