@@ -1,7 +1,7 @@
-"""Activity of a process without heartbeats, as the operating system sees it.
+"""Activity of a process without heartbeats, as measured by the operating system.
 
 Heartbeats come from a Python thread. Code that holds Python's lock for long (a call into a library, the import of a
-large one from a slow disk) stops them although the process works.
+large library from a slow disk) stops the heartbeats although the process works.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Look = Callable[[int], ActivitySample | None]
 
 
 class ActivityMonitor:
-    """A monitor that samples one process repeatedly, and decides by the latest samples whether it works.
+    """A monitor that samples one process repeatedly, and decides from the latest samples whether the process works.
 
     Args:
         pid: process to sample.

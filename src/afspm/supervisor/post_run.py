@@ -124,7 +124,7 @@ def _times(count: int) -> str:
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a recorded run, in a process of its own that can neither harm nor delay the run."""
+    """Write the report of a recorded run, in a separate process that can't harm or delay the run."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")

@@ -212,7 +212,7 @@ class _WindowsJob:
     """Windows job object of a child and its own children; elsewhere `reaper` does its work.
 
     Args:
-        has_tip: whether the child retracts a tip first: it then ends by itself, not with the supervisor.
+        has_tip: whether the child retracts a tip first, and so is not ended with the supervisor.
     """
 
     def __init__(self, child: subprocess.Popen[bytes], *, has_tip: bool) -> None:

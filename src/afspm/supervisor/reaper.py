@@ -32,7 +32,7 @@ class Reaper:
         self._popen: subprocess.Popen[bytes] | None = None
 
     def begin(self) -> None:
-        """Start the reaper process. If that fails (too many processes), the run goes on without it."""
+        """Start the reaper process. If that fails (too many processes), the run goes on without a reaper."""
         if sys.platform == "win32":
             return
         with contextlib.suppress(OSError):

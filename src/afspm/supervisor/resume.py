@@ -37,7 +37,7 @@ ZMTP = b"\xff"
 # orphans end within seconds; the reaper kills the rest
 GONE_WITHIN_S = 10.0
 STEP_NS = 1_000_000
-"""Simulated time between the last packet and the resumed run, so that no two packets have one time."""
+"""Simulated time between the last packet and the resumed run, so that no two packets have the same time."""
 
 
 @dataclass(frozen=True)

@@ -77,7 +77,7 @@ class RunOutcome:
 
 
 class Supervisor:
-    """A runner of tasks until the experiment ends, all are done, an essential one is lost, or a person stops it."""
+    """A runner of a run's tasks, until the run ends by itself or a person stops the run."""
 
     def __init__(
         self,
@@ -260,7 +260,7 @@ TOLERANCE_S = 5.0
 
 
 class ClockCheck:
-    """A check that warns once if experiment time and wall clock differ; it is off at another speed than 1."""
+    """A check that warns once if experiment time and wall clock differ, in a run at real speed."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock

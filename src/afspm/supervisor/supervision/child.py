@@ -59,8 +59,6 @@ class RestartBudget:
 
 @dataclass(frozen=True)
 class ChildPolicy:
-    """Liveness and restart policies of one child."""
-
     liveness: LivenessPolicy = field(default_factory=LivenessPolicy)
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     beats: bool = True
@@ -83,19 +81,17 @@ class HeartbeatReport(Protocol):
 
 
 class ChildPhase(Enum):
-    """Phase of a child's life."""
-
     IDLE = auto()
     """Not started yet."""
     RUNNING = auto()
     KILLING = auto()
-    """It was killed as dead or frozen; its exit is awaited."""
+    """The process was killed as dead or frozen; its exit is awaited."""
     WAITING = auto()
-    """It crashed; it is restarted after the delay."""
+    """The process crashed, and is restarted after the delay."""
     STOPPING = auto()
-    """It was asked to end."""
+    """The process was asked to end."""
     DONE = auto()
-    """It has ended, on purpose or because it was asked to."""
+    """The process has ended, on purpose or as requested."""
     GIVEN_UP = auto()
 
 

@@ -70,7 +70,7 @@ class Liveness:
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
         """Process a heartbeat, with the age of the current step and the limit for one step.
 
-        A heartbeat after `closing` cancels the announcement: the process is not closing, or another one announced it.
+        A heartbeat after `closing` cancels the announcement: it came from another process, or by mistake.
         """
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = ProcessHealth.ALIVE
@@ -84,7 +84,7 @@ class Liveness:
             self._deadline_s = now_s + self._policy.start_s
 
     def closing(self, now_s: float) -> None:
-        """Process an announcement of the process that it ends on purpose."""
+        """Process the announcement of an end on purpose."""
         self._vital = ProcessHealth.NOT_CLOSING
         self._step_began_s, self._longest_s = now_s, self._policy.longest_step_s
         self._deadline_s = now_s + self._policy.closing_s

@@ -10,7 +10,7 @@ from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import ChildLife, SupervisedChild
 
 SILENT_PERIODS = 2.5
-"""Beat periods without a heartbeat after which a process is shown as silent; a little later it is killed."""
+"""Beat periods without a heartbeat after which a process is shown as silent; a little later, the process is killed."""
 
 _WITHOUT_PROCESS = {
     ChildPhase.IDLE: ProcessCondition.STARTING,

@@ -21,8 +21,6 @@ LEAVE_AFTER_S = 3.0  # after being killed
 
 
 class EndReason(Enum):
-    """Reason why a run ended."""
-
     EXPERIMENT_ENDED = auto()
     ALL_DONE = auto()
     STOPPED = auto()
@@ -77,9 +75,9 @@ class RunEnd:
         ask_s, kill_s: when to ask and to kill, in real monotonic time.
         latest_s: deadline for busy processes; then they are asked to end.
         last: the last step taken.
-        in_haste: whether a person wants the run to end now.
-        busy_s: when a process was last seen busy after it was asked.
-        began_s: when the end began.
+        in_haste: whether a person has asked to end the run at once.
+        busy_s: time at which a process was last busy after the request to end.
+        began_s: time at which the end began.
     """
 
     why: EndReason

@@ -148,7 +148,7 @@ class SupervisorCore:
         return min((s for s in found if s is not None), default=None)
 
     def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
-        """Return ids of the processes whose activity to sample, by name, and the time span to judge them by, in s.
+        """Return the process ids to sample for activity, by name, and the time span to judge, in s.
 
         These are processes with a late heartbeat; at the end of a run also starting processes, and all processes that
         were asked to end.

@@ -84,12 +84,12 @@ class RestartOrdered:
 
 @dataclass(frozen=True, slots=True)
 class SchedulerAnswered:
-    """The event that the scheduler of this run has answered: components may send it requests."""
+    """The event that the scheduler of this run has answered, so that components may send requests."""
 
 
 @dataclass(frozen=True, slots=True)
 class UseReported:
-    """The scheduler's answer whether the microscope is in use; `why` is empty if it is not."""
+    """The scheduler's answer whether the microscope is in use; an empty `why` means that it is not in use."""
 
     why: str
 
@@ -155,7 +155,7 @@ class AskUse:
 
 @dataclass(frozen=True, slots=True)
 class EndExperiment:
-    """The effect that asks the scheduler to end the experiment; `EndRefused` follows if it refuses."""
+    """The effect that asks the scheduler to end the experiment; `EndRefused` follows a refusal."""
 
 
 @dataclass(frozen=True, slots=True)
