@@ -36,7 +36,7 @@ class PublishedEvent:
 
 
 class Events(Iterator[PublishedEvent]):
-    """An iterator over messages published from now on; none is lost while the loop's body is busy.
+    """An iterator over messages published from now on; no message is lost while the loop's body is busy.
 
     It ends with the experiment, or after `timeout_s` without a message (a later `for` continues).
 

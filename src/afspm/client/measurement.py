@@ -1,4 +1,4 @@
-"""Taking one scan or spectrum exactly once, over interruptions and restarts."""
+"""Measurement of one scan or spectrum, exactly once, over interruptions and restarts."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ Value = float | str | bool
 
 
 def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
-    """Convert a value to set to a parameter: a number in `unit` (default: SI), a quantity as text ("2 um/s"), True …
+    """Convert a value into a parameter to set: a number in `unit` (default: SI), text such as "2 um/s", True …
 
     Raises:
         InvalidValue: the number is not finite.
