@@ -60,7 +60,7 @@ class Experiment:
 
     @property
     def files(self) -> list[Path]:
-        """Files of the experiment, absolute; each file overrides the files before."""
+        """Files of the experiment, absolute; each file overrides the earlier files."""
         return [file.resolve() for file in self._document.files]
 
     @property

@@ -1,4 +1,4 @@
-"""Sockets of processes: the intermediary classes that name them in a file, and the resolved addresses."""
+"""Sockets of processes: the intermediary classes that describe sockets in a file, and the resolved addresses."""
 
 from __future__ import annotations
 
