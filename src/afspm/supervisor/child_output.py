@@ -26,7 +26,7 @@ Stream = Literal["stdout", "stderr"]
 
 @dataclass(frozen=True, slots=True)
 class OutputLine:
-    """A line that a child wrote."""
+    """An output line of a child."""
 
     name: str
     pid: int
@@ -45,8 +45,8 @@ class OutputDropped:
 class OutputLimit:
     """Rate limit on the lines of one stream.
 
-    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Beyond that begins a pause, in which all lines
-    but the last are dropped. `go_on` ends the pause, after PAUSE_S or at the end of the stream.
+    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Above that a pause begins, in which all lines but
+    the last are dropped. `go_on` ends the pause, after PAUSE_S or at the end of the stream.
     """
 
     def __init__(self, now_s: float) -> None:

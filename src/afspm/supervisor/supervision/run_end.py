@@ -58,7 +58,7 @@ _EXIT_CODES = {
 
 
 class EndStep(Enum):
-    """Step to end the processes that still run."""
+    """One step in ending the processes that still run."""
 
     ASK = auto()
     """Close the processes' standard input, so that they end cleanly."""

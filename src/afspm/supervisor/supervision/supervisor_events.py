@@ -42,7 +42,7 @@ class Beaten:
 
 @dataclass(frozen=True, slots=True)
 class ActivitySeen:
-    """The operating system's answer whether a process without heartbeats works; None: unknown.
+    """The event that the activity of a process without heartbeats was sampled; `works` is None if unknown.
 
     Attributes:
         processor_s: processor time used since the process started; None: unknown.
