@@ -1,4 +1,4 @@
-"""Addresses in ZeroMQ's notation, and the settings of components that hold an address to listen at."""
+"""Addresses in ZeroMQ's notation, and the annotation of settings that hold a listening address."""
 
 from __future__ import annotations
 
@@ -31,9 +31,7 @@ def _has_port(match: re.Match[str]) -> bool:
 
 
 def reaches(connect: str, bind: str) -> bool:
-    """Return whether a connection to the address `connect` ends at a socket bound at `bind` (a wildcard means any
-    host).
-    """
+    """Return whether connecting to `connect` reaches a socket bound to `bind`; a wildcard host matches any."""
     if connect == bind:
         return True
     a, b = _ADDRESS.fullmatch(connect), _ADDRESS.fullmatch(bind)
@@ -50,9 +48,9 @@ def connectable(bind: str) -> str:
 
 @dataclass(frozen=True)
 class Listens:
-    """Mark of a setting that holds an address, or a port (0: any free port), to listen at.
+    """Annotation of a setting that holds a listening address, or a port (0: any free port).
 
-    `afspm check` finds two components that listen at one address by this mark.
+    `afspm check` uses the annotation to find two components that listen at one address.
 
     Attributes:
         host: for a port, the setting that names the host; empty: this computer only.
@@ -63,15 +61,13 @@ class Listens:
     keyed: bool = True
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> object:
-        """Validate the setting with pydantic: an address or a port. Only pydantic calls it, so pydantic is not loaded
-        here.
-        """
+        # only pydantic calls this, so pydantic is not loaded at the top
         from pydantic_core import core_schema
 
         return core_schema.no_info_after_validator_function(self.checked, handler(source))
 
     def checked(self, value: object) -> object:
-        """Return a valid value.
+        """Return `value` if it is an address or a port.
 
         Raises:
             InvalidValue: `value` is neither an address nor a port.
@@ -83,8 +79,7 @@ class Listens:
         return value
 
     def address(self, value: object, settings: Mapping[str, object]) -> str | None:
-        """Return the address that the component listens at; None if the component chooses one itself, or the value is
-        invalid.
+        """Return the component's listening address; None for port 0 (any free port) or an invalid value.
 
         Args:
             value: value of the setting.

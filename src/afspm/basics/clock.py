@@ -1,7 +1,7 @@
-"""The one clock of a run: experiment time, which in a simulation may begin anywhere and pass faster than real time.
+"""Clock of a run: experiment time, which a simulation may start at any date and run faster than real time.
 
-Timestamps, scan durations and periods are in experiment time. Heartbeats, request timeouts and other times of
-processes are in real time: `monotonic_s`.
+Timestamps, scan durations and periods are in experiment time. Heartbeats, request timeouts and other times that
+concern processes are in real time: `monotonic_s`.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def iso_utc(time_ns: int | None) -> str:
 
 
 class Clock(Protocol):
-    """A source of time."""
+    """Interface of a run's clock."""
 
     def now_ns(self) -> int:
         """Return the experiment time in ns since the Unix epoch."""
@@ -60,11 +60,11 @@ class Clock(Protocol):
         ...
 
     def real_s(self, experiment_s: float) -> float:
-        """Return the real time, in s, that `experiment_s` of the experiment lasts."""
+        """Convert a duration from experiment time to real time, both in s."""
         ...
 
     def late(self) -> AbstractContextManager[None]:
-        """Slow a simulated time down to real time, within bounds, while the block runs."""
+        """Slow simulated time down to real time while the block runs, for a limited time."""
         ...
 
 
@@ -104,10 +104,10 @@ _CHECKSUM = struct.Struct("<I")
 
 
 class SharedSimulationTime:
-    """Time of a simulated run that slows down for late processes; all processes share it in a small file.
+    """Simulated time that the processes of a run share in a small file, and that slows down for late processes.
 
-    Between two moments of real time the experiment runs at real speed, and afterwards at full speed. A late process
-    writes both moments.
+    While a process is late, experiment time passes as fast as real time; otherwise at the speed of the run. A late
+    process writes the begin of the slow period and its latest end into the file.
 
     Args:
         path: an existing file.
@@ -179,7 +179,7 @@ class ExperimentClock:
     """Clock of a run: experiment time = start + (real time - origin) · speed.
 
     All processes of a run get the same origin, start and speed, and on one computer the same anchor of real time. So
-    all show the same time, at any start and after any change of the system clock.
+    their clocks agree, whenever a process starts, and after any change of the system clock.
 
     Attributes:
         origin_s: real time, s since the Unix epoch, at which the run began.
@@ -206,7 +206,7 @@ class ExperimentClock:
 
     @classmethod
     def from_dict(cls, values: PlainMapping) -> ExperimentClock:
-        """Return the clock of an `as_dict` table; the real time for an empty table."""
+        """Return the clock that an `as_dict` table describes; the real-time clock for an empty table."""
         if not values:
             return cls.real()
         times = (float(values["origin_s"]), float(values["start_s"]), float(values["speed"]))
@@ -246,13 +246,13 @@ class ExperimentClock:
     def late(self) -> AbstractContextManager[None]:
         """Slow the experiment's time down to real time while the block runs, for at most `LONGEST_LATE_S`.
 
-        Use it for work that takes no experiment time but computing time: a scan that is due and not begun, a scan that
-        is finished and not yet registered. At a speed of one nothing changes.
+        Use it around work that takes computing time but no experiment time: starting a scan that is due, or
+        registering a finished scan. Without effect at speed 1.
         """
         return nullcontext() if self._waiting is None else self._waiting.late(self.speed)
 
     def wall_ahead_s(self) -> float:
-        """Return the lead of the system clock in s, after it was set or the computer was suspended."""
+        """Return the lead of the system clock over the run's clock in s: nonzero after a clock change or a suspend."""
         return _anchor_s() - self._wall_at_zero_s
 
     def now_s(self) -> float:

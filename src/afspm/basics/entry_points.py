@@ -1,12 +1,12 @@
-"""Entry points: installed packages extend afspm through them.
+"""Entry points, through which installed packages extend afspm.
 
-afspm's own drivers, emulators, components, readers, … are declared in the same groups of its `pyproject.toml` as those
-of any other package, and are found in the same way. A package declares one line for each of its classes::
+afspm declares its own drivers, emulators, components, readers, … in its `pyproject.toml`, as any other package does.
+One line declares one class::
 
     [project.entry-points."afspm.components"]
     Ridges = "my_lab.ridges:Ridges"
 
-| comes in | the metadata of all installed packages, read once a process: reading them costs milliseconds |
+| comes in | the metadata of all installed packages, read once per process, since reading takes milliseconds |
 | goes out | names, paths of classes, loaded objects, and for `afspm doctor` an inventory |
 | always holds | nothing is imported until its name is used; a name that two packages declare is refused |
 """
@@ -40,18 +40,18 @@ COMMANDS = "afspm.commands"  # afspm NAME: a function, or a typer.Typer
 PAGES = "afspm.pages"  # `afspm run --dashboard`: a module with the functions of afspm.cli.run.RunPage
 
 CLASSES = (COMPONENTS, SCHEDULERS, DRIVERS, EMULATORS)
-"""The groups of the classes that an experiment file names without a module."""
+"""Groups whose classes an experiment file may name without a module."""
 _FILE = "entry_points.txt"
 GROUPS = (*CLASSES, READERS, EXPORTERS, ESTIMATORS, TRACKERS, FIGURES, DISPLAYS, FUNCTIONS, FORMS, COMMANDS, PAGES)
 
 
 @dataclass(frozen=True)
 class DeclaredName:
-    """A name that a package declares.
+    """A name that an installed package declares as an entry point.
 
     Attributes:
         package: name and version of the package.
-        problem: why the name can't be used; empty if it can be used or was not tried.
+        problem: reason why the name can't be used; empty if usable or not tried.
     """
 
     group: str
@@ -61,12 +61,12 @@ class DeclaredName:
 
 
 def names(*groups: str) -> tuple[str, ...]:
-    """Return the sorted names in some groups."""
+    """Return all names that packages declare in these groups, sorted."""
     return tuple(sorted({point.name for point in _points(groups)}))
 
 
 def find(name: str, *groups: str) -> EntryPoint | None:
-    """Return the entry point of a name in some groups; None if no package declares the name.
+    """Return the entry point with this name in one of the groups; None if no package declares the name.
 
     Raises:
         ConfigError: two packages declare the name.
@@ -84,7 +84,7 @@ def find(name: str, *groups: str) -> EntryPoint | None:
 
 
 def class_path(name: str) -> str | None:
-    """Return the class that an experiment file names, as "package.module.Name"; None if no package declares it.
+    """Return the full path of a declared class, "package.module.Name"; None if no package declares the name.
 
     Raises:
         ConfigError: two packages declare the name.
@@ -94,18 +94,18 @@ def class_path(name: str) -> str | None:
 
 
 def modules(*groups: str) -> tuple[str, ...]:
-    """Return the sorted modules that declare the names in some groups."""
+    """Return the modules that define the declared objects of these groups, sorted."""
     return tuple(sorted({point.module for point in _points(groups)}))
 
 
 def is_declared(class_: type) -> bool:
-    """Return whether a declared module defines a class or one of its bases."""
+    """Return whether a class, or one of its bases, is defined in a module of a declared class."""
     declared = modules(*CLASSES)
     return any(base.__module__ in declared for base in class_.__mro__)
 
 
 def load(group: str, name: str) -> Any:
-    """Import the object behind a name; None if no package declares the name.
+    """Import and return the object declared under a name; None if no package declares the name.
 
     Raises:
         ConfigError: the module can't be imported, or two packages declare the name.
@@ -115,7 +115,7 @@ def load(group: str, name: str) -> Any:
 
 
 def required(group: str, name: str) -> Any:
-    """Import the object behind a name that afspm itself declares.
+    """Import and return an object that afspm itself declares.
 
     Raises:
         ConfigError: no package declares the name, its module can't be imported, or two packages declare it.
@@ -127,17 +127,17 @@ def required(group: str, name: str) -> Any:
 
 
 def folder(group: str, name: str) -> Path | None:
-    """Return the folder of the module that declares a name, without importing it; None if not found."""
+    """Return the folder of the module of a declared object, without importing the module; None if not found."""
     point = find(name, group)
     spec = None if point is None else find_spec(point.module)
     return None if spec is None or spec.origin is None else Path(spec.origin).parent
 
 
 def inventory(taken_commands: Collection[str] = ()) -> tuple[DeclaredName, ...]:
-    """Load every declared name, and return all by group and name, with the reason why a name can't be used.
+    """Load every declared object, and return all declared names with the reasons why some can't be used.
 
     Args:
-        taken_commands: the commands of the core, which no package replaces.
+        taken_commands: afspm's own commands, which no package can replace.
     """
     found = []
     for group, points in sorted(_installed().items(), key=lambda item: (item[0] not in GROUPS, item[0])):

@@ -40,14 +40,14 @@ class AfspmError(Exception):
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, or the stop button of a notebook, during a call of afspm."""
+    """An interrupt by Ctrl-C, or by a notebook's stop button, during a call of afspm."""
 
     def _render_traceback_(self) -> list[str]:
         return rendered(self, "nothing is left half done")
 
 
 def rendered(error: BaseException, text: str) -> list[str]:
-    """Return an error's text with the caller's lines of the traceback, without those of afspm and libraries."""
+    """Return an error's text and the traceback lines of the user's code, without lines of afspm and libraries."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [one for one in frames if not one.filename.startswith(_PACKAGE) and _LIBRARIES not in one.filename]
     own = [one for one in own if one.line]
@@ -60,7 +60,7 @@ def _place(frame: traceback.FrameSummary) -> str:
 
 
 class ConfigError(AfspmError):
-    """The experiment file, or a setting of a component, is wrong."""
+    """An error in the experiment file, or in a setting of a component."""
 
     code = "config"
 
@@ -78,7 +78,7 @@ class ConfigErrors(ConfigError):
 
 
 class ErrorCollector:
-    """Errors that are raised together at the end, so that a user sees all mistakes at once::
+    """A collector of errors, which are raised together so that a user sees all mistakes at once::
 
         errors = ErrorCollector()
         for name in names:
@@ -105,13 +105,13 @@ class ErrorCollector:
         return False
 
     def raise_all(self) -> None:
-        """Raise ConfigErrors, or the one error itself; return if there are no errors."""
+        """Raise the collected error, or ConfigErrors for several; do nothing without errors."""
         if self.errors:
             raise self.errors[0] if len(self.errors) == 1 else ConfigErrors(self.errors)
 
 
 def individual_errors(error: AfspmError) -> tuple[AfspmError, ...]:
-    """Return the errors that a ConfigErrors gathers; any other error alone."""
+    """Return the single errors of a ConfigErrors; for any other error, only that error."""
     return error.errors if isinstance(error, ConfigErrors) else (error,)
 
 
@@ -170,7 +170,7 @@ class Refused(RequestError):
 
     Args:
         response: the number of the ControlResponse.
-        reason: the reason for people, as the refusing process gave it.
+        reason: the refusing process's reason, as text for people.
     """
 
     code = "refused"
@@ -182,7 +182,7 @@ class Refused(RequestError):
 
 
 class NoResponse(RequestError):
-    """A request without an answer in time: it may or may not have been carried out."""
+    """A request without an answer in time, which may or may not have been carried out."""
 
     code = "no-response"
 

@@ -18,6 +18,6 @@ class ExitCode(IntEnum):
     ENDED = 80
     """The experiment ended (KILL)."""
     OWN_FAULT = 82
-    """An exception of the component's own code, written to `<name>.fault.json`: restart it while it makes progress."""
+    """An exception of the component's own code, written to `<name>.fault.json`: restarted while there is progress."""
     ORPHAN = 81
     """The parent is gone, or closed the standard input of this process to stop it."""

@@ -37,7 +37,7 @@ def duration_text(seconds: float) -> str:
 
 
 def lengths_text(values_m: Sequence[float], joined: str = ", ") -> str:
-    """Return lengths in the unit that suits the largest, in the notation of experiment files.
+    """Return lengths as text, in the unit that suits the largest, in the notation of experiment files.
 
     >>> lengths_text([5e-7, 2.5e-7], " x ")
     '500 x 250 nm'
@@ -67,7 +67,7 @@ def position_text(xy_m: tuple[float, float]) -> str:
 
 
 def typeset(text: str) -> str:
-    """Return the text of lengths, areas and positions with typographic signs, for pages.
+    """Return a text with typographic multiplication and minus signs, for pages.
 
     >>> typeset("2 x 1 µm at (1.2, -0.5) µm")
     '2 × 1 µm at (1.2, −0.5) µm'
@@ -91,7 +91,7 @@ def day(time_ns: int, zone: tzinfo | None = None) -> str:
 
 
 def period_text(begin_ns: int, end_ns: int, zone: tzinfo | None = None) -> str:
-    """Return a period, "2026-11-20 22:04 to 23:10 UTC", with the date of its end if that is another day."""
+    """Return a period, "2026-11-20 22:04 to 23:10 UTC"; the end has a date only if it is on another day."""
     same = day(begin_ns, zone) == day(end_ns, zone)
     until = (
         time_of_day(end_ns, zone, seconds=False) + _zone(zone) if same else day_and_time(end_ns, zone, seconds=False)
@@ -147,5 +147,5 @@ def unit_text(unit: str) -> str:
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Return a number of things: (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many`: irregular plural."""
+    """Return a count with its noun: (1, "scan") as "1 scan", (2, "scan") as "2 scans"; `many`: irregular plural."""
     return f"{count} {one if count == 1 else many or f'{one}s'}"

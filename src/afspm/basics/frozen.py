@@ -1,4 +1,4 @@
-"""`replace` for the frozen parts of the scheduler's state: as `dataclasses.replace`, but many times faster."""
+"""A much faster `dataclasses.replace`, for the frozen dataclasses of the scheduler's state."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 else:
 
     def replace(part: T, /, **changes: object) -> T:
-        """Return a copy of a dataclass without `__post_init__`, with some fields changed."""
+        """Return a copy of a dataclass with some fields changed, without a call of `__post_init__`."""
         if not hasattr(part, "__dict__"):
             return dataclasses.replace(part, **changes)
         copy = object.__new__(type(part))

@@ -6,7 +6,7 @@ language. Standard input then stays open: its end means that the parent is gone 
 On the heartbeat socket a process sends `[beat, age, longest, token]`: the byte 0 (alive) or 1 (closing on purpose),
 the age of the current step in s (ASCII; 0 when idle), the longest duration of a step in s (ASCII), and
 `beat_token`. All but the first are optional. The second and third distinguish a busy process from a frozen one. After
-the first beat with a token, beats without it are ignored: no other process can beat in its place.
+the first beat with a token, beats without the token are ignored, so that no other process can beat in its place.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from afspm.basics.plain_data import Plain, PlainMapping
 
 @dataclass(frozen=True)
 class Sockets:
-    """The addresses of one process; None for sockets that it does not use."""
+    """Socket addresses of one process; None for unused sockets."""
 
     publish: str | None = None
     """Bound: the process publishes here."""
@@ -40,7 +40,7 @@ class Sockets:
 
 @dataclass(frozen=True)
 class Launch:
-    """A process's part in an experiment, in JSON's own types."""
+    """The launch line of a process: class, settings, sockets, clock and folders, in JSON's types."""
 
     name: str
     class_: str = ""
@@ -49,22 +49,22 @@ class Launch:
     """Keyword arguments of the constructor."""
     sockets: Sockets = Sockets()
     envelopes: tuple[str, ...] | None = None
-    """Prefixes of the envelopes to subscribe to; None: all."""
+    """Prefixes of the envelopes (topics) to subscribe to; None: all."""
     clock: PlainMapping = field(default_factory=dict)
     """`ExperimentClock.as_dict()`; empty: real time."""
     problems: Mapping[str, int] = field(default_factory=dict)
-    """Problems named in the experiment file."""
+    """Numbers of the problems that the experiment file names, by name."""
     run_dir: str = ""
     state_dir: str = ""
     """Folder for state that must survive a restart; empty: nothing is kept."""
     beat_period_s: float = 1.0
     beat_token: str = ""
-    """Sent with each heartbeat: proves to the supervisor which process beats."""
+    """Token in each heartbeat, which proves the sender's identity to the supervisor."""
     request_timeout_s: float = 5.0
     request_retries: int = 3
     log_level: str = "INFO"
     keys: PlainMapping | None = None
-    """CURVE key pair of the process, and the key owner of each address (`transport.keys.from_launch`); None: plain."""
+    """CURVE key pair of the process, and key owner of each address (`transport.keys.from_launch`); None: no keys."""
     messages: tuple[str, ...] = ()
     """Python modules, or .proto files, with the user's message types."""
     run: str = ""
@@ -72,28 +72,27 @@ class Launch:
     simulated: bool = False
     """True only if the microscope is certainly simulated: by its translator, or by `controller`."""
     controller: str = ""
-    """For a translator: the emulator of this run that is the only controller it connects to; empty: none."""
+    """For a translator: the emulator of this run, as the only controller to connect to; empty: no emulator."""
     sample_coordinates: bool = False
     """Positions are sample coordinates, which the scheduler maps to tip coordinates."""
     retracts: bool = False
-    """For a translator: retract the tip when standard input ends while a request of the run has switched the feedback
-    off."""
+    """For a translator: retract the tip if standard input ends while the run has the feedback switched off."""
     adjustable: tuple[str, ...] = ()
     """For a translator: parameters that may be set during a scan."""
     solved: tuple[str, ...] = ()
     """For a scheduler: the problems that components of the run solve."""
     keeps_requests: bool = False
-    """Inputs and requests of the process are recorded, so that `afspm what-if` can replay it."""
+    """Record inputs and requests of the process, for a replay by `afspm what-if`."""
 
     def to_json(self) -> str:
-        """Return one line of JSON, without a newline at its end."""
+        """Return the launch line as JSON, without a newline at its end."""
         plain = dataclasses.asdict(self)
         plain["class"] = plain.pop("class_")
         return json.dumps(plain, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Launch:
-        """Return the launch line in a line of JSON.
+        """Parse a launch line.
 
         Raises:
             ConfigError: the line is not JSON, or an entry is unknown or of the wrong type.

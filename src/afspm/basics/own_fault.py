@@ -9,14 +9,13 @@ from dataclasses import dataclass
 class OwnFault:
     """An error of a component's own code that ended the component.
 
-    A restart begins with the component's memory and keyed measurements. If a life ends with both unchanged, it has made
-    no progress. So two equal faults in a row will recur after every restart, and repeat every request to the microscope
-    before them.
+    A restarted component continues from its memory and its saved measurements. If both are unchanged when the same
+    fault occurs again, every further restart would fail in the same way, and repeat its requests to the microscope.
 
     Attributes:
-        error: the type of the exception; its text may differ from life to life.
+        error: type of the exception, since its text may differ after a restart.
         place: file and line in the component's code.
-        kept: a checksum of memory and keyed measurements.
+        kept: checksum of memory and saved measurements.
     """
 
     error: str

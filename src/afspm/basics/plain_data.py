@@ -18,7 +18,7 @@ PlainList: TypeAlias = list[Any]
 
 
 class _Strict:
-    """Mark of a boolean setting: without it pydantic accepts "yes" and 1 as true; an experiment file must say true."""
+    """Annotation of a boolean setting that accepts true and false only, not "yes" or 1."""
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
         from pydantic_core import core_schema
@@ -28,7 +28,7 @@ class _Strict:
 
 @dataclass(frozen=True)
 class _AtLeast:
-    """Mark of an integer setting: a whole number, not below `least`."""
+    """Annotation of an integer setting with the lower bound `least`."""
 
     least: int
 

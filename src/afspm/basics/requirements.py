@@ -1,4 +1,4 @@
-"""Packages that a class needs beyond a plain install of afspm, in its attribute `requires`, as for `pip install`.
+"""Check of the packages that a class lists in its attribute `requires`, beyond a plain install of afspm.
 
     class Ridges(Component):
         requires = ("afspm[features]", "torch>=2.4")

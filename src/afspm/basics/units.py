@@ -1,4 +1,4 @@
-"""Units at the edges: everything inside afspm is in SI (metres, seconds, volts, amperes, radians …).
+"""Conversion of units at the edges of afspm: inside, all quantities are in SI (metres, seconds, volts, radians …).
 
 A small exact table holds the units of scanning probe microscopy; pint, loaded on demand, converts all others.
 """
@@ -61,8 +61,8 @@ class Dimension:
     """A kind of quantity.
 
     Attributes:
-        name: name of a quantity of this kind, with its article.
-        example: a quantity as people write it.
+        name: noun with its article, such as "a length".
+        example: a quantity of this kind as text, such as "400 nm".
         largest_plain: the largest number accepted without a unit, in SI.
     """
 
@@ -72,7 +72,7 @@ class Dimension:
 
     @property
     def hint(self) -> str:
-        """Return a hint with an example, for an error."""
+        """Return a hint for an error message, with an example."""
         return f'{self.name}, for example "{self.example}"'
 
 
@@ -86,12 +86,12 @@ DIMENSIONS: Final[Mapping[str, Dimension]] = {
     "s": Dimension("a time", "15 min"),
     "Hz": Dimension("a frequency", "2 kHz"),
 }
-"""By SI unit. A plain number means SI: with the bounds, 400 for a length is refused, not taken as 400 m."""
+"""Dimensions by SI unit. A number without a unit is in SI: the bounds refuse 400 as a length, since it means 400 m."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Mark of a float setting: the experiment file may give it as text with any unit of this kind.
+    """Annotation of a float setting that the experiment file may give as text with a unit.
 
     Attributes:
         si: the SI unit that the component gets, e.g. "m".
@@ -106,13 +106,13 @@ class Unit:
     above: float = -math.inf
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> object:
-        """Make pydantic read text with a unit. Only pydantic calls it, so pydantic is not loaded here."""
+        # only pydantic calls this, so pydantic is not loaded at the top
         from pydantic_core import core_schema
 
         return core_schema.no_info_before_validator_function(self.read, handler(source))
 
     def read(self, value: object) -> float:
-        """Return a quantity of the experiment file in the SI unit; a plain number is taken as SI.
+        """Convert a value of the experiment file to the SI unit; a number without a unit is in SI.
 
         Raises:
             UnitError: not a finite number, an unknown unit, a unit of another kind, or a required unit is missing.
@@ -135,9 +135,9 @@ Length = Annotated[float, Unit("m")]
 Duration = Annotated[float, Unit("s", least=0.0)]
 PositiveDuration = Annotated[float, Unit("s", above=0.0)]
 Period = Annotated[float, Unit("s", is_written=True, least=0.0)]
-"""A duration on which a night depends: 10 may mean seconds or minutes, so the file names the unit."""
+"""A duration that must be written with a unit, since 10 could mean seconds or minutes."""
 PollPeriod = Annotated[float, Unit("s", least=1e-3)]
-"""The time between two polls of a controller: with none, the process would do nothing else."""
+"""Time between two polls of a controller, at least 1 ms, so that polls don't use up a processor."""
 Angle = Annotated[float, Unit("rad")]
 Voltage = Annotated[float, Unit("V")]
 Current = Annotated[float, Unit("A")]
@@ -178,7 +178,7 @@ def parse_quantity(text: str) -> tuple[float, str]:
 
 
 def si(value: str | float, unit: str) -> float:
-    """Return a quantity as text ("2.5 um") or a plain number (SI already) as a float in the SI unit `unit`.
+    """Convert a quantity as text ("2.5 um"), or a number in SI, to a float in the SI unit `unit`.
 
     Raises:
         UnitError: not a number, an unknown unit, a unit of another kind than `unit`, or a required unit is missing.
@@ -196,7 +196,7 @@ def si(value: str | float, unit: str) -> float:
 
 
 def si_or_text(value: float | str, unit: str) -> float:
-    """Return a number, taken in the SI unit `unit`, or a text with a unit, as a float in `unit`.
+    """Convert a number in the SI unit `unit`, or a text with a unit, to a float in `unit`.
 
     Raises:
         UnitError: text without a unit, or with an unknown unit.

@@ -1,4 +1,4 @@
-"""The commands. Each module reads arguments, calls one room, and prints; no decisions are made here."""
+"""The commands of `afspm`. Each module reads arguments, calls another package, and prints; it makes no decisions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All commands. Their modules import other rooms inside functions only, so that every command starts fast."""
+"""The program `afspm` with all commands. Command modules import late, inside functions, so that commands start fast."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class DeclaredCommands(TyperGroup):
-    """Commands of the core and of packages; those of packages are loaded for the help and when called."""
+    """Commands of afspm and of other packages; a package's command is loaded for the help, and when called."""
 
     def list_commands(self, ctx: object) -> list[str]:
         declared = entry_points.names(entry_points.COMMANDS)

@@ -24,7 +24,7 @@ Runs = Annotated[Path, typer.Option("--runs", metavar="DIR", help="Where to make
 
 
 def opt(help_text: str, *flags: str, **more: Any) -> object:
-    """Return an option; its help text names the default, if that needs saying."""
+    """Return a command-line option; the help does not show the default, so `help_text` may state it."""
     return typer.Option(*flags, help=help_text, show_default=False, **more)
 
 
@@ -46,5 +46,5 @@ SuiteReportFile = Annotated[
 
 
 def names_in(given: list[str] | None) -> tuple[str, ...]:
-    """Return names given by repeating the option, separated by commas, or both."""
+    """Return the names given to an option, which may be repeated, or have several names separated by commas."""
     return tuple(name.strip() for names in given or () for name in names.split(",") if name.strip())

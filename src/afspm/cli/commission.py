@@ -38,7 +38,7 @@ def commission(
 ) -> None:
     """Take a new controller into use, step by step, with the tip withdrawn first.
 
-    Ends with a report for people and programs, and 0 if nothing was wrong.
+    Writes a report for people and programs. Ends with 0 if nothing was wrong.
     """
     from afspm.basics.units import si
     from afspm.testing.commissioning.procedure import commission as walk
@@ -71,7 +71,7 @@ def _before(file: Path) -> InstrumentReport | None:
 
 
 class Terminal:
-    """Questions to the person at this terminal. No answer means no confirmation."""
+    """A dialogue with the user at this terminal. No answer means no confirmation."""
 
     def __init__(self) -> None:
         self._console = plain_console()

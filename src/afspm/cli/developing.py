@@ -48,8 +48,8 @@ def check_translator(
 ) -> None:
     """Check each base operation of a translator from outside, with the tip withdrawn.
 
-    Starts translator and scheduler (and an emulated controller, if there is one), or joins running ones. What the
-    microscope does not support is skipped and listed. Ends with 0 if nothing was wrong.
+    Starts translator and scheduler (and an emulated controller, if the file has one), or joins running processes.
+    Operations that the microscope does not support are skipped and listed. Ends with 0 if nothing was wrong.
     """
     import sys
 
@@ -122,8 +122,8 @@ def check_client(
 ) -> None:
     """Test a client in another language by its behaviour in experiments on the simulated microscope.
 
-    Starts the client's conformance program again and again, with real and with scripted schedulers, and sends it steps.
-    Ends with 0 if nothing was wrong.
+    Starts the client's conformance program repeatedly, with real and with scripted schedulers, and sends the program
+    steps to carry out. Ends with 0 if nothing was wrong.
     """
     import sys
 
@@ -282,7 +282,7 @@ def component(name: Name, into: Into = Path()) -> None:
 def driver(name: Name, into: Into = Path()) -> None:
     """Make a package with a driver for a new controller.
 
-    As it is, it drives a controller that only pretends, and passes the checks of the operations that it has.
+    At first the driver works with a pretended controller, and passes the checks of its operations.
     """
     what = "replace its PretendController, and look how far it is with"
     _write("driver", name, into, what, "afspm test-translator experiment.toml")

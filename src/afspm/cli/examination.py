@@ -41,7 +41,7 @@ _ILL = (ProcessCondition.SILENT, ProcessCondition.RESTARTING, ProcessCondition.G
 
 @dataclass
 class Examination:
-    """Findings, packets counted by sender, and the experiment's processes on this computer."""
+    """Findings, rates of packets by envelope, and ids of the experiment's processes on this computer."""
 
     found: list[Diagnosis] = field(default_factory=list)
     heard: list[Heard] = field(default_factory=list)
@@ -53,12 +53,12 @@ class Examination:
 
 
 def examine(experiment: Experiment | None, runs: Path, listen_s: float, commands: Collection[str] = ()) -> Examination:
-    """Examine an experiment from this computer, and listen to its scheduler for `listen_s`.
+    """Examine an experiment from this computer, and count its scheduler's packets for `listen_s` of real time.
 
     Without an experiment only this computer is examined.
 
     Args:
-        commands: names of the core's commands, which no package can replace.
+        commands: names of afspm's own commands, which no package can replace.
     """
     found = Examination([] if experiment is None else [*_file(experiment)])
     found.found += diagnosis.of_packages(entry_points.inventory(commands))
@@ -133,14 +133,14 @@ def _sizes(pids: Mapping[str, int]) -> dict[str, int]:
 
 
 class _Connections:
-    """The examination of an experiment's addresses, then of its scheduler."""
+    """An examiner of an experiment's addresses, then of its scheduler."""
 
     def __init__(self, experiment: Experiment, into: Examination) -> None:
         self._experiment, self._into = experiment, into
         self._scheduler = next((part.name for part in experiment.resolved.with_role(Role.SCHEDULER)), "scheduler")
 
     def examine(self, listen_s: float) -> None:
-        """Examine addresses, keys, clock, versions, and the packets published."""
+        """Examine addresses, keys, clock, versions, and published packets."""
         reached = self._addresses()
         launch = self._launch()
         if launch is None or not launch.sockets.control:

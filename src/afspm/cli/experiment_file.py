@@ -70,7 +70,7 @@ def _explain(experiment: Experiment, console: Console) -> None:
 
 
 def show(findings: Sequence[Finding], console: Console) -> None:
-    """Print findings, one a paragraph, with colours on a terminal."""
+    """Print each finding as a paragraph, with colours on a terminal."""
     from rich.text import Text
 
     for finding in findings:
@@ -193,11 +193,11 @@ def _arrives(targets: Targets, message: Notification, way: Way) -> bool:
 
 
 COMPUTING_S = 0.1
-"""Real time between two scans that have no period: measured 0.04 to 0.14 s on an idle computer of two cores."""
+"""Real time between two scans without a period: 0.04 to 0.14 s, measured on an idle computer of two cores."""
 
 
 def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: datetime) -> Iterator[str]:
-    """Yield a line for each component, then one for the end.
+    """Yield a line about the planned work of each component, then a line about the expected end.
 
     Args:
         speed: experiment seconds in a real second.
@@ -222,7 +222,7 @@ def estimate_lines(works: Mapping[str, PlannedWork | None], speed: float, now: d
 
 
 def work_text(work: PlannedWork) -> str:
-    """Return the work of a component in one line."""
+    """Return the planned work of a component as one line of text."""
     parts = []
     if work.scans is None:
         parts.append("scans without end")

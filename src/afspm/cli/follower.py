@@ -1,4 +1,4 @@
-"""Following a running experiment: published packets reduced to an `Overview`, without any request."""
+"""A follower of a running experiment, which reduces published packets to an `Overview` and sends no requests."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Follower:
     Args:
         folder: folder of the run.
         name: name (and owner of the key) of the follower.
-        envelopes: prefixes of the envelopes to subscribe to; None: all without values of scans and spectra.
+        envelopes: prefixes of the envelopes to subscribe to; None: all messages but values of scans and spectra.
 
     Attributes:
         ended: the experiment has ended.
@@ -55,14 +55,14 @@ class Follower:
         self._link.listen(self._take)
 
     def pump(self, timeout_s: float | None) -> None:
-        """Wait once, and take in all events."""
+        """Wait for events once, and process them."""
         try:
             self._link.pump(timeout_s)
         except ExperimentEnded:
             self.ended = True
 
     def catch_up(self, within_s: float = HEARD_WITHIN_S) -> None:
-        """Take in all packets of the scheduler's cache.
+        """Wait for all packets of the scheduler's cache, and process them.
 
         Raises:
             NoResponse: no packet arrived.
@@ -82,7 +82,7 @@ class Follower:
         return 0.0 if self.heard_s is None else self.clock.monotonic_s() - self.heard_s
 
     def cut_off(self) -> str:
-        """Return a message for a run that was cut off; empty if it runs or has ended."""
+        """Return a message if the run stopped without an end, after a power cut for instance; else empty."""
         return cut_off_message(self.folder)
 
     def close(self) -> None:

@@ -27,7 +27,7 @@ _UNBROKEN = 10_000  # columns: output to files and pipes is not wrapped
 
 
 def person() -> str:
-    """Return "terminal:ada": the terminal, and the user of this computer."""
+    """Return the name of the user at this terminal for the experiment, such as "terminal:ada"."""
     try:
         user = getpass.getuser()
     except (OSError, KeyError, ImportError):  # a container without this user
@@ -37,7 +37,7 @@ def person() -> str:
 
 @contextmanager
 def looking(where: Path, *, lines: bool = False) -> Iterator[Follower]:
-    """Follow the run at `where`; end the command if no run goes on there.
+    """Open a follower of the run at `where`; end the command if no run goes on there.
 
     Args:
         lines: whether to follow lines of unfinished scans, too.

@@ -31,19 +31,19 @@ _DRIFT_NIGHT = "A simulated night of eighteen hours on a sample that drifts by m
 
 
 class RunPage(Protocol):
-    """Functions of a module that shows runs in the browser."""
+    """Interface of a module that shows runs in the browser."""
 
     def with_page(self, files: list[Path]) -> Experiment:
-        """Return the experiment of these files, with a page added if they have none."""
+        """Return the experiment of these files, with a web page added if the files have none."""
 
     def resumed_with_page(self, found: ResumableRun) -> ResumableRun:
-        """Return the run to resume, with a page added if it has none."""
+        """Return the run to resume, with a web page added if the run has none."""
 
     def page_of(self, experiment: Experiment, started: Sequence[str]) -> tuple[str, PlainMapping] | None:
-        """Return name and settings of the page among the processes started here; None if there is none."""
+        """Return name and settings of the web page among the processes started here; None if there is no page."""
 
     def stay(self, folder: Path, name: str, settings: PlainMapping) -> None:
-        """Show an ended run, on the page with this name and these settings, until Ctrl-C."""
+        """Show an ended run until Ctrl-C, on a web page with this name and these settings."""
 
 
 def run(
@@ -158,7 +158,7 @@ def _described(start: ProcessStart) -> str:
 
 
 def ask_metadata(experiment: Experiment) -> dict[str, str]:
-    """Ask for the entries of [metadata]; offer those of the file and of the microscope's class."""
+    """Ask the user for the entries of [metadata]; the defaults are from the file and the microscope's class."""
     known = experiment.resolved.metadata()
     return {name: answer for name, text in _QUESTIONS.items() if (answer := _answer(name, text, known.get(name, "")))}
 
@@ -181,7 +181,7 @@ def demo(
     runs: Runs = RUNS,
     dashboard: Annotated[bool, typer.Option("--dashboard", help="Show it in the browser, too.")] = False,
 ) -> None:
-    """Show a simulated night: the tip changes, is seen to have changed, and is repaired.
+    """Show a simulated night: the tip changes, the change is detected, and the tip is repaired.
 
     Nothing but afspm is needed. The night leaves a folder with its scans, a picture and `report.html`.
     """

@@ -37,7 +37,7 @@ def runs(
     page: Annotated[bool, typer.Option("--page", help="Write index.html, with pictures, into the folder.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> None:
-    """List all runs under a folder, the newest first, or those with the words that you give.
+    """List all runs under a folder, the newest first, or only the runs with the words that you give.
 
     An index is kept in runs.sqlite beside the runs; delete it at any time.
     """

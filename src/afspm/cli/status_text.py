@@ -1,4 +1,4 @@
-"""Text on a running experiment, for a terminal of any width, and as JSON. The data come from an `Overview`."""
+"""Status of a running experiment, as text for a terminal of any width and as JSON. The data are from an `Overview`."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class RunDescription:
     """Facts about a run that are not in its packets.
 
     Attributes:
-        replay_of: folder of the run that is replayed; empty: it is no replay.
+        replay_of: folder of the replayed run; empty if this is no replay.
         began_ns: experiment time at its start; None if unknown.
         plans: planned work of each component; None: no estimate.
         speed: experiment seconds in a real second.
@@ -53,7 +53,7 @@ def bar(part: float, *, fancy: bool = True, width: int = BAR) -> str:
 
 
 def flagged(seen: Overview) -> Iterator[tuple[int, str, Span | None]]:
-    """Yield number, name, and start and source of the flag of each flagged problem."""
+    """Yield each flagged problem: its number, its name, and the span with the flag's start and source."""
     for number in seen.control.problems if seen.control else ():
         yield number, seen.problems.name(number), seen.timelines.problems[number].now
 
@@ -66,7 +66,7 @@ def log_line(line: LogLine) -> Text:
 
 
 class StatusText:
-    """Text on a run at one moment, in experiment time."""
+    """The status of a run at one moment of experiment time, as text and as JSON."""
 
     def __init__(self, seen: Overview, run: RunDescription, now_ns: int) -> None:
         self._seen = seen
@@ -91,7 +91,7 @@ class StatusText:
         return Group(*lines)
 
     def summary(self) -> str:
-        """Return control, problems and microscope in one line."""
+        """Return control, problems and state of the microscope in one line."""
         return "; ".join(
             " ".join(line.plain.split()) for line in (self._control(), *self._problems(), self._microscope())
         )

@@ -28,8 +28,7 @@ def pause(where: Where = RUNS) -> None:
 def resume(where: Where = RUNS) -> None:
     """Let a paused experiment continue: AUTOMATED.
 
-    The experiment must be running. One that was killed, perhaps with its computer, continues by `afspm run --resume
-    RUN`.
+    The experiment must be running. After a kill or a power cut, continue it by `afspm run --resume RUN`.
     """
     from afspm.model import ControlMode
 
@@ -40,7 +39,7 @@ def end(
     where: Where = RUNS,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Don't ask.")] = False,
 ) -> None:
-    """End a running experiment, for all its components; it asks first."""
+    """End a running experiment, for all its components, after a question."""
     with acting(where) as scope:
         if not yes:
             typer.confirm("End the experiment?", abort=True)

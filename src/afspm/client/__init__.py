@@ -1,8 +1,8 @@
 """Components and scripts: the base class of users' components, its loop, and `Scope`, the blocking handle.
 
 **Theory of operation.** A component has one thread, which waits in one place (`experiment_link`) and calls one handler
-at a time (`loop`). Packets that arrive meanwhile wait in order (`backlog`). `Scope` offers the same to scripts as
-calls that block, and handles packets while it waits.
+at a time (`loop`). Packets that arrive meanwhile wait in order (`backlog`). `Scope` offers blocking calls to scripts,
+and handles packets while a call waits.
 
     comes in      packets of the scheduler, answers to requests
     state         the newest state of the experiment; a memory on disk; intent and result of each keyed measurement

@@ -1,4 +1,4 @@
-"""Packets that wait for their handler: in order, none lost, in bounded memory however long a handler takes."""
+"""Queue of the packets that wait for their handler: in order, without loss, in bounded memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MEMORY_LIMIT_BYTES = 256 << 20
 
 
 class PacketBacklog:
-    """A queue of packets; beyond `limit_bytes` they wait in a temporary file, which is removed when it is empty."""
+    """A queue of packets; beyond `limit_bytes`, packets wait in a temporary file, which is removed once empty."""
 
     def __init__(self, limit_bytes: int = MEMORY_LIMIT_BYTES) -> None:
         self._limit_bytes = limit_bytes

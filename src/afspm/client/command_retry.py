@@ -58,16 +58,16 @@ class CommandRetry:
         self._control = control
 
     def ask(self, kind: ControlRequest, subject: object = None, *, until_s: float | None = None) -> Response:
-        """Send a command until it succeeds, inside a block with control; wait for control if it is lost.
+        """Send a command until it succeeds, inside a block with control; if control is lost, wait for it.
 
-        In an unbroken block, lost control is an error instead: others may have changed the microscope meanwhile.
+        In an unbroken block, lost control is an error: other components may have changed the microscope meanwhile.
 
         Raises:
             Refused: the microscope or a limit refuses.
             NoResponse: the microscope stays silent, or is not free until `until_s`; or, in an unbroken block, control
                 was lost before an action was answered.
-            ControlLost: control was not back until `until_s`; or, in an unbroken block, was lost, and no action was
-                carried out.
+            ControlLost: control was not regained by `until_s`; or, in an unbroken block, was lost before any action
+                was carried out.
         """
         request_id = self._link.next_id()
         while True:
@@ -100,7 +100,7 @@ class CommandRetry:
             return self.ask(kind, subject, until_s=until_s)
 
     def read(self, kind: ControlRequest, subject: object, until_s: float | None) -> Response:
-        """Send a reading request; take control for it if only the holder may read."""
+        """Send a request that only reads; take control for it if the scheduler demands that."""
         response = self.send(kind, subject, until_s=until_s)
         if response.code != ControlResponse.NOT_IN_CONTROL:
             return response
@@ -108,9 +108,9 @@ class CommandRetry:
             return self.send(kind, subject, until_s=until_s)
 
     def set(self, kind: ControlRequest, wanted: object, message: str, until_s: float | None) -> None:
-        """Send a setting, and wait until its `message` is published and the tip has stopped moving.
+        """Send a setting; wait until its `message` is published and the tip has stopped moving.
 
-        The wait is short for a microscope that publishes nothing, since nothing changed.
+        If nothing is published, since nothing changed, the wait ends after SETTLED_WITHIN_S.
         """
         link, view = self._link, self._link.view
         count = view.count(message)
@@ -119,12 +119,12 @@ class CommandRetry:
             link.wait(lambda: view.state is not ScopeState.MOVING, until_s)
 
     def set_parameter(self, wanted: Parameter, until_s: float | None) -> Parameter:
-        """Set a parameter and return it as it is then in force. Control must be held around it. Raises as `ask`."""
+        """Set a parameter, and return the value in force. Control must be held. Raises as `ask`."""
         response = self.ask(ControlRequest.PARAM, wanted, until_s=until_s)
         return wire.decode_parameter(response.payload) if response.payload else wanted
 
     def publish_settings(self, settings: tuple[Parameter, ...], key: str) -> None:
-        """Have the scheduler publish the parameters that a sweep has set for the measurement of a key."""
+        """Ask the scheduler to publish the parameters that a sweep has set for the measurement `key`."""
         link = self._link
         message = MeasurementSettings(link.clock.now_ns(), link.name, settings, key)
         response = link.request(RELAY_REQUEST, RelayedMessage(*wire.encode(message)))
@@ -140,10 +140,10 @@ class CommandRetry:
         until_s: float | None = None,
         is_seen: Callable[[], bool] = lambda: False,
     ) -> Response:
-        """Send a request, and repeat it with its id, so that it is executed once, while the microscope is silent.
+        """Send a request; repeat it while the microscope is silent, with the same id, so that it is executed once.
 
         Args:
-            is_seen: returns whether the effect of the request is seen, which counts as an answer.
+            is_seen: returns whether the effect of the request has been observed, which counts as an answer.
 
         Returns:
             The answer; NO_RESPONSE only if control was lost before any answer.
@@ -183,7 +183,7 @@ class CommandRetry:
             self._wait_for_news(link.earlier(RETRY_S, give_up_s))
 
     def get_over(self, kind: ControlRequest, response: Response, states: int, until_s: float | None) -> None:
-        """Wait for the obstacle that a failed response names, or raise Refused.
+        """Wait until the cause of a failed response is gone; raise Refused if no wait can help.
 
         Args:
             states: number of states published before the request.
@@ -229,7 +229,7 @@ class CommandRetry:
 
 
 def refused(kind: int, response: Response, where: str) -> Refused:
-    """Return a refusal as an error."""
+    """Return the error for a refused request."""
     known = response.code in ControlResponse._value2member_map_
     code = ControlResponse(response.code).name if known else str(response.code)
     what = _ASKED_FOR.get(kind, request_name(kind))

@@ -47,7 +47,7 @@ class Component:
                     scans = self.scope.scan(region, shape=(256, 256), key=f"tile-{i}")
 
     Everything runs on one thread, one handler at a time. An exception in a handler ends the process; the supervisor
-    restarts it, and the scheduler sends it the cached packets.
+    restarts the process, and the scheduler sends the cached packets again.
 
     The attributes below exist from `on_start` on, not yet in `__init__`.
 
@@ -59,11 +59,11 @@ class Component:
         memory: a dict on disk, saved after each handler (in `run`: by its `save`) and restored after a restart.
         run_dir: folder of this run.
         simulated: whether the microscope is simulated; state it in your output.
-        packet: the packet being handled (its envelope, its time), None between handlers.
+        packet: the packet being handled, with envelope and time; None between handlers.
         longest_step_s: longest allowed handler in real seconds; after it the process counts as frozen and is killed.
             Waiting inside `scope` does not count.
         period_s: period of `on_tick`; None: no ticks.
-        period_time: whether that is experiment time or real time.
+        period_time: whether `period_s` is in experiment time or real time.
     """
 
     solves: ClassVar[tuple[str, ...]] = ()
@@ -71,7 +71,7 @@ class Component:
     flags: ClassVar[tuple[str, ...]] = ()
     """Problems that the component may flag; the experiment file must have a component that solves each."""
     publishes: ClassVar[tuple[str, ...]] = ()
-    """Envelopes that the component publishes itself; with any, it gets an address to publish on."""
+    """Envelopes that the component publishes itself; if there are any, the component gets an address to publish on."""
     listens: ClassVar[tuple[str, ...] | None] = None
     """Prefixes of the envelopes to subscribe to, unless the experiment file gives them. None: all except messages about
     processes, requests and logs; `("",)`: really all."""
@@ -82,7 +82,7 @@ class Component:
     needs_approval: ClassVar[bool] = False
     """The component acts for agents: its commands need the approval of a person."""
     requires: ClassVar[tuple[str, ...]] = ()
-    """Packages needed beside a plain install of afspm, in the notation of `pip install`: `("scikit-learn>=1.4",)`."""
+    """Packages needed beyond a plain install of afspm, in the notation of `pip install`: `("scikit-learn>=1.4",)`."""
     needs_actions: tuple[str, ...] = ()
     """Actions that the microscope must have."""
     needs_parameters: tuple[str, ...] = ()
@@ -105,7 +105,7 @@ class Component:
     def planned_work(self, speed_m_s: float | None) -> PlannedWork | None:
         """Return the work that the component plans, for `afspm check` and the report; None: no estimate.
 
-        It is called after `__init__` alone, in classes that a package declares.
+        Called after `__init__`, without `on_start`, and only for classes that a package declares as entry points.
 
         Args:
             speed_m_s: scan speed at the start, if the experiment file gives it.
@@ -113,10 +113,10 @@ class Component:
         return None
 
     def run(self) -> None:
-        """Run the experiment as a script; at its return the component is done. It excludes ticks."""
+        """Run the experiment as a script; the component is done once this returns. Such a component has no ticks."""
 
     def on_start(self) -> None:
-        """Start; all attributes exist, and no other handler was called."""
+        """Prepare the component: all attributes exist, and no other handler has been called yet."""
 
     def on_scan(self, scan: Scan) -> None:
         """Handle one measured channel of a scan."""
@@ -131,9 +131,9 @@ class Component:
         """Handle a change of mode, holder or problems."""
 
     def on_problem(self, problem: str, flagged: bool) -> None:
-        """Handle a flagged (True) or removed (False) problem; at the start, each problem that is already flagged.
+        """Handle a problem that is flagged (True) or cleared (False); at the start, each problem already flagged.
 
-        `problem` is its name, such as "tip-shape-changed", or a name of the experiment file.
+        `problem` is a standard name, such as "tip-shape-changed", or a name from the experiment file.
         """
 
     def on_scan_parameters(self, parameters: ScanParameters) -> None:
@@ -146,13 +146,13 @@ class Component:
         """Handle a new position of the probe."""
 
     def on_message(self, envelope: str, message: Any) -> None:
-        """Handle any other message, without a handler of its own name.
+        """Handle a message of a type that has no handler of its own.
 
         A method `on_peak_list(self, message)` handles the messages of your type `PeakList`.
         """
 
     def on_tick(self) -> None:
-        """Run every `period_s`. Ticks missed during a long step are skipped."""
+        """Do periodic work, every `period_s`. Ticks missed during a long step are skipped."""
 
     def on_end(self) -> None:
         """Finish: the experiment has ended, the process is being stopped, or `run` has returned."""

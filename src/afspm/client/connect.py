@@ -1,4 +1,4 @@
-"""`afspm.connect`: a script or notebook joins a running experiment."""
+"""`afspm.connect`: connects a script or notebook to a running experiment."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def connect(where: str | Path = "runs", name: str = "notebook", *, messages: Seq
     Args:
         where: the folder of the run, the folder of all runs (for the newest), or the experiment file (for its newest
             run, in the folder `runs` here or beside it).
-        name: holder of control that others see. Two programs that join need different names.
+        name: name of this program in the experiment, shown as the holder of control. Two programs need two names.
         messages: modules and .proto files with message types of your own, as in the experiment file. Only these are
             imported, not the run's own list, since its folder may come from another person.
 
@@ -85,7 +85,7 @@ def _log_of(name: str) -> logging.Logger:
 
 
 def guest_facts(launch: Launch) -> Plain:
-    """Return the guest's entry in run.json: a component's launch line, without class, settings and envelopes."""
+    """Return the entry for guests in run.json: a component's launch line without class, settings and envelopes."""
     sockets = Sockets(subscribe=launch.sockets.subscribe[:1], control=launch.sockets.control)
     guest = dataclasses.replace(launch, name=GUEST, class_="", settings={}, sockets=sockets, envelopes=None)
     facts: Plain = json.loads(guest.to_json())
@@ -132,7 +132,7 @@ def _keys_in(folder: Path) -> Plain:
 
 
 def find_run(where: Path) -> Path:
-    """Return the folder of a run.
+    """Return a run's folder, from the folder itself, a folder of runs (its newest) or an experiment file (its newest).
 
     Raises:
         FileError: there is no such run.

@@ -1,4 +1,4 @@
-"""Control of the microscope: requesting it, waiting for it, noticing its loss, releasing it."""
+"""Control of the microscope: request, wait, detection of a loss, and release."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ ASK_AGAIN_S = 10.0  # in case a published control state was lost
 
 
 class ControlHold:
-    """The component's hold on control, and the problem for which it wants control.
+    """The component's control of the microscope, and the problem to solve with it.
 
-    Answers of the scheduler grant control. The published state takes it away, but only once it has named this
-    component: an older state, from before the grant, may arrive later and is not a loss.
+    The scheduler's answer grants control. A published state with another holder means loss, but only after a state
+    that names this component: a state from before the grant may arrive after the answer.
 
     Attributes:
-        held: the component is in control.
+        held: whether the component is in control.
         tenures: number of grants of control.
         why_lost: reason of the last loss, for people.
-        gives_back_inherited: release control that an earlier life of this component held at its death.
-        is_unbroken: in this block lost control is an error, so that all requests belong to one tenure.
+        gives_back_inherited: whether to release control that the component held before its restart.
+        is_unbroken: whether a loss of control in the present block is an error: all requests belong to one grant.
     """
 
     def __init__(self, link: ExperimentLink, problems: ProblemNames) -> None:
@@ -51,7 +51,7 @@ class ControlHold:
         """Hold control in the block; an inner block shares the control of the outer one.
 
         Raises:
-            ControlLost: control was not given until `until_s`; or, in the block, if `unbroken`, was lost.
+            ControlLost: control was not given by `until_s`; or, if `unbroken`, was lost in the block.
             Refused: the problem to solve is not flagged.
         """
         if self._wanted and solving not in (Problem.NONE, self._wanted[0]):
@@ -81,10 +81,10 @@ class ControlHold:
             self.is_unbroken = was_unbroken
 
     def regain(self, until_s: float | None = None) -> None:
-        """Return once control is held; until then, request control after each change of the control state.
+        """Wait until control is held; request control after each change of the control state.
 
         Raises:
-            ControlLost: not until `until_s`, or the problem has been solved, or the block is unbroken.
+            ControlLost: control was not given by `until_s`, the problem has been solved, or the block is unbroken.
         """
         link, solving = self._link, self._solving
         if self.is_unbroken and not self.held:
@@ -109,7 +109,7 @@ class ControlHold:
             link.log.info("in control")
 
     def release_inherited(self) -> None:
-        """Release unneeded control of an earlier life: other components wait for it."""
+        """Release control that the component held before its restart, unless it needs control now."""
         state = self._link.view.control
         if state is not None and state.holder == self._link.name and not self._wanted and not self.held:
             self._link.send_only(ControlRequest.RELEASE_CTRL)
@@ -121,12 +121,12 @@ class ControlHold:
         self.held = False
 
     def lost(self, why: str) -> None:
-        """Record that the scheduler denies control."""
+        """Record the loss of control, and its reason."""
         self.held = False
         self.why_lost = why
 
     def obstacle(self, solving: int = Problem.NONE) -> str:
-        """Return the obstacle to control, for people; empty without one."""
+        """Return why control can't be had now, as text for people; empty if it can."""
         state = self._link.view.control
         if state is None:
             return ""

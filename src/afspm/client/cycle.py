@@ -10,7 +10,7 @@ from afspm.model import ScopeState
 
 
 class CycleOutcome(Enum):
-    """The outcome of a cycle."""
+    """Outcome of one attempt at a scan or spectrum."""
 
     COMPLETED = auto()
     INTERRUPTED = auto()
@@ -24,18 +24,17 @@ class CycleOutcome(Enum):
 class Cycle:
     """A measurement as a sequence of states: `busy`, then results, then FREE.
 
-    After a lost connection the cache may have kept the results but not `busy`; then they count, too.
+    After a lost connection the cache may hold the results without the state `busy`; such results count, too.
 
     Args:
         busy: the state during the measurement, SCANNING or SPEC.
-        fits: returns whether a result can be the requested one. Only such results count, even while this component is
-            in
-            control: a person, or another program, can always use the controller itself.
+        fits: returns whether a result can be the requested one. Only such results count, even while this component
+            is in control: a person, or another program, can always use the controller itself.
         since_ns: packets up to this time belong to an earlier measurement; None: nothing was published before.
-        resumed: an earlier life of the component requested it; others may have measured since.
+        resumed: whether it was requested before a restart of the component; others may have measured since.
 
     Attributes:
-        begun: whether its start was seen.
+        begun: whether its start was observed.
         results: the results that fit.
         other: the first result since `busy` that does not fit.
     """
@@ -53,11 +52,11 @@ class Cycle:
         self.other: Any = None
 
     def control_was_lost(self) -> None:
-        """Register the loss of control: others may measure from now on."""
+        """Note the loss of control: other components may measure from now on."""
         self._resumed = True
 
     def on_state(self, state: ScopeState, time_ns: int | None) -> None:
-        """Take a published state of the microscope."""
+        """Process a published state of the microscope."""
         if self.outcome is not None or self._is_old(time_ns):
             return
         if state is self._busy:
@@ -73,7 +72,7 @@ class Cycle:
             self.outcome = CycleOutcome.COMPLETED if self.results else without
 
     def on_result(self, result: object, time_ns: int | None) -> None:
-        """Take a published channel of a scan, or a spectrum."""
+        """Process a published channel of a scan, or a spectrum."""
         if self.outcome is not None or self._is_old(time_ns):
             return
         if self._fits(result):

@@ -42,11 +42,11 @@ class HostedComponent(Protocol):
 
 
 class MessageDispatcher:
-    """The calls of `component`'s handlers for packets; handlers inherited from `base` are empty.
+    """A dispatcher that calls a component's handlers for packets; handlers inherited from `base` do not count.
 
     Args:
-        prefixes: prefixes of the envelopes that the component subscribed to; None: all. More packets arrive: `Scope`
-            needs them.
+        prefixes: prefixes of the envelopes that the component subscribed to; None: all. Other packets arrive as well,
+            since `Scope` needs them.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class MessageDispatcher:
         return any(map(self._wants_message, wire.known_messages()))
 
     def give(self, packet: Packet) -> None:
-        """Call the handlers of a packet; an unreadable packet is logged and dropped."""
+        """Call the handlers for a packet; an unreadable packet is logged and dropped."""
         try:
             message = wire.message_of(packet.envelope)
             thing = wire.decode(message, packet.payload)

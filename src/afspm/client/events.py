@@ -1,4 +1,4 @@
-"""Published messages one after the other, for scripts that look at every message."""
+"""Iteration over published messages, for scripts that need every message."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class PublishedEvent:
     """A published message.
 
     Attributes:
-        envelope: its topic.
+        envelope: topic of the message.
         message: an object of `afspm.model`, or a generated message.
-        time_ns: its time in the experiment; None if the publisher gives none.
+        time_ns: experiment time of the message; None if the publisher gives no time.
     """
 
     envelope: str
@@ -36,7 +36,7 @@ class PublishedEvent:
 
 
 class Events(Iterator[PublishedEvent]):
-    """An iterator over messages published from now on; none is lost while the loop's body is busy.
+    """An iterator over messages published from now on; no message is lost while the loop's body is busy.
 
     It ends with the experiment, or after `timeout_s` without a message (a later `for` continues).
 
@@ -85,7 +85,7 @@ class Events(Iterator[PublishedEvent]):
         return PublishedEvent(packet.envelope, message, packet.time_ns)
 
     def close(self) -> None:
-        """Drop all waiting messages, and keep no more."""
+        """Drop all waiting messages, and stop collecting new ones."""
         self._forget()
         self._backlog.close()
 

@@ -1,4 +1,4 @@
-"""The only place where a component waits: it passes events of the port to their handlers, and sends requests."""
+"""A component's connection to its experiment, the only place where it waits: events come in, requests go out."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ class PublishedState:
         return self.status.state if self.status else ScopeState.UNDEFINED
 
     def take(self, message: str, thing: object) -> None:
-        """Take `thing`, published as the message `message`."""
+        """Store `thing`, published as the message `message`."""
         setattr(self, wire.declaration(message).attribute, thing)
         self._published[message] += 1
 
     def take_time(self, time_ns: int | None) -> None:
-        """Take the time of a packet of the scheduler."""
+        """Update `newest_ns` with the time of a packet from the scheduler."""
         if time_ns is not None and (self.newest_ns is None or time_ns > self.newest_ns):
             self.newest_ns = time_ns
 
@@ -79,8 +79,8 @@ class PublishedState:
 
 
 LONGER_THAN_THE_SCHEDULER = 1.2
-"""Factor on the time that the scheduler waits for the microscope, so that its NO_RESPONSE arrives before the timeout: a
-repetition opens a new connection, as if the scheduler were gone."""
+"""Ratio of a component's timeout to the scheduler's timeout for the microscope. The scheduler's NO_RESPONSE then
+arrives before the component repeats its request on a new connection."""
 CAUGHT_UP_WITHIN_S = 2.0
 """Time before the warning that the scheduler's packets do not arrive."""
 UNHEARD = "the scheduler is connected, but its packets do not arrive"
@@ -92,7 +92,7 @@ class RequestTracker:
     """Ids of a component's requests, and their answers. Only one request at a time is waited for.
 
     Args:
-        session: differs between two lives of a component of the same name.
+        session: text that differs after each restart of a component of the same name.
 
     Attributes:
         connections: number of connections to the scheduler so far.
@@ -112,7 +112,7 @@ class RequestTracker:
         self.answer: Response | None = None
 
     def next_id(self) -> str:
-        """Return an id for a request, unique over all lives of this component."""
+        """Return an id for a request, unique over all restarts of this component."""
         self._requests += 1
         return f"{self._name}/{self._session}/{self._requests}"
 
@@ -127,7 +127,7 @@ class RequestTracker:
         return request.id
 
     def relay(self, thing: object, now_s: float, timeout_s: float) -> None:
-        """Have the scheduler publish `thing`. While one message is unanswered, only the newest of each kind waits."""
+        """Ask the scheduler to publish `thing`. While a message is unanswered, only the newest of each kind waits."""
         relayed = RelayedMessage(*wire.encode(thing))
         self._waiting[relayed.message] = relayed
         if self._relayed is None or self._relayed[1] < now_s - timeout_s:
@@ -157,8 +157,8 @@ class ExperimentLink:
     """A component's connection to its experiment, for use from one thread.
 
     Args:
-        source: address of the scheduler's publisher, whose packets hold the state; None: those of any publisher.
-        session: differs between two lives of a component of the same name.
+        source: address of the scheduler's publisher, whose packets hold the state; None: packets of any publisher.
+        session: text that differs after each restart of a component of the same name.
     """
 
     def __init__(
@@ -191,7 +191,7 @@ class ExperimentLink:
 
     @classmethod
     def of_launch(cls, launch: Launch, port: Port, session: str, **given: Any) -> ExperimentLink:
-        """Return the link of a process with a launch line.
+        """Return the link for a process with this launch line.
 
         Args:
             given: name, activity or log, as to the constructor.
@@ -236,7 +236,7 @@ class ExperimentLink:
         return True
 
     def pump(self, timeout_s: float | None) -> None:
-        """Wait once, and pass all events to their handlers."""
+        """Wait for events once, and pass them to their handlers."""
         self.check()
         for incoming in self.port.poll(timeout_s):
             self._take(incoming)
@@ -269,7 +269,7 @@ class ExperimentLink:
         is already done.
 
         Raises:
-            NoResponse: not until `until_s` (monotonic), or the scheduler is connected and does not answer.
+            NoResponse: the packets have not arrived by `until_s` (monotonic).
         """
         has_warned = False
         while not self.wait_connected(self.is_caught_up, CAUGHT_UP_WITHIN_S, until_s):
@@ -283,7 +283,7 @@ class ExperimentLink:
         return self._source in self._caught_up if self._source else bool(self._caught_up)
 
     def until(self, timeout_s: float | None) -> float | None:
-        """Return the end of a timeout in monotonic time."""
+        """Return the end of a timeout in monotonic time; None for no timeout."""
         return None if timeout_s is None else self.clock.monotonic_s() + timeout_s
 
     def earlier(self, timeout_s: float, until_s: float | None) -> float:
@@ -299,7 +299,7 @@ class ExperimentLink:
     # --- listening ---
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call `listener(packet, ours)` with every packet from now on; `ours`: the scheduler sent it.
+        """Call `listener(packet, ours)` with every packet from now on; `ours`: whether the scheduler sent the packet.
 
         Returns:
             A function that removes the listener.
@@ -324,14 +324,14 @@ class ExperimentLink:
     def request(
         self, kind: int, subject: object = None, *, request_id: str = "", until_s: float | None = None
     ) -> Response:
-        """Send a request to the scheduler, and return its answer, also a refusal.
+        """Send a request to the scheduler, and return the answer, even a refusal.
 
         A request without an answer is repeated with its id, so that it is executed once. The wait lasts while the
         scheduler is away.
 
         Raises:
             ExperimentEnded: the answer is that the experiment has ended.
-            NoResponse: no repetition was answered, or none until `until_s` (monotonic).
+            NoResponse: no repetition was answered, or none by `until_s` (monotonic).
         """
         request = Request(kind, subject, id=request_id or self.next_id())
         frames, requests, sent = wire.encode_request(request), self.requests, 0
@@ -365,7 +365,7 @@ class ExperimentLink:
         self.requests.send_only(kind, subject)
 
     def relay(self, thing: object) -> None:
-        """Have the scheduler publish a message of this component, without waiting."""
+        """Ask the scheduler to publish a message of this component, without waiting."""
         self.requests.relay(thing, self.clock.monotonic_s(), self.request_timeout_s)
 
     def _checked(self, answer: Response) -> Response:

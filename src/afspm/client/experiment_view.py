@@ -50,7 +50,7 @@ class ExperimentView:
 
     @property
     def control_state(self) -> ControlState:
-        """Return mode, holder and problems."""
+        """Return the mode, the holder of control, and the flagged problems."""
         self._catch_up()
         return self._link.view.control or ControlState(ControlMode.UNDEFINED)
 

@@ -12,10 +12,10 @@ from afspm.transport.process import signals
 
 
 class Interrupts:
-    """The interrupts (Ctrl-C, the stop button of a notebook) during calls over one port.
+    """A handler of interrupts (Ctrl-C, the stop button of a notebook) during calls over one port.
 
     An interrupt is raised where a call waits, so that no request or answer is left half done. A program that handles or
-    ignores SIGINT itself, as components do, is left alone.
+    ignores SIGINT itself, as components do, is not affected.
     """
 
     def __init__(self, port: Port) -> None:
@@ -25,7 +25,7 @@ class Interrupts:
 
     @contextmanager
     def heeded(self) -> Iterator[None]:
-        """Raise KeyboardInterrupt in this block only where `heed` is called, and at its end."""
+        """Raise KeyboardInterrupt only where the block calls `heed`, and at the end of the block."""
         if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
             yield  # components handle SIGINT themselves, as does an outer block of this kind
             return
@@ -36,7 +36,7 @@ class Interrupts:
 
     @contextmanager
     def deferred(self) -> Iterator[None]:
-        """Finish this block, which must be short; further interrupts during it are dropped."""
+        """Drop interrupts during the block, which must be short."""
         self._is_deferred = True
         try:
             yield
@@ -44,7 +44,7 @@ class Interrupts:
             self._is_deferred = self._has_come = False
 
     def heed(self) -> None:
-        """Raise KeyboardInterrupt after an interrupt."""
+        """Raise KeyboardInterrupt if an interrupt has come since the last call."""
         if self._has_come and not self._is_deferred:
             self._has_come = False
             raise Interrupted

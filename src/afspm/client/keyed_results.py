@@ -1,4 +1,4 @@
-"""Keyed measurements, taken exactly once: the intent is on disk before the request, the result after it."""
+"""Measurements with a key, taken exactly once: the intent is on disk before the request, the result after it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LONGEST_KEY = 100
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """The scans or spectra of a measurement, and its interruptions, for people."""
+    """The scans or spectra of a measurement, and its interruptions as text."""
 
     things: list[Any]
     interruptions: list[str]
@@ -45,10 +45,10 @@ class MeasurementResult:
 
 
 class KeyedResults:
-    """The keyed measurements of one component.
+    """The store of one component's measurements with a key.
 
     Args:
-        folder: state folder of the run; None keeps nothing over a restart.
+        folder: state folder of the run; None: nothing survives a restart.
         name: name of the component.
     """
 
@@ -64,7 +64,7 @@ class KeyedResults:
 
     @property
     def pending(self) -> Plain | None:
-        """Return the intent without a result: key, plan, attempt, since_ns, interruptions."""
+        """Return the intended measurement without a result: key, plan, attempt, since_ns, interruptions; else None."""
         intent: Plain | None = self._memory.get("pending")
         path = None if intent is None else self._path(intent["key"])
         return None if path is not None and path.exists() else intent
@@ -75,12 +75,12 @@ class KeyedResults:
         self._memory.save(synced=False)  # a power cut may have it measured again, which costs a scan and no harm
 
     def before_sweep(self, key: str) -> list[Parameter] | None:
-        """Return the parameters as they were before a sweep that has not been ended; None: no value of it was set."""
+        """Return the parameter values from before an unfinished sweep; None if the sweep has set no parameter."""
         kept = self._memory.get("before_sweep", {}).get(key)
         return None if kept is None else [Parameter(**one) for one in kept]
 
     def keep_before_sweep(self, key: str, before: Sequence[Parameter] | None) -> None:
-        """Save the parameters before a sweep sets the first; None: they are in force again."""
+        """Save the parameter values from before a sweep; None: they are in force again."""
         kept = self._memory.setdefault("before_sweep", {})
         if before is None:
             kept.pop(key, None)
@@ -89,7 +89,7 @@ class KeyedResults:
         self._memory.save()
 
     def find(self, key: str, plan: Plain) -> MeasurementResult | None:
-        """Return the result of an earlier life or call with the same key.
+        """Return the saved result of a key, from an earlier call or before a restart; None without a result.
 
         Raises:
             InvalidValue: the key was used for another measurement.
@@ -111,7 +111,7 @@ class KeyedResults:
         return MeasurementResult(things, head["interruptions"])
 
     def fulfil(self, key: str, plan: Plain, result: MeasurementResult) -> None:
-        """Save the result of the intent. On a full disk it is lost, and a later life measures again."""
+        """Save the result of the intended measurement. If the disk is full, a restarted component measures again."""
         path, is_kept = self._path(key), False
         if path is not None:
             things = [wire.encode(thing) for thing in result.things]
@@ -142,12 +142,12 @@ class KeyedResults:
 
 
 def kept_in(state_dir: Path, name: str) -> list[str]:
-    """Return the names of the files with a component's measurements."""
+    """Return the names of the files with a component's saved measurements."""
     return sorted(path.name for path in (state_dir / f"{name}.results").glob("*"))
 
 
 def check_key(key: str) -> str:
-    """Return a key, if it is valid in request ids.
+    """Return `key` if it is valid as a part of request ids.
 
     Raises:
         InvalidValue: the key is not valid.

@@ -1,4 +1,4 @@
-"""The loop of a component: one thread that waits in one place and calls one handler at a time."""
+"""The main loop of a component: one thread, which waits in one place and calls one handler at a time."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ AT_ONCE = 16  # packets handled between two polls of the port: a KILL must not w
 
 
 class ComponentLoop:
-    """The loop of one component until the experiment ends, the process is stopped, or `run` returns.
+    """The main loop of one component, until the experiment ends, the process is stopped, or `run` returns.
 
     Args:
         base: class with the empty handlers that the component overrides.
@@ -216,12 +216,12 @@ class _Ticker:
         self._next = now()
 
     def due_in_s(self) -> float:
-        """Return the real seconds until the next tick; at most 0 if it is due."""
+        """Return the real seconds until the next tick; 0 if a tick is due."""
         left = self._next - self._now()
         return self._real_s(left) if left > 0 else 0.0
 
     def done(self) -> None:
-        """Count a tick, and skip those missed meanwhile."""
+        """Schedule the next tick, and skip missed ticks."""
         missed = max(0, self._now() - self._next) // self._period
         self._next += (missed + 1) * self._period
 

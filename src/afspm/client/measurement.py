@@ -1,4 +1,4 @@
-"""Taking one scan or spectrum exactly once, over interruptions and restarts."""
+"""Measurement of one scan or spectrum, exactly once, over interruptions and restarts."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from afspm.model.sessions import KEYED
 from afspm.transport.port import CUT_OFF_SHOWS_WITHIN_S
 
 BEGUN_WITHIN_S = 2 * CUT_OFF_SHOWS_WITHIN_S
-"""Real time from the success of the action to the published state. The connection may be cut between the two. Until a
-cut is certainly noticed, silence does not mean that nothing was begun: a new request would measure twice."""
+"""Limit in real time from the accepted action to the published start. The connection may break in between; until a
+break is certain to be detected, a new request might measure twice."""
 STOPPED_WITHIN_S = 10.0  # after an interrupt by the user
 IDLE_AFTER_S = 5.0  # the same, if no start was seen
 MOST_FAILURES = 5  # unexplained ones in a row, before a person has to look
 
 
 class _Watch:
-    """A cycle that takes in published packets until it is closed."""
+    """A subscription that passes published packets to a `Cycle` until closed."""
 
     def __init__(self, link: ExperimentLink, target: Target, cycle: Cycle) -> None:
         self._link = link
@@ -82,7 +82,7 @@ class _MeasurementTask:
 
     @property
     def request_id(self) -> str:
-        """Return the id of the starting action: different for each attempt, the same in every life."""
+        """Return the id of the starting action: different for each attempt, the same after a restart."""
         return f"{self.stem}/{self.attempt}"
 
     def drop_watch(self) -> None:
@@ -111,13 +111,13 @@ class MeasurementRunner:
         self._unfinished = self._of_earlier_life()
 
     def take(self, target: Target, key: str | None, until_s: float | None, *, repeat: bool = True) -> MeasurementResult:
-        """Measure until there is a complete result; with a key, once in all lives of the component.
+        """Measure until the result is complete; with a key, only once, even over restarts of the component.
 
         Raises:
             Refused: the microscope or a limit refuses.
-            NoResponse: not until `until_s`.
-            MeasurementFailed: the microscope fails again and again.
-            ControlLost: control was not given until `until_s`; or, without `repeat`, was lost during the measurement.
+            NoResponse: there is no result by `until_s`.
+            MeasurementFailed: the microscope fails repeatedly.
+            ControlLost: control was not given by `until_s`; or, without `repeat`, was lost during the measurement.
         """
         if key is not None and (found := self._results.find(check_key(key), target.facts())) is not None:
             return found

@@ -1,4 +1,4 @@
-"""Setting the microscope up for a measurement: region, shape, probe position and kind of spectrum."""
+"""Setup of the microscope for a measurement: region, shape, probe position and kind of spectrum."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from afspm.model import ControlRequest, Feedback, Frame, Parameter, ProbePositio
 
 
 class MeasurementSetup:
-    """The setup of the microscope for measurements; settings in force are skipped. Control must be held around each
-    call.
+    """A setter of the microscope's settings for a measurement. Control must be held during each call.
+
+    Settings already in force are not sent again.
 
     Args:
         view: the published settings in force.
@@ -22,7 +23,7 @@ class MeasurementSetup:
         self._rounded: tuple[ScanParameters, ScanParameters | None] | None = None
 
     def prepare(self, target: Target, key: str, until_s: float | None) -> None:
-        """Set everything that a target needs, and publish its settings as the microscope then reports them."""
+        """Set all that a target needs, and publish its sweep parameters as the microscope reports them."""
         if isinstance(target, ScanTarget):
             self.set_scan(target.parameters, until_s)
         else:

@@ -14,7 +14,7 @@ Value = float | str | bool
 
 
 def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
-    """Return a parameter to set, from a number in `unit` (SI without one), a quantity as text ("2 um/s"), True, "on" …
+    """Convert a value into a parameter to set: a number in `unit` (default: SI), text such as "2 um/s", True …
 
     Raises:
         InvalidValue: the number is not finite.
@@ -39,7 +39,7 @@ def to_parameter(name: str, value: Value, unit: str | None) -> Parameter:
 
 
 def from_parameter(parameter: Parameter, unit: str | None) -> Value:
-    """Return the value in force in `unit`; without one in SI for base parameters, else as received.
+    """Return a received value in `unit`; without `unit`, in SI for base parameters, else as received.
 
     Text that is not a number becomes True, False or text.
 
@@ -60,7 +60,7 @@ def from_parameter(parameter: Parameter, unit: str | None) -> Value:
 
 
 def value_in(response: Response, asked: Parameter, unit: str | None) -> Value:
-    """Return the value in a response; for a peer that only confirms, the requested value."""
+    """Return the value in a response; the requested value if the response only confirms."""
     return from_parameter(wire.decode_parameter(response.payload) if response.payload else asked, unit)
 
 

@@ -1,17 +1,17 @@
-"""The port log: everything that a component gets from outside, and everything that it sends, for a later replay.
+"""The port log: all inputs and outputs of a component, for a later replay without the experiment (`afspm what-if`).
 
-Inputs: events of the port, readings of the clock, and the saved memory at the start of each life. Outputs: requests and
-published packets, as bytes. With these a component can be run again without its experiment: `afspm what-if`.
+Inputs: events of the port, readings of the clock, and the saved memory at each start of the process. Outputs: requests
+and published packets, as bytes.
 
 A line of the file is a list; its first item is its kind:
 
 - ["life", facts]: a process starts.
 - ["poll", timeout_s, monotonic_s, now_ns, events, readings]
 - ["send", frames, handled, readings], ["publish", envelope, payload, handled, readings]
-- ["end", how]: the process ends by itself. It is missing after a kill.
+- ["end", how]: the process ends by itself; after a kill this line is missing.
 
-`readings` are those of the clock since the line before, `handled` is the packet in whose handler a message was sent.
-Values of scans and spectra are in the record: their packets have only time and envelope here.
+`readings` are the readings of the clock since the previous line; `handled` is the packet whose handler sent a message.
+Values of scans and spectra are in the run's record; here their packets have only time and envelope.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from afspm.transport.port import CaughtUp, Incoming, PacketReceived, Port, Reply
 from afspm.transport.process.context import ProcessContext
 
 INLINE_BYTES = 4096
-"""Larger packets that the record holds are not kept twice."""
+"""Packets of scans and spectra above this size are in the run's record only."""
 SUFFIX = ".jsonl"
 _IN_FILES = ("Scan2d", "Spec1d")
 
 
 class RecordedClock:
-    """A clock that keeps its readings, those of the component's own thread only."""
+    """A clock that records each reading by the component's own thread."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
@@ -71,7 +71,7 @@ class RecordedClock:
         return self._clock.late()
 
     def taken(self) -> PlainList:
-        """Return the readings since the last call: kind, value, kind, value …"""
+        """Return the readings since the last call, as a flat list: kind, value, kind, value …"""
         taken, self._readings = self._readings, []
         return taken
 
@@ -84,8 +84,8 @@ class RecordedPort:
     """A port that writes the port log. See `afspm.transport.port.Port`.
 
     Args:
-        wants: returns whether a handler of the component gets a packet.
-        handled: returns the packet in whose handler the component is.
+        wants: returns whether the component has a handler for a packet.
+        handled: returns the packet that is being handled.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class RecordedPort:
         self._port.close()
 
     def end(self, how: int | str) -> None:
-        """Note that the component has ended by itself: an exit code, or the type of its error."""
+        """Log that the component ends by itself; `how` is an exit code, or the type of an error."""
         self._log.add(["end", how])
         self._log.close()
 

@@ -54,17 +54,17 @@ __all__ = ["Events", "PublishedEvent", "Scope"]
 
 Place = tuple[float | str, float | str]
 SET_BACK_WITHIN_S = 60.0
-"""Wait for control after a failed sweep."""
+"""Limit on the wait for control after a failed sweep, real time."""
 _LOOK_S = 0.5
-"""Interval between two looks at a value on its way, real."""
+"""Real time between two readings of a value that has not arrived at its target."""
 ANSWER_S = 60.0  # default of readings; calls that wait for control or a measurement have no limit by default
 
 
 class Scope(ExperimentView):
     """The handle for scans, spectra, settings and actions; each call returns when it is done.
 
-    A call requests control and releases it afterwards; `with scope.control():` keeps it over several calls. Without
-    control, calls wait until it is given. Timeouts are in real seconds; None waits for ever.
+    A call requests control and releases it afterwards; `with scope.control():` keeps control over several calls.
+    Without control, calls wait until control is given. Timeouts are in real seconds; None waits for ever.
 
     Every call may raise:
         Refused: the scheduler, a limit or the microscope refused; `reason` gives the reason.
@@ -113,12 +113,11 @@ class Scope(ExperimentView):
         `ScanSet.interruptions` gives times and reasons.
 
         Args:
-            region: region to scan; None: the present one.
-            shape: (rows, columns); None: the present one.
-            key: take this scan once in this run: after a restart the component gets the scan of its earlier life. Each
-                component has its own keys, one for each measurement. A saved scan needs its space on disk until
-                `forget`.
-            repeat: False raises ControlLost where control was lost during the scan, instead of taking it again.
+            region: region to scan; None: the present region.
+            shape: (rows, columns); None: the present shape.
+            key: take this scan only once in this run: after a restart the component gets the saved scan. Each
+                measurement of a component needs its own key. A saved scan takes space on disk until `forget`.
+            repeat: False: if control is lost during the scan, raise ControlLost instead of taking the scan again.
         """
         with self._call():
             target = ScanTarget.of(region, shape, self._frame)
@@ -164,21 +163,21 @@ class Scope(ExperimentView):
                 for point in points:
                     print(point.values, point.scans["Height"].values.std())
 
-        Control is kept over all points. Where it is lost meanwhile, to the repair of a tip for instance, the point is
-        measured again with its parameters set again. However the block ends, the parameters are set back to their
-        values before it. In the record they are columns of `run.scans` and `run.spectra`.
+        Control is kept over all points. If control is lost, to a tip repair for instance, the point's parameters are
+        set and measured again. When the block ends, even by an error, the parameters are set back to their earlier
+        values. In the record the parameters are columns of `run.scans` and `run.spectra`.
 
         Args:
-            parameters: the values of each: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s", "points": 4,
-                "spacing": "log"}. The first parameter changes least often.
+            parameters: values of each parameter: a list, or a range such as {"from": "0.5 um/s", "to": "4 um/s",
+                "points": 4, "spacing": "log"}. The first parameter changes least often.
             measure: the measurement at each point.
-            region, shape: of the scans, as for `scan`.
-            at, kind: of the spectra, as for `spectrum`.
+            region, shape: region and shape of the scans, as for `scan`.
+            at, kind: position and kind of the spectra, as for `spectrum`.
             order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops;
                 "random".
-            seed: of the random order.
-            key: makes each measurement happen once in this run, under the keys "<key>-1", "<key>-2" …
-            done: that many points are left out.
+            seed: seed of the random order.
+            key: take each measurement only once in this run, under the keys "<key>-1", "<key>-2" …
+            done: number of points to skip at the beginning.
         """
         plan = SweepPlan.of(parameters, order, seed)
         target = (
@@ -239,12 +238,12 @@ class Scope(ExperimentView):
         """Set a parameter and return its value in force, in the same unit.
 
         Args:
-            value: a number, in `unit` (SI without one), a quantity as text ("0.5 V"), True, "on" …
-            wait: for a parameter of another instrument, such as a temperature: return when it has arrived at `value`,
-                with the value measured then. Control is not needed for the wait.
+            value: a number in `unit` (default: SI), a quantity as text ("0.5 V"), True, "on" …
+            wait: for a parameter of another instrument, such as a temperature: wait until it has arrived at `value`,
+                and return the measured value. The wait needs no control.
 
         Raises:
-            NoResponse: with `wait`, its target was changed on the way, or it has not arrived within the timeout.
+            NoResponse: with `wait`: the target was changed meanwhile, or was not reached within the timeout.
         """
         with self._call():
             asked, until_s = to_parameter(parameter, value, unit), self._link.until(timeout_s)
@@ -276,7 +275,7 @@ class Scope(ExperimentView):
         return value_in(response, Parameter(name), unit)
 
     def get(self, parameter: str, unit: str | None = None, *, timeout_s: float | None = ANSWER_S) -> Value:
-        """Return a parameter's value in `unit`; without one in SI, or as received if it is not a base parameter."""
+        """Return a parameter's value in `unit`; without `unit`, in SI for base parameters, else as received."""
         with self._call():
             asked = Parameter(parameter)
             response = self._commands.read(ControlRequest.PARAM, asked, self._link.until(timeout_s))
@@ -293,12 +292,12 @@ class Scope(ExperimentView):
         setpoint: float | None = None,
         timeout_s: float | None = None,
     ) -> None:
-        """Set the given fields of the z feedback, and return when `feedback` shows them; the others stay unchanged.
+        """Set the given fields of the z feedback, and return when `feedback` shows them; other fields stay unchanged.
 
         Args:
-            on: whether the feedback regulates; off, the tip is held at its height.
-            proportional_gain, integral_gain: in the controller's own units.
-            setpoint: in the unit of the operating mode: A for a tunnelling current, V, m, Hz or N in force microscopy.
+            on: whether the feedback regulates; if False, the tip is held at its height.
+            proportional_gain, integral_gain: gains in the controller's own units.
+            setpoint: in the unit of the operating mode: A for a tunnelling current; V, m, Hz or N in force microscopy.
         """
         with self._call():
             feedback = Feedback(on, proportional_gain, integral_gain, setpoint)
@@ -318,7 +317,7 @@ class Scope(ExperimentView):
     ) -> None:
         """Set the region of the next scan, and with `shape` (rows, columns) its pixels; return when they are in force.
 
-        Both are set together: one after the other, they would form another frame in between, which may be refused.
+        Both are sent in one request: set one after the other, they could form a frame in between that is refused.
         """
         with self._call():
             until_s = self._link.until(timeout_s)
@@ -331,7 +330,7 @@ class Scope(ExperimentView):
             self._commands.in_control(ControlRequest.ACTION, name, self._link.until(timeout_s))
 
     def supports(self, action: str, *, timeout_s: float | None = ANSWER_S) -> bool:
-        """Return whether the microscope has an action of this name, such as "x-retract", without any effect.
+        """Return whether the microscope has an action, such as "x-retract", without starting the action.
 
         Call it before `action`, which raises Refused for an action that the microscope does not have.
         """
@@ -351,16 +350,15 @@ class Scope(ExperimentView):
     ) -> Iterator[None]:
         """Keep control over all calls in the block, after waiting for it.
 
-        Within the block control may still be lost: to a problem, or to MANUAL. The next call then waits until it is
-        back. If the problem to solve has been cleared meanwhile, the call raises ControlLost.
+        Within the block control may still be lost: to a problem, or to MANUAL. The next call then waits until control
+        is back. If the problem to solve has been cleared meanwhile, the call raises ControlLost.
 
         Args:
             solving: the flagged problem to solve, by name or number.
-            unbroken: all calls in the block belong together, as a pulse and the position that the probe was moved to.
-                After a
-                loss of control the next call in the block raises ControlLost, and nothing more is done: begin the block
-                again, since others may have changed anything. `action` raises NoResponse if the loss came before the
-                answer, so that its outcome is unknown. Inside another block, an unbroken block first waits for control.
+            unbroken: all calls in the block belong together, such as a move of the probe and a pulse there. After a
+                loss of control the next call raises ControlLost, and nothing more is done: begin the block again, since
+                others may have changed anything. `action` raises NoResponse if control was lost before the answer: its
+                outcome is unknown. Inside another block, an unbroken block first waits for control.
         """
         number = Problem.NONE if solving is None else self.problems.number(solving)
         with self._control.hold(solving=number, until_s=self._link.until(timeout_s), unbroken=unbroken):
@@ -405,7 +403,7 @@ class Scope(ExperimentView):
         self._ask_scheduler(RESTART_REQUEST, process)
 
     def approval_facts(self) -> Plain:
-        """Return the facts that an approval is valid for: run, limits, offset of the coordinates, and time."""
+        """Return the facts on which an approval depends: run, limits, offset of the coordinates, and time."""
         with self._call():
             response = self._link.request(CLOCK_REQUEST)
         if not response.ok:
@@ -414,7 +412,7 @@ class Scope(ExperimentView):
         return {name: facts.get(name) for name in ("run", "limits", "offset_m", "now_ns")}
 
     def approve(self, grant: Grant) -> None:
-        """Approve a plan of an agent, give it a grant, or revoke its approvals; needs the role `approve`."""
+        """Approve a plan of an agent, give the agent a grant, or revoke its approvals; needs the role `approve`."""
         self._ask_scheduler(GRANT_REQUEST, grant)
 
     def end_experiment(self) -> None:
@@ -424,11 +422,11 @@ class Scope(ExperimentView):
             self._ask_scheduler(ControlRequest.END_EXPERIMENT, None)
 
     def progress(self, done: int, of: int, *, left_s: float | None = None) -> None:
-        """Publish the progress of the component, for people who watch. Never waits.
+        """Publish the progress of the component, for display. Never waits.
 
         Args:
             done, of: number of finished parts, and of all parts.
-            left_s: experiment time that the rest will take; None: at the rate since the first call.
+            left_s: experiment time left; None: estimated from the rate since the first call.
         """
         now_ns = self._link.clock.now_ns()
         begun, begun_ns = self._begun = self._begun or (done, now_ns)
@@ -437,7 +435,7 @@ class Scope(ExperimentView):
         self._link.relay(Progress(now_ns, self._link.name, done, of, left_s))
 
     def note(self, text: str, *, scan: HasTime | None = None, time_ns: int | None = None) -> None:
-        """Write a remark into the record of the run: on a scan, on a moment, or on now. It needs no control.
+        """Write a remark into the record of the run: on a scan, or on a moment (default: now). Needs no control.
 
             scope.note("the tip changed here", scan=scans)
 
@@ -496,7 +494,7 @@ class Scope(ExperimentView):
         return self._control.tenures
 
     def give_back_inherited(self) -> None:
-        """Release control that an earlier life of this component held at its death. Called by the component's loop."""
+        """Release control that this component held before its restart. Called by the component's loop."""
         self._control.gives_back_inherited = True
         self._control.release_inherited()
 

@@ -22,10 +22,10 @@ class SweepPoint:
     """A point of a sweep and the scan or spectrum taken there.
 
     Attributes:
-        number: counts from 1, in the order of measurement.
+        number: number of the point, from 1, in the order of measurement.
         of: the number of points.
-        key: of the measurement; empty if the sweep has none.
-        values: by their parameters; numbers in SI, or in the unit that they were given in.
+        key: key of the measurement; empty if the sweep has no key.
+        values: value of each parameter; a number is in SI, or in the unit given.
     """
 
     number: int
@@ -36,24 +36,24 @@ class SweepPoint:
 
     @property
     def scans(self) -> ScanSet:
-        """All channels of the scan."""
+        """All channels of the scan taken at this point."""
         return self._result.scans
 
     @property
     def spectrum(self) -> Spectrum:
-        """The spectrum."""
+        """The spectrum taken at this point."""
         return self._result.spectrum
 
 
 class ParameterSweep:
-    """The measurement of a plan's points. Values before the first point are kept until they are in force again.
+    """A sweep in progress, which measures each point of a plan and then sets the parameters back.
 
-    A sweep with a key keeps them on disk: a component that is killed and started again goes on with the point after
-    the last, and sets the parameters back to what they were before its first life.
+    With a key the original values are saved on disk: after a restart of the component the sweep goes on with the next
+    point, and still sets the parameters back to the original values.
 
     Args:
-        target: of each measurement.
-        key: of the sweep; its measurements have keys "<key>-1", "<key>-2" …
+        target: scan or spectrum to take at each point.
+        key: key of the sweep; its measurements have the keys "<key>-1", "<key>-2" …
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class ParameterSweep:
         self._before = None if key is None else results.before_sweep(key)
 
     def points(self, done: int, until_s: float | None) -> Iterator[SweepPoint]:
-        """Measure and yield each point, but for the first `done`. Raises as a measurement."""
+        """Measure and yield each point, except the first `done`. Raises as `MeasurementRunner.take`."""
         for index, places in list(enumerate(self._plan.places()))[done:]:
             key = None if self._key is None else f"{self._key}-{index + 1}"
             target = replace(self._target, settings=self._plan.settings(places))
@@ -86,10 +86,10 @@ class ParameterSweep:
             yield SweepPoint(index + 1, self._plan.total, key or "", self._plan.values(places), result)
 
     def set_back(self, until_s: float | None) -> None:
-        """Set the parameters to their values before the sweep; what the microscope refuses is logged.
+        """Set the parameters to their values before the sweep; a value that the microscope refuses is logged.
 
         Raises:
-            ControlLost, NoResponse: not until `until_s`; another life, or another call, sets them back.
+            ControlLost, NoResponse: not done by `until_s`; a later call can still set them back, even after a restart.
         """
         if self._before is None:
             return
@@ -104,7 +104,7 @@ class ParameterSweep:
 
     @property
     def left_behind(self) -> str:
-        """The values before the sweep, for a person, where they are not in force again; else empty."""
+        """Parameter values from before the sweep that are not in force again, as text; empty if all are."""
         return ", ".join(map(_text, self._before or ()))
 
     def _read(self, until_s: float | None) -> list[Parameter]:

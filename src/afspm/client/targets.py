@@ -25,7 +25,7 @@ SHEARED = 0.1  # and its measured size and angle
 
 @dataclass(frozen=True)
 class ScanTarget:
-    """A scan to take. None: the present setting.
+    """A scan to take; None keeps the present setting.
 
     Attributes:
         shape: (rows, columns).
@@ -53,11 +53,11 @@ class ScanTarget:
         return ScanParameters(self.region, self.shape)
 
     def facts(self) -> Plain:
-        """Return the target in JSON's types, so that a later life of the component recognises it."""
+        """Return the target in JSON's types, so that the component recognises it after a restart."""
         return _facts(self)
 
     def fits(self, scan: Scan) -> bool:
-        """Return whether a scan can be the requested one."""
+        """Return whether shape and region of a scan match this target."""
         wanted = self.region
         if self.shape is not None and scan.shape != self.shape:
             return False
@@ -69,7 +69,7 @@ class ScanTarget:
         return is_near(wanted, scan.region, FITS)
 
     def name_of(self, scan: Scan) -> str:
-        """Return the channel: a result has each channel once."""
+        """Return the scan's channel, which is unique within a result."""
         return scan.channel
 
     def describe(self, scan: Scan) -> str:
@@ -80,7 +80,7 @@ class ScanTarget:
 
 @dataclass(frozen=True)
 class SpectrumTarget:
-    """A spectrum to take. None: the present kind or probe position; settings as of `ScanTarget`."""
+    """A spectrum to take; None keeps the present kind or position of the probe. `settings` as in `ScanTarget`."""
 
     at_m: XY | None
     kind: str | None
@@ -98,7 +98,7 @@ class SpectrumTarget:
         return cls(None if at_m is None else xy_of(at_m), kind, frame)
 
     def facts(self) -> Plain:
-        """Return the target in JSON's types, so that a later life of the component recognises it."""
+        """Return the target in JSON's types, so that the component recognises it after a restart."""
         return _facts(self)
 
     def fits(self, spectrum: Spectrum) -> bool:
@@ -110,7 +110,7 @@ class SpectrumTarget:
         return math.dist(self.at_m, spectrum.position_m) <= SPOT_M
 
     def name_of(self, spectrum: Spectrum) -> str:
-        """Return the same name for all: a result has only one spectrum."""
+        """Return an empty name, since a result has only one spectrum."""
         return ""
 
     def describe(self, spectrum: Spectrum) -> str:
@@ -129,7 +129,7 @@ def _facts(target: Target) -> Plain:
 
 
 def target_from(facts: Plain) -> Target:
-    """Return the target with these facts."""
+    """Return the target from its `facts()`."""
     kind = SpectrumTarget if facts["what"] == SpectrumTarget.what else ScanTarget
     target: Target = from_plain(kind, {name: value for name, value in facts.items() if name != "what"})
     return target

@@ -1,4 +1,4 @@
-"""Capabilities of a microscope, as far as they are known from its class, before it runs."""
+"""Capabilities of a microscope, as far as its class shows them before it runs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MicroscopeCapabilities:
-    """Generic names of actions, and of parameters with their SI unit (None: it depends on the operating mode).
+    """Actions and parameters of a microscope, by their generic names.
 
     Attributes:
-        sets: parameters set by an action that the experiment file adds, by its name.
-        table: its parameter table.
+        parameters: SI unit of each parameter; None: the unit depends on the operating mode.
+        sets: parameters that an action of the experiment file sets, by the action's name.
+        table: the microscope's parameter table.
     """
 
     actions: frozenset[str]
@@ -29,7 +30,7 @@ class MicroscopeCapabilities:
     table: ParameterTable
 
     def refuses(self, parameter: Parameter) -> str:
-        """Return why the microscope would refuse a value; empty if it would not, or has no such parameter."""
+        """Return why the microscope would refuse a value; empty for a valid value or an unknown parameter."""
         if parameter.name not in self.table or parameter.value is None:
             return ""
         try:
@@ -63,9 +64,7 @@ def _set_by(action: object, table: ParameterTable) -> tuple[Parameter, ...]:
 
 
 def base() -> dict[str, str | None]:
-    """Return the base parameters and afspm's extensions with their SI units, for a microscope with unknown
-    capabilities.
-    """
+    """Return the base parameters and afspm's extensions with SI units, for a microscope of unknown capabilities."""
     ours = {
         names.PULSE_VOLTAGE: "V",
         names.PULSE_DURATION: "s",

@@ -1,4 +1,4 @@
-"""From `class = "module.Name"` to the class: imported only when an experiment is checked or started."""
+"""Import of the classes that an experiment file names as `class = "module.Name"`, when it is checked or started."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _ROLE_BY_BASE = (
 
 @dataclass(frozen=True)
 class ComponentDeclaration:
-    """Declarations in class attributes of a component (of a command: in its table)."""
+    """Declarations of a component: from its class attributes, or for a command from its table in the file."""
 
     solves: tuple[str, ...] = ()
     flags: tuple[str, ...] = ()
@@ -54,7 +54,7 @@ class ComponentDeclaration:
 
 
 class Unloadable(Exception):
-    """The error that a class can't be loaded; message and hint are for the user."""
+    """An error in loading a class, with a message and a hint for the user."""
 
     def __init__(self, what: str, hint: str = "") -> None:
         super().__init__(what)
@@ -128,7 +128,7 @@ def load(path: str) -> Any:
 
 
 def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
-    """Return the spec of a module, which may lie beside the file; None if there is none."""
+    """Return the spec of a module, installed or in one of the folders; None if not found."""
     with importing_from(folders):
         try:
             return importlib.util.find_spec(name)
@@ -137,7 +137,7 @@ def find_module(name: str, folders: Sequence[Path]) -> ModuleSpec | None:
 
 
 def role_of(component: type) -> Role | None:
-    """Return the role of a class by its bases or its attribute `role`; None if it has none."""
+    """Return the role of a class, by its bases or its attribute `role`; None if the class has no role."""
     for base in component.__mro__:
         for package, role in _ROLE_BY_BASE:
             if base.__module__ == package or base.__module__.startswith(package + "."):

@@ -1,4 +1,4 @@
-"""[conditions]: the values of other instruments that measuring needs.
+"""[conditions]: values of other instruments that are required for measurements.
 
 The conditions are enforced by `scheduler.instruments`.
 
@@ -32,10 +32,10 @@ _OF_BAND: Final = (*_BOUNDS, "for")
 
 @dataclass(frozen=True)
 class ConditionsReader:
-    """Reads the section.
+    """A reader of the section [conditions].
 
     Args:
-        instruments: the components that are instruments, each with its parameters.
+        instruments: parameters of each component that is an instrument.
         actions: known actions; None if they can't be known before the microscope runs.
     """
 
@@ -45,7 +45,7 @@ class ConditionsReader:
     problems: ProblemNames
 
     def read(self, table: Table) -> InstrumentSettings:
-        """Return the settings; errors are reported, and the entries left out."""
+        """Return the settings; report errors, and leave faulty entries out."""
         for instrument, parameters in self.instruments.items():
             for one in parameters:
                 if instrument_of(one) != instrument:

@@ -19,8 +19,8 @@ class Document:
     """Merged tables, and the place where each key was last set.
 
     Attributes:
-        homes: folders for relative file names and modules; empty: those of the files. (An expanded file lies in the run
-            folder, but names files beside the original.)
+        homes: folders for relative file names and modules; empty: the folders of the files. (An expanded file lies in
+            the run folder, but names files beside the original.)
         is_whole: whether all files could be read.
         findings: errors and warnings so far.
     """
@@ -39,7 +39,7 @@ class Document:
         self.findings.warning(what, self.place(*path), hint)
 
     def place(self, *path: str | int) -> SourceLocation:
-        """Return where `path` is set: its own line, or the line of the innermost table around it."""
+        """Return the file and line that set `path`, or the line of the innermost table around `path`."""
         for depth in range(len(path), 0, -1):
             found = self.places.get(path[:depth])
             if found is not None:
@@ -47,12 +47,12 @@ class Document:
         return SourceLocation(str(self.files[0]))
 
     def folder_of(self, *path: str | int) -> Path:
-        """Return the folder of the file that sets `path`: relative file names start there."""
+        """Return the folder of the file that sets `path`: the start of relative file names."""
         return self.homes[0] if self.homes else Path(self.place(*path).file).resolve().parent
 
     @property
     def folders(self) -> list[Path]:
-        """Folders of the files, the first file's first; modules are found there."""
+        """Folders of the files, in order, in which modules are found."""
         return list(self.homes or dict.fromkeys(file.resolve().parent for file in self.files))
 
 

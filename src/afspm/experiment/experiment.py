@@ -36,7 +36,7 @@ class Experiment:
 
     @property
     def name(self) -> str:
-        """The variable `name`, else the folder of an `experiment.toml`, else the file's own name."""
+        """Name of the experiment: the variable `name`, else the folder of `experiment.toml`, else the file's name."""
         named = self.parts.variables.get("name")
         file = self._document.files[0].resolve()
         return (
@@ -50,22 +50,22 @@ class Experiment:
 
     @property
     def folder(self) -> Path:
-        """Folder of the first file, absolute: relative paths in it start there."""
+        """Folder of the first file, absolute: the start of relative paths in that file."""
         return self._document.folders[0]
 
     @property
     def folders(self) -> list[Path]:
-        """Folders of all files, absolute; modules in them are found."""
+        """Folders of all files, absolute, in which modules are found."""
         return self._document.folders
 
     @property
     def files(self) -> list[Path]:
-        """Files of the experiment, absolute; each overrides those before it."""
+        """Files of the experiment, absolute; each file overrides the earlier files."""
         return [file.resolve() for file in self._document.files]
 
     @property
     def component_names(self) -> list[str]:
-        """Names of all processes, in the order of the file: also translator, scheduler and recorder."""
+        """Names of all processes, in the order of the file, including translator, scheduler and recorder."""
         self.resolved  # noqa: B018  (adds the implied parts)
         return [part.name for part in self.parts.components]
 
@@ -76,7 +76,7 @@ class Experiment:
 
     @property
     def recorders(self) -> list[str]:
-        """Names of the recorders; by default there is one."""
+        """Names of the recorders, by default one."""
         return self.resolved.declaring(RECORDS)
 
     def check(self, only: Collection[str] = (), without: Collection[str] = ()) -> list[Finding]:
@@ -125,9 +125,9 @@ class Experiment:
         """Return the processes to start: translator and scheduler first.
 
         Args:
-            take_address: returns a free loopback address for each that the file leaves open.
-            only: names of processes to start here (empty: all). Addresses between them and the others must be in the
-                file, since the others could not know one that is chosen here.
+            take_address: returns a free loopback address, for each socket that has no address in the file.
+            only: names of processes to start here (empty: all). Addresses between these and other processes must be in
+                the file, since processes elsewhere can't know an address chosen here.
             without: names of processes not to start here.
             simulated: whether the microscope is known to be simulated although its translator is not started here.
 
@@ -201,7 +201,7 @@ def load_expanded(path: Path, homes: Sequence[Path], *overlays: Path) -> Experim
     """Read the expanded experiment file of a run, and merge overlays into it.
 
     Args:
-        homes: folders of the files that it was made of (`Experiment.folders`).
+        homes: folders of the original files (`Experiment.folders`).
     """
     return Experiment(documents.read([path, *overlays], homes))
 

@@ -46,7 +46,7 @@ class Finding:
 
 @dataclass
 class Findings:
-    """A collection of findings, so that one check reports them all."""
+    """A collection of the findings of one check."""
 
     found: list[Finding] = field(default_factory=list)
 

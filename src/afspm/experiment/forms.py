@@ -1,4 +1,4 @@
-"""Other forms of experiment files, which plug-ins convert into afspm's."""
+"""Other forms of experiment files, which plug-ins convert into afspm's form."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class FileForm(Converter, Protocol):
     """A form of experiment files, declared as an entry point of the group `afspm.forms`."""
 
     def explained(self, resolved: ResolvedExperiment) -> list[tuple[SourceLocation, str, str]]:
-        """Return, for each line of the file, its place, the setting, and the setting's equivalent here."""
+        """Return place, setting and afspm's equivalent of the setting, for each line of the file."""
 
     def short(self, resolved: ResolvedExperiment) -> str:
         """Return the experiment as a file in afspm's form."""

@@ -1,7 +1,7 @@
-"""Picture of an experiment: the scheduler as a bar, its translator below it, the components above.
+"""Picture of an experiment: the scheduler as a bar, the translator below, the components above.
 
-Every component has a column: envelopes go up to it from the bar, its requests go down. Envelopes between components run
-in lanes above them. No two lines share a path, so each can be followed.
+Every component has a column: envelopes go up from the bar to the component, requests go down. Envelopes between
+components run in lanes above the components. No two lines share a path, so each can be followed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BAR_HEIGHT, ARROW_AT, MOST_LABELS = 62.0, 16.0, 7
 
 @dataclass
 class ProcessBox:
-    """One process and its column. Widths are set first, then places."""
+    """The drawn box of one process, and its column. Widths are set first, then places."""
 
     part: ExperimentPart
     lines: list[tuple[str, str]]
@@ -56,7 +56,7 @@ class ProcessBox:
 
     @property
     def arrows_at(self) -> float:
-        """Offset of the midpoint between the two arrows from the middle of the box: labels differ in length."""
+        """Offset of the two arrows' midpoint from the middle of the box, since their labels differ in length."""
         left, right = self._sides
         most = self.width / 2 - ARROW_AT - 12
         return max(-most, min(most, (left - right) / 2))
@@ -73,7 +73,7 @@ class ProcessBox:
 
 @dataclass(frozen=True)
 class PublisherLane:
-    """Envelopes that one component publishes to others."""
+    """The drawn lane of the envelopes from one component to other components."""
 
     publisher: ProcessBox
     listeners: tuple[ProcessBox, ...]

@@ -23,7 +23,7 @@ RECORDS, NOTIFIES = "records", "notifies"
 
 
 def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the recorder of [record]; None if it is off, the file lists one, or there is no scheduler."""
+    """Return the recorder of [record]; None if switched off, in the file already, or without a scheduler."""
     section = resolved.sections.record
     if not section.on or resolved.declaring(RECORDS) or not resolved.with_role(Role.SCHEDULER):
         return None
@@ -31,7 +31,7 @@ def recorder(resolved: ResolvedExperiment) -> ExperimentPart | None:
 
 
 def notifier(resolved: ResolvedExperiment) -> ExperimentPart | None:
-    """Return the notifier of [notify]; None if it sends nothing during the experiment, or the file lists one."""
+    """Return the notifier of [notify]; None if nothing is sent during the experiment, or the file has a notifier."""
     section = resolved.sections.notify
     occasions = (set(OCCASIONS) - {END}) & set(section.on)
     is_wanted = (section.command or section.webhook) and occasions
@@ -75,5 +75,5 @@ def check_notify(resolved: ResolvedExperiment) -> None:
 
 
 def is_program(name: str, folder: Path) -> bool:
-    """Return whether a command may begin with this: "python", an installed program, or a file in `folder`."""
+    """Return whether `name` can be run: "python", an installed program, or a file in `folder`."""
     return name == "python" or shutil.which(name) is not None or (folder / name).is_file()

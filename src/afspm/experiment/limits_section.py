@@ -1,4 +1,4 @@
-"""[limits]: which parameters may be set, how far, how fast, where and by what component.
+"""[limits]: bounds on parameters, actions and scan regions, and the components that may use them.
 
 The limits are enforced by `scheduler.safety.limits`.
 
@@ -70,7 +70,7 @@ class LimitsSection(Section):
 
 
 class RoleSection(Section):
-    """A table of [limits.roles]: further limits of a component, or of a person or agent that acts through it."""
+    """A table of [limits.roles]: further limits of a component, or of a person or agent that uses the component."""
 
     region: RegionSection | None = None
     actions: tuple[str, ...] | None = None
@@ -86,11 +86,11 @@ class LimitsReader:
     """A reader of the section [limits] for a microscope's capabilities.
 
     Args:
-        parameters: known generic names with their SI units (None: it depends on the operating mode).
+        parameters: SI units of the known parameters, by generic name; None: depends on the operating mode.
         actions: known actions; None if they can't be known before the microscope runs.
-        sets: parameters that an action sets, by its name.
-        instruments: the parameters of each other instrument; their units are known only when it runs.
-        certain: whether these are all parameters, or only the base parameters and afspm's extensions.
+        sets: parameters that an action sets, by the action's name.
+        certain: whether `parameters` has all parameters, or only the base parameters and afspm's extensions.
+        instruments: parameters of each other instrument, whose units are known only when the instrument runs.
     """
 
     document: Document
@@ -106,7 +106,7 @@ class LimitsReader:
         return frozenset((*names.BASE_ACTIONS, *names.EXTENSION_ACTIONS)) if self.actions is None else self.actions
 
     def read(self, table: Table) -> ExperimentLimits:
-        """Return the limits; errors are reported, and the entries left out."""
+        """Return the limits; report errors, and leave faulty entries out."""
         own = {key: value for key, value in table.items() if key in LimitsSection.model_fields}
         whole = parse(LimitsSection, "limits", own, self.document)
         parameters = {key: value for key, value in table.items() if key not in _OWN}

@@ -24,7 +24,7 @@ OWN_KEYS: Final = frozenset(
 SIMULATED = "simulated"
 """Marks a simulated microscope: an attribute of its class, or a key in the table of a command."""
 EMULATED = "emulated"
-"""Class attribute that marks an emulated controller; the translator talks to it."""
+"""Class attribute that marks an emulated controller, to which the translator connects."""
 # a command declares in its table what a class declares by attributes
 DECLARED_KEYS: Final = ("solves", "flags", "publishes", "listens", "needs_actions", "needs_parameters")
 
@@ -38,8 +38,7 @@ class ExperimentPart:
         command: program and arguments; empty for a Python class.
         settings: arguments of the constructor, still with units.
         own: the table's keys that belong to afspm (wiring, envelopes, role …).
-        implied: whether the process is part of every experiment instead of the file; it runs on the scheduler's
-            computer.
+        implied: whether afspm adds the process to every experiment; it then runs on the scheduler's computer.
     """
 
     name: str
@@ -53,7 +52,7 @@ class ExperimentPart:
 
 @dataclass
 class ExperimentParts:
-    """The file, sorted and expanded."""
+    """The tables of an experiment file, sorted by kind, with references replaced."""
 
     variables: Settings = field(default_factory=dict)
     sections: dict[str, Settings] = field(default_factory=dict)
@@ -65,7 +64,7 @@ class ExperimentParts:
     """Tables of components without equivalent, by name, unchanged."""
 
     def free_name(self, wanted: str) -> str:
-        """Return a name for a component that is not in the file: `wanted`, with a number if that is taken."""
+        """Return a name that is not in the file: `wanted`, with a number if that name is taken."""
         taken = {part.name.casefold() for part in self.components}
         taken |= {name.casefold() for name in (*self.variables, *self.intermediaries)}
         names = itertools.chain([wanted], (f"{wanted}{number}" for number in itertools.count(2)))
@@ -76,7 +75,7 @@ class Converter(Protocol):
     """A converter of components from another form of files."""
 
     def convert(self, tables: dict[str, Settings], parts: ExperimentParts, document: Document) -> dict[str, Settings]:
-        """Return the components in afspm's form, by name; components already in it are returned unchanged.
+        """Return the components in afspm's form, by name; components already in this form are returned unchanged.
 
         Args:
             tables: components with their references replaced.
@@ -85,7 +84,7 @@ class Converter(Protocol):
 
 
 def sort(document: Document, converters: Iterable[Converter] = ()) -> ExperimentParts:
-    """Sort the tables and expand references; report tables that can't be part of an experiment."""
+    """Sort the tables of a file, and expand references; report tables that can't be part of an experiment."""
     parts = ExperimentParts()
     raw_components: dict[str, Settings] = {}
     for key, value in document.data.items():
@@ -175,13 +174,13 @@ def _report_unused(parts: ExperimentParts, used: set[str], document: Document) -
 
 
 class VariableReferences:
-    """The replacement of references: a text that equals a top-level key stands for that key's value, as in the paper.
+    """A replacer of references: a text that equals a top-level key stands for that key's value, as in the paper.
 
-    Only whole texts count, and only keys of variables and intermediary tables. Components and sections are no values,
-    so a component can be named (in a role, in a limit) without its table being pasted in.
+    Only whole texts count, and only keys of variables and intermediary tables. Names of components and sections are not
+    replaced, so that roles and limits can name a component.
 
     Attributes:
-        used: keys that were referred to.
+        used: keys that were replaced.
     """
 
     def __init__(self, document: Document, variables: Table) -> None:
@@ -190,7 +189,7 @@ class VariableReferences:
         self.used: set[str] = set()
 
     def expand(self, value: object, path: Path) -> Any:
-        """Return `value`, set at `path`, with all references in it replaced, also within replacements."""
+        """Return `value`, set at `path`, with all its references replaced, also within replacements."""
         return self._expand(value, path, ())
 
     def _expand(self, value: object, path: Path, through: tuple[str, ...]) -> object:

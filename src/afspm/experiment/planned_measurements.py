@@ -1,4 +1,4 @@
-"""The plan of a component, as far as its settings fix it. The component is constructed, never started."""
+"""The plan of a component, as far as its settings define it. The component is constructed, never started."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 
 @dataclass(frozen=True)
 class PlannedMeasurements:
-    """Measurements of a plan, and the capabilities that it needs.
+    """Measurements of a component's plan, and the actions and parameters needed for them.
 
     Attributes:
         drift_doubts: warnings for an experiment that corrects drift; `where` names the setting.
         parameters: values to set, by the setting that gives them: {"zoom_parameters": (Parameter("scan-speed", …),)}.
-        period_s: between the starts of two rounds; 0: no pause.
-        scan_speed_m_s: of a microscope that knows the speed of its first scan.
-        is_listed: whether the file lists the regions, each at a place of its own.
+        period_s: time between the starts of two rounds; 0: no pause.
+        scan_speed_m_s: speed of the first scan, if the component is a microscope that defines the speed.
+        is_listed: whether the file lists each region, so that an error has a line.
         work: returns the work at a scan speed; see `Component.planned_work`.
     """
 
@@ -45,11 +45,11 @@ class PlannedMeasurements:
     work: Callable[[float | None], PlannedWork | None] | None = None
 
     def sets(self, name: str) -> bool:
-        """Return whether the file sets this parameter."""
+        """Return whether the plan sets this parameter."""
         return any(one.name == name for parameters in self.parameters.values() for one in parameters)
 
     def frame(self) -> Iterator[Parameter]:
-        """Yield the parameters that its scans set: sizes, places and pixels."""
+        """Yield the parameters that the planned scans set: sizes, positions and pixels."""
         for region in self.regions:
             sides = zip((names.SCAN_SIZE_X, names.SCAN_SIZE_Y), region.size_m, strict=True)
             corner = zip((names.SCAN_TOP_LEFT_X, names.SCAN_TOP_LEFT_Y), region.top_left_m, strict=True)
@@ -62,7 +62,7 @@ class PlannedMeasurements:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Reason why the limits refuse a part of a plan.
+    """The reason why the limits refuse a part of a plan.
 
     Attributes:
         where: path of the setting; empty if several are concerned.
@@ -74,7 +74,7 @@ class Refusal:
 
 
 def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
-    """Return the plan of a component with these settings; None if it has none, or none that can be known.
+    """Return the plan of a component with these settings; None if there is no plan, or it can't be known.
 
     Only classes declared by entry points, and classes derived from them, are constructed: their `__init__` only stores
     and checks settings.
@@ -108,7 +108,7 @@ def plan_of(component: type, settings: Table) -> PlannedMeasurements | None:
 
 
 _PARAMETERS = ("parameters", "zoom_parameters", "initial")
-"""Attributes of components with parameters to set, named as the settings."""
+"""Attributes of components that hold parameters to set; settings have the same names."""
 
 
 def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
@@ -117,7 +117,7 @@ def _as_parameters(values: Mapping[str, object]) -> tuple[Parameter, ...]:
 
 
 def refusals(name: str, planned: PlannedMeasurements, limits: ExperimentLimits) -> list[Refusal]:
-    """Return why the limits would refuse the plan; each reason once."""
+    """Return the reasons why the limits would refuse the plan, each once."""
     # steps and rates depend on the value before, which is unknown here
     guard = LimitChecker(_without_changes(limits))
     found: dict[str, Refusal] = {}
@@ -219,10 +219,10 @@ def _shift_m(points: Iterable[XY], allowed: Region, margin: float) -> XY | None:
 
 
 def too_slow(planned: PlannedMeasurements, usual_m_s: float | None) -> str:
-    """Return a text if a round takes longer than its period; empty if it does not, or its speed is unknown.
+    """Return a warning if a round of scans takes longer than its period; empty if not, or at unknown speed.
 
     Args:
-        usual_m_s: scan speed where the plan sets none.
+        usual_m_s: scan speed if the plan sets no speed.
     """
     speeds = [one for one in planned.parameters.get("parameters", ()) if one.name == names.SCAN_SPEED]
     speed_m_s = si(f"{speeds[0].value} {speeds[0].unit or 'm/s'}", "m/s") if speeds else usual_m_s

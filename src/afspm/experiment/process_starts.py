@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from afspm.experiment.resolved_experiment import ResolvedExperiment, ResolvedProcess
 
 DASHBOARD = "dashboard"
-TERMINAL = "terminal"
-"""The name of commands such as `afspm approve`."""
 """Name under which `afspm dashboard` joins a run."""
+TERMINAL = "terminal"
+"""Name under which commands such as `afspm approve` join a run."""
 DASHBOARD_PASSWORD = "AFSPM_DASHBOARD_PASSWORD"
 """Environment variable that only dashboards get."""
 # each connects to a socket that the process before it binds
@@ -39,14 +39,14 @@ class ProcessStart:
     """One process to start.
 
     Attributes:
-        launch: line for its standard input; the supervisor adds heartbeat, log, clock and folders unless they were
-            given to `Experiment.launches`.
+        launch: line for its standard input; the supervisor adds heartbeat, log, clock and folders, unless
+            `Experiment.launches` has filled them in.
         command: program and arguments; empty: the Python host runs `launch.class_`.
         folder: working directory of commands: the experiment file's folder.
-        beats: whether it sends heartbeats; without them (`heartbeats = false`) only its exit shows that it is dead.
+        beats: whether it sends heartbeats; without (`heartbeats = false`) only an exit shows that a process is dead.
         python_path: folders to put before PYTHONPATH, so that modules beside the file are found.
         leaves_last: whether it stays until the other components have ended, to record their last packets.
-        acts: whether it follows a plan of its own, as a series does, or that is unknown; the others react.
+        acts: whether it follows a plan of its own, as a series does (True if unknown), or only reacts.
         hidden: environment variables that hold secrets of other processes.
     """
 
@@ -64,7 +64,7 @@ class ProcessStart:
 def starts(
     resolved: ResolvedExperiment, take_address: Callable[[], str], only: Collection[str], without: Collection[str]
 ) -> list[ProcessStart]:
-    """Return the chosen processes, translator and scheduler first; clock and folders are added later."""
+    """Return the processes to start here, translator and scheduler first; clock and folders are added later."""
     implied = {name for name, process in resolved.processes.items() if process.part.implied}
     chosen = chosen_names(resolved, only, without)
     if any(scheduler.name in chosen for scheduler in resolved.with_role(Role.SCHEDULER)):
@@ -106,7 +106,7 @@ def chosen_names(resolved: ResolvedExperiment, only: Collection[str], without: C
 def ends_idle(resolved: ResolvedExperiment, names: Collection[str]) -> bool:
     """Return whether a run of these processes ends once no process with a plan is left.
 
-    Only if all processes with plans, and the scheduler, are started here: plans on other computers may go on.
+    True only if all processes with plans, and the scheduler, are started here: plans elsewhere may go on.
     """
     acting = {name for name, process in resolved.processes.items() if process.role is Role.COMPONENT and process.acts}
     schedulers = {scheduler.name for scheduler in resolved.with_role(Role.SCHEDULER)}
@@ -228,7 +228,7 @@ def _variable_name(secret: object) -> list[str]:
 def asking(resolved: ResolvedExperiment, names: Collection[str]) -> Launch | None:
     """Return a launch line for requests to a scheduler elsewhere, in the name of the first of `names`.
 
-    None if its address is not in the file, or it is written in another language and may not know these requests.
+    None if the file lacks the scheduler's address, or the scheduler is a command, which may not know these requests.
     """
     scheduler = next(iter(resolved.with_role(Role.SCHEDULER)), None)
     if scheduler is None or scheduler.part.command:

@@ -42,13 +42,13 @@ _EXAMPLE_HEADERS = (
         if one.kind is wire.MessageKind.STATE and one.source is Role.TRANSLATOR
     ),
 )
-"""Headers for a trial of the user's mapping."""
+"""Packet headers for a trial of the user's mapping from packets to envelopes."""
 DRIFT = "DriftMapping"
-"""Envelope that a scheduler publishes if it corrects drift."""
+"""Envelope that a drift-correcting scheduler publishes."""
 
 
 def resolve(parts: ExperimentParts, document: Document) -> ResolvedExperiment:
-    """Resolve the experiment; errors are reported, and the faulty parts left out."""
+    """Resolve the experiment; report errors, and leave faulty parts out."""
     resolved = ResolvedExperiment(
         parts=parts,
         document=document,

@@ -1,4 +1,4 @@
-"""The resolved experiment: all that is known of it before it starts."""
+"""The resolved experiment: all facts about an experiment that are known before its start."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ from afspm.scheduler.safety.limits import ExperimentLimits
 
 @dataclass
 class ResolvedProcess:
-    """One process, resolved.
+    """One process, with its class loaded and its settings checked.
 
     Attributes:
         component: its class, loaded from `class_path`; None and empty for a command, or a class that can't be loaded.
         settings: arguments of its constructor: in SI, of JSON's types.
-        wrong: settings that were refused; None if all are right.
+        wrong: settings with errors; None if there are no errors.
     """
 
     part: ExperimentPart
@@ -47,7 +47,7 @@ class ResolvedProcess:
 
     @property
     def acts(self) -> bool:
-        """Whether it follows a plan of its own, like a script that solves no problems; True for a command (unknown)."""
+        """Whether the process follows a plan of its own: a script that solves no problems, or a command (unknown)."""
         if self.component is None or not issubclass(self.component, Component):
             return self.component is None
         return self.component.run is not Component.run and not self.declared.solves
@@ -58,12 +58,12 @@ class ResolvedProcess:
 
     @property
     def is_microscope(self) -> bool:
-        """Whether it is a simulated microscope, by its class (of a command: by its table)."""
+        """Whether the process is a simulated microscope, by its class, or for a command by its table."""
         return self.part.own.get(SIMULATED) is True if self.part.command else self.declares(SIMULATED)
 
     @property
     def envelopes(self) -> tuple[str, ...] | None:
-        """Prefixes that it subscribes to: those of the file, else those of its class; None: all."""
+        """Prefixes of the envelopes to subscribe to, from the file or else from the class; None: all."""
         wanted = self.part.own.get("envelopes", self.wires.envelopes)
         if wanted is None:
             return self.declared.listens
@@ -76,12 +76,12 @@ class ResolvedProcess:
 
 @dataclass
 class ResolvedExperiment:
-    """An experiment, resolved.
+    """An experiment, with classes loaded, settings checked and sockets connected.
 
     Attributes:
-        processes: by name, in the order of the file.
+        processes: processes by name, in the order of the file.
         listening: sockets that components bind by settings of their own, beside the wiring.
-        plans: by component, as far as its settings fix them.
+        plans: plan of each component, as far as its settings define one.
     """
 
     parts: ExperimentParts
@@ -117,12 +117,12 @@ class ResolvedExperiment:
         return [process for process in self.processes.values() if process.role is role]
 
     def declaring(self, attribute: str) -> list[str]:
-        """Return the names of the processes with a flag of their class that is true."""
+        """Return the names of the processes whose class has the flag `attribute` set to True."""
         return [name for name, process in self.processes.items() if process.declares(attribute)]
 
     @property
     def instruments(self) -> dict[str, tuple[str, ...]]:
-        """The parameters of each instrument, by component: those with its name and a dot before."""
+        """Parameters of each instrument, by component."""
         found = {}
         for name in self.declaring("is_instrument"):
             given = self.processes[name].settings.get("parameters")
@@ -143,7 +143,7 @@ class ResolvedExperiment:
     def simulated_with(self, started: Collection[str]) -> bool:
         """Return whether the microscope is certain to be simulated, if these processes are started together.
 
-        Either the translator is the microscope itself, or it is wired to an emulator that is started with it.
+        Either the translator is the microscope itself, or it is wired to an emulator that is started as well.
         """
         translators = self.with_role(Role.TRANSLATOR)
         return bool(translators) and all(
@@ -151,9 +151,9 @@ class ResolvedExperiment:
         )
 
     def controller_of(self, translator: str, started: Collection[str]) -> str:
-        """Return the name of the emulator that a translator is wired to; empty if none is started with it.
+        """Return the name of the emulator that a translator is wired to; empty if no emulator is started as well.
 
-        Always empty for a translator written in another language: nothing proves which controller it talks to.
+        Always empty for a translator written in another language: nothing proves to which controller it connects.
         """
         process = self.processes[translator]
         if process.is_microscope or process.part.command or translator not in started:

@@ -40,7 +40,7 @@ Orcid = Annotated[str, pydantic.AfterValidator(_checked_orcid)]
 
 
 class Section(pydantic.BaseModel):
-    """Base class: unknown keys are errors."""
+    """Base class of the file's sections: unknown keys are errors."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
 
@@ -54,14 +54,14 @@ class ClockSection(Section):
 
 
 class SecuritySection(Section):
-    """[security]: the folder of CURVE keys, or consent to run without."""
+    """[security]: the folder of CURVE keys, or consent to run without keys."""
 
     keys: str | None = None
     plain: StrictBool = False
     """Programs without keys may join through a bridge, which opens plain sockets; all other sockets stay private."""
     insecure: StrictBool = False
     tcp: StrictBool = False
-    """Use no unix sockets, for programs whose library has none. Every socket then has keys."""
+    """Use TCP only, for programs whose library lacks unix sockets. Every socket then has keys."""
 
     @property
     def are_sockets_private(self) -> bool:
@@ -85,20 +85,20 @@ class RestartSection(Section):
 
 
 class RecordSection(Section):
-    """[record]: contents of the record of a run, beside files that components write."""
+    """[record]: contents of the record of a run, in addition to files that components write."""
 
     on: StrictBool = True
     scans: StrictBool = True
-    """Scans and spectra, too, each as a file."""
+    """Whether scans and spectra are recorded, too, each as a file."""
     requests: StrictBool = False
-    """Inputs and requests of each component and of the scheduler, for `afspm what-if`."""
+    """Whether inputs and requests of components and scheduler are recorded, too, for `afspm what-if`."""
 
 
 class MetadataSection(Section):
     """[metadata]: entries written into every file of the run; None: unknown."""
 
     technique: Literal["STM", "STS", "AFM"] | None = None
-    """STM, STS or AFM; filled in by the class of a microscope that has only one."""
+    """STM, STS or AFM; filled in by the class of a microscope with one technique."""
     sample: str | None = None
     person: str | None = None
     orcid: Orcid | None = None
@@ -149,7 +149,7 @@ S = TypeVar("S")
 
 
 def parse(kind: type[S], name: str, table: Settings, document: Document) -> S:
-    """Return the section `[name]`, a model or a dataclass. Report errors, and return the defaults then."""
+    """Return the section `[name]`, a model or a dataclass; after errors, report them and return the defaults."""
     try:
         return pydantic.TypeAdapter(kind).validate_python(table)
     except pydantic.ValidationError as error:

@@ -42,7 +42,7 @@ def check(
 
     Args:
         given: parameters that the table must not set.
-        wrong: names of settings with errors are added to it.
+        wrong: set to which the names of settings with errors are added.
     """
     everything = _parameters(component)
     parameters = {name: p for name, p in everything.items() if p.kind not in _KINDS_WITHOUT_NAME and name not in given}
@@ -81,7 +81,7 @@ def _replaced_class_hint(path: tuple[str, ...], name: str, document: Document) -
 
 
 def default_of(component: type, name: str) -> Any:
-    """Return the default of a setting; None if it has none."""
+    """Return the default of a setting; None if there is no default."""
     parameter = _parameters(component).get(name)
     return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
 

@@ -182,9 +182,7 @@ def check_listens_to(resolved: ResolvedExperiment) -> None:
 
 
 def check_problems(resolved: ResolvedExperiment) -> None:
-    """Require that problems exist, and that each flagged one is solved by a component or a person, or ends the
-    experiment.
-    """
+    """Require that all problems exist, and that each problem that is flagged is also solved, or ends the experiment."""
     control = resolved.sections.control
     by_hand = (*control.solved_by_hand, *control.end_on)
     solvers = (problem for process in resolved.processes.values() for problem in process.declared.solves)
@@ -249,7 +247,7 @@ def _is_published(prefix: str, published: set[str], made: Collection[str]) -> bo
 
 
 def check_controller(resolved: ResolvedExperiment) -> None:
-    """Allow one emulated controller, and no other address for its translator."""
+    """Refuse a second emulated controller; warn of a translator's address that an emulated controller overrides."""
     for name in resolved.emulators[1:]:
         what = f"[{name}] is a second emulated controller beside [{resolved.emulators[0]}]"
         resolved.document.error(what, name, hint="one is enough")
@@ -274,7 +272,7 @@ def check_clock(resolved: ResolvedExperiment) -> None:
 
 
 def check_names_of_people(resolved: ResolvedExperiment) -> None:
-    """Require that roles name components, or people who have a key."""
+    """Require that roles name components, or people with a key."""
     names, keys, security = set(resolved.processes), resolved.keys_folder, resolved.sections.security
     if keys is not None:
         names |= {file.stem for file in (keys / "public").glob("*.key")}

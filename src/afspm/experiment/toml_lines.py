@@ -38,7 +38,7 @@ def locate(text: str) -> dict[Path, int]:
 
 
 class _Scanner:
-    """A scanner of a text that `tomllib` has accepted, so that it need not detect errors."""
+    """A scanner without error checks, for a text that `tomllib` has accepted."""
 
     def __init__(self, text: str) -> None:
         self.lines: dict[Path, int] = {}

@@ -1,4 +1,4 @@
-"""The experiment as one TOML text: references replaced and defaults filled in."""
+"""Output of an experiment as one TOML text, with references replaced and defaults filled in."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from afspm.model import Role
 
 
 def trace_overlay(experiment: ResolvedExperiment, folder: Path) -> Path | None:
-    """Write an overlay into `folder` that switches the trace on; None if no translator talks to a controller."""
+    """Write an overlay into `folder` that switches the trace on; None if no translator can trace a controller."""
     for translator in experiment.with_role(Role.TRANSLATOR):
         if translator.component is not None and default_of(translator.component, "trace") is not None:
             overlay = folder / "trace.toml"

@@ -1,4 +1,4 @@
-"""Errors of pydantic, reworded for an experiment file: one sentence for each wrong value."""
+"""Errors of pydantic in the words of an experiment file: one sentence for each wrong value."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _WANTED: Final = {
     "less_than": "below {lt:g}",
     "less_than_equal": "at most {le:g}",
 }
-"""Expected values, by pydantic's types of errors."""
+"""Descriptions of the expected value, by pydantic's types of errors."""
 
 
 def report(
@@ -48,10 +48,10 @@ def report(
     document: Document,
     known: Callable[[SettingPath], Iterable[str]] = lambda place: (),
 ) -> None:
-    """Report the errors of the value given at `path` of the document, one for each place within it.
+    """Report pydantic's errors about the value at `path` of the document, one for each place.
 
     Args:
-        known: returns the valid names for the place of an unknown one.
+        known: returns the valid names of settings at a place.
     """
     by_place: dict[SettingPath, list[ErrorDetails]] = {}
     for one in error.errors(include_url=False):
@@ -65,7 +65,7 @@ def report(
 
 
 def name_of(path: SettingPath) -> str:
-    """Return ("limits", "a", 0) as "[limits] a[0]"."""
+    """Return a setting's path as text: ("limits", "a", 0) as "[limits] a[0]"."""
     text = ""
     for part in path[1:]:
         text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)

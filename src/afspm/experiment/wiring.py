@@ -1,7 +1,7 @@
 """Sockets that each process binds or connects to; the file may leave addresses open.
 
-Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's, every
-component to the scheduler's. A component that publishes binds a publisher, to which its listeners connect.
+Translator and scheduler each bind a publisher and a control server. The scheduler connects to the translator's sockets,
+every component to the scheduler's. A component that publishes binds a publisher, to which its listeners connect.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from afspm.model import Role
 
 
 def read_wires(part: ExperimentPart, document: Document) -> WiringKeys:
-    """Return the wiring keys of a component as addresses; report wrong ones."""
+    """Return the wiring keys of a component as addresses; report wrong keys."""
     wires = WiringKeys()
     for key, kinds in WIRE_KEYS.items():
         if key not in part.own:
@@ -94,7 +94,7 @@ def _apply_timeouts(wires: WiringKeys, table: Table) -> None:
 
 
 def connect(processes: Mapping[str, ResolvedProcess], document: Document) -> Wiring:
-    """Return the sockets of all processes: as the wiring keys say, defaults elsewhere."""
+    """Return the sockets of all processes, from the wiring keys or else by default."""
     net = Wiring()
     scheduler = next((p for p in processes.values() if p.role is Role.SCHEDULER), None)
     translator = next((p for p in processes.values() if p.role is Role.TRANSLATOR), None)

@@ -1,4 +1,4 @@
-"""Sockets of processes: the intermediary classes that name them in a file, and the resolved addresses."""
+"""Sockets of processes: the intermediary classes that describe sockets in a file, and the resolved addresses."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from afspm.experiment.findings import SourceLocation
 
 
 class WiringClass(Enum):
-    """Kinds of intermediary classes: they name sockets, and are not imported."""
+    """Kinds of intermediary classes, which describe sockets and are never imported."""
 
     PUBLISHER = "publisher"
     SUBSCRIBER = "subscriber"
@@ -39,7 +39,7 @@ WIRE_SETTINGS: Final[dict[WiringClass, frozenset[str]]] = {
     WiringClass.ROUTER: frozenset({"server_url", "router_url", *_REQUESTS}),
     WiringClass.CLIENT: frozenset({"url", *_REQUESTS}),
 }
-"""Settings of each kind."""
+"""Valid settings of each kind of intermediary."""
 
 # Keys of a component that name its intermediaries, and the kinds that fit.
 WIRE_KEYS: Final[dict[str, tuple[WiringClass, ...]]] = {
@@ -60,7 +60,7 @@ def wire_of(table: object) -> WiringClass | None:
 
 @dataclass(frozen=True)
 class BoundSocket:
-    """A socket that a process binds: the address that the file gives under `key`, or None if it is left open."""
+    """A socket that a process binds, at the address that the file gives under `key`; None if left open."""
 
     owner: str
     use: str
@@ -104,5 +104,5 @@ class Wiring:
     links: dict[str, ProcessSockets] = field(default_factory=dict)
 
     def addresses(self, take: Callable[[], str]) -> dict[str, str]:
-        """Return the address of every bound socket by its key; open ones are filled by `take()`."""
+        """Return the address of every bound socket by its key; `take()` supplies the addresses left open."""
         return {key: slot.address or take() for key, slot in self.slots.items()}

@@ -1,10 +1,10 @@
-"""Start the processes of an experiment, watch them, restart dead ones, and end the run.
+"""Supervision of an experiment's processes: start them, watch them, restart dead ones, and end the run.
 
 **Theory of operation.** The decisions are pure (`supervision/`): events and real monotonic times in, effects out. The
 loop around them (`supervisor`) waits in one poller for heartbeats, exits, output, signals and the next deadline.
 
     comes in      an `Experiment`; heartbeats; exits and output of children; Ctrl-C; orders that the scheduler relays
-    state         for each child: its lives, its phase, its last heartbeat (`supervised_child`)
+    state         for each child: its starts, its phase, its last heartbeat (`supervised_child`)
     goes out      children started, killed, asked to end; states of processes and log lines to the scheduler; the run
                   folder
     always holds  a process counts as hanging if its heartbeats stop or one step exceeds its limit, never because the

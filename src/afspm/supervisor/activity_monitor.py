@@ -1,7 +1,7 @@
-"""Activity of a process without heartbeats, as the operating system sees it.
+"""Activity of a process without heartbeats, as measured by the operating system.
 
 Heartbeats come from a Python thread. Code that holds Python's lock for long (a call into a library, the import of a
-large one from a slow disk) stops them although the process works.
+large library from a slow disk) stops the heartbeats although the process works.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from typing import Any
 import psutil
 
 LEAST_SHARE = 0.05
-"""Share of a processor above which a process works. A hanging process uses less: each thread that waits for Python's
-lock polls it 200 times a second, which takes some thousandths, and threads of a socket library run on."""
+"""Share of a processor above which a process counts as working. A hanging process uses less: threads that wait for
+Python's lock poll it 200 times a second, which takes some thousandths, and threads of a socket library run on."""
 LOOKS = 10
 """Samples in the judged time span: frequent, since a wait for the disk shows only while it lasts."""
 
@@ -30,7 +30,7 @@ class ActivitySample:
         processor_s: processor time used since the process started.
         waits_for_disk: whether one of its threads waits for the disk.
         stopped: whether the process is suspended (SIGSTOP); then it counts as idle, even if it worked a moment before.
-        runs: whether its main thread runs, or would if a processor were free.
+        runs: whether its main thread is running, or ready to run.
     """
 
     processor_s: float
@@ -43,11 +43,11 @@ Look = Callable[[int], ActivitySample | None]
 
 
 class ActivityMonitor:
-    """A monitor that samples one process repeatedly, and decides by the latest samples whether it works.
+    """A monitor that samples one process repeatedly, and decides from the latest samples whether the process works.
 
     Args:
         pid: process to sample.
-        lately_s: age up to which samples count, real time.
+        lately_s: age up to which samples count, in s of real time.
         look: takes a sample; replaced in tests.
 
     Attributes:
@@ -68,7 +68,7 @@ class ActivityMonitor:
         return self._seen[-1][1].processor_s if self._seen else None
 
     def work(self, now_s: float) -> bool | None:
-        """Return whether the process works at a real monotonic time; None if unknown."""
+        """Take a sample if one is due, and return whether the process works; None if unknown."""
         if now_s >= self.again_s:
             self.again_s = now_s + self._lately_s / LOOKS
             self._works = self._judge(self._look(self._pid), now_s)

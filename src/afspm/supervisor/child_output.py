@@ -1,4 +1,4 @@
-"""Output of one child: its lines, and the limit on how many are kept."""
+"""Output lines of one child process, and a limit on their rate."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from afspm.basics.clock import ExperimentClock
 # bytes: a start with many warnings, or a few tracebacks, pass in full
 AT_ONCE = 500_000
 BYTES_PER_S = 5_000
-"""Permanent rate: 0.2 GB in a night of ten hours."""
+"""Sustained rate: 0.2 GB in a night of ten hours."""
 PAUSE_S = 10.0
-"""Duration of one pause."""
+"""Real time for which lines are dropped once the limit is exceeded."""
 LAST_BYTES = 10_000
 """Size of the last lines that are kept after a pause: a traceback, the most important part, comes last."""
 STAMP_BYTES = 100
@@ -26,7 +26,7 @@ Stream = Literal["stdout", "stderr"]
 
 @dataclass(frozen=True, slots=True)
 class OutputLine:
-    """A line that a child wrote."""
+    """An output line of a child."""
 
     name: str
     pid: int
@@ -36,7 +36,7 @@ class OutputLine:
 
 @dataclass(frozen=True, slots=True)
 class OutputDropped:
-    """A number of lines of a child that were dropped here, because its output exceeded the limit."""
+    """A number of lines of a child that were dropped because its output exceeded the limit."""
 
     name: str
     lines: int
@@ -45,8 +45,8 @@ class OutputDropped:
 class OutputLimit:
     """Rate limit on the lines of one stream.
 
-    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Beyond that it pauses: until `go_on` is called,
-    PAUSE_S later or at the end of the stream, all lines but the last are dropped.
+    A stream may write AT_ONCE bytes in a burst, and then BYTES_PER_S. Above that a pause begins, in which all lines but
+    the last are dropped. `go_on` ends the pause, after PAUSE_S or at the end of the stream.
     """
 
     def __init__(self, now_s: float) -> None:
@@ -56,7 +56,7 @@ class OutputLimit:
         self.pausing = False
 
     def passes(self, line: bytes, now_s: float) -> bool:
-        """Return whether a line passes now; otherwise it is withheld, since it may be the last line.
+        """Return whether a line passes now; otherwise hold the line back, as it may be one of the last.
 
         Args:
             now_s: real monotonic time.
@@ -86,7 +86,7 @@ class OutputLimit:
 
 
 class ChildOutput:
-    """The output lines of a child, reported within the limit.
+    """A reporter of a child's output lines, within the limit.
 
     The child never waits for the supervisor: a driver that logs much must not slow down.
     """

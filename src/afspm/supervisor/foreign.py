@@ -1,7 +1,7 @@
 """`python -m afspm.supervisor.foreign [--] command …` runs a component written in another language.
 
-The command gets the launch line on its standard input, which stays open as long as the parent's does. When that closes
-or the parent dies, the command is terminated, then killed. The exit code is the command's.
+The command gets the launch line on its standard input. When the standard input of this process closes, or its parent
+dies, the command is terminated, then killed. The exit code is the command's.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`python -m afspm.supervisor.host` hosts one Python process of an experiment; its launch line is on standard input."""
+"""`python -m afspm.supervisor.host` runs one Python class of an experiment; its launch line is on standard input."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MOST_FILES = 65_536  # plenty; child programs that loop over all possible descri
 
 
 def main() -> int:
-    """Run the process and return its exit code."""
+    """Run the class that the launch line names, and return the exit code."""
     leave_interrupts_to_parent()
     pipe = take_standard_input()
     try:

@@ -1,4 +1,4 @@
-"""Keys for the processes of a run: those of the file, or pairs made for this run. Each process gets only its own."""
+"""Keys for the processes of a run: from the keys folder, or made for this run. Each process gets only its own keys."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class KeyHandout:
     """The processes to start, with their keys.
 
     Attributes:
-        guest, supervisor: keys, in the form of launch lines, of programs that join the run and of the supervisor's
-            reporter; None: the file gives a keys folder, or there are no keys.
+        guest, supervisor: keys for programs that join the run, and for the supervisor's reporter, as in launch lines;
+            None: the file gives a keys folder, or there are no keys.
     """
 
     starts: Sequence[ProcessStart]
@@ -39,7 +39,7 @@ class KeyHandout:
 
     @contextmanager
     def laid_down(self, folder: Path) -> Iterator[None]:
-        """Keep the guests' key in the run's folder while in the block; a failing disk is no error."""
+        """Keep the guests' keys in the run's folder during the block; errors of the disk are ignored."""
         file = folder / STATE_DIR / GUEST_KEYS
         if self.guest is not None:
             text = json.dumps(self.guest).encode()
@@ -53,7 +53,7 @@ class KeyHandout:
 
 
 def hand_over(experiment: Experiment, starts: Sequence[ProcessStart]) -> KeyHandout:
-    """Give each process to start its keys.
+    """Return the processes to start, each with its keys.
 
     Raises:
         ConfigError: a key of the file is missing, or readable for other users.

@@ -34,9 +34,9 @@ _LEVELLED = re.compile(rf"(?P<level>{'|'.join(_LEVELS)})\b:?\s*(?P<text>.*)", re
 
 
 class LineReader:
-    """A reader of the log levels of one process's lines.
+    """A parser of the log levels in one process's output lines.
 
-    On stderr a line may begin with its level ("WARNING the tip is blunt"), as afspm's own do. Lines without a level
+    On stderr a line may begin with its level ("WARNING the tip is blunt"), as afspm's lines do. Lines without a level
     belong to the line before: a traceback below an ERROR. Lines before the first level are warnings, since a program
     that writes to stderr before its log is set up reports a problem. Lines on stdout are information.
     """
@@ -81,7 +81,7 @@ class RunLog:
         self._level = level
         terminal = terminal or sys.stdout
         self.listener: Callable[[str, int, str], None] = lambda name, level, text: None
-        """Called with each line, as `write` is."""
+        """Function that is called with the arguments of each `write`."""
         self._hangs = False
         self._shown = _Shown(_coloured(terminal) if terminal.isatty() else _plain(terminal))
         self._widest = max(map(len, (LOGGED_AS, *names)))
@@ -109,7 +109,7 @@ class RunLog:
         return f" [{day_and_time(now_ns)}]"
 
     def close(self) -> None:
-        """Write and show the lines that wait, as far as file and terminal take them."""
+        """Write and show the waiting lines, as far as file and terminal accept them in time."""
         self._shown.close()
         self._file.close()
 
@@ -142,7 +142,7 @@ class _Shown:
             self._changed.notify()
 
     def close(self) -> None:
-        """Write the lines that wait, for SHOWN_WITHIN_S at most."""
+        """Write the waiting lines, for SHOWN_WITHIN_S at most."""
         with self._changed:
             self._closing = True
             self._changed.notify()

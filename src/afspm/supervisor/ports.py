@@ -30,7 +30,7 @@ from afspm.transport.network import HAS_PRIVATE_SOCKETS
 LOWEST, HIGHEST = 20_000, 32_000
 TRIES = 200
 CAN_HOLD = sys.platform == "linux"
-"""Other systems let no second process bind a port that one process has bound without listening."""
+"""Whether a port can be held for a child: other systems let no second process bind a held port."""
 LONGEST_FOLDER = 90
 """Limit on the path of a folder of sockets, in bytes. macOS has the lowest limit for a socket's path: 103."""
 # limits the open descriptors of a process that chooses ports for many runs
@@ -45,8 +45,8 @@ class FreePorts:
 
     A port is chosen here and bound by the child, so that a restarted child has the same address. On Linux the port is
     held meanwhile: other programs that look for free ports, such as a second experiment, skip it before the child has
-    bound it and while the child restarts. On other systems another program may take it; the child then fails to bind
-    and logs so.
+    bound it and while the child restarts. On other systems another program may take it; the child then fails to bind,
+    and logs the failure.
     """
 
     def __init__(self, host: str = "127.0.0.1") -> None:
@@ -107,7 +107,7 @@ class NewAddresses(NamedTuple):
 
 @contextmanager
 def new_addresses(*, private: bool, tcp: bool) -> Iterator[NewAddresses]:
-    """Make addresses for a run, valid within the block. Raises ConfigError if there is no place for them.
+    """Make addresses for a run, valid within the block. Raises ConfigError if no folder for sockets can be made.
 
     Args:
         private: use unix sockets where the system has them. Heartbeats, which stay on this computer, use them whenever
@@ -136,7 +136,7 @@ def require_free(bound: Mapping[str, str]) -> None:
         bound: address -> name of the process that will bind it here.
 
     Raises:
-        ConfigError: another program listens at one.
+        ConfigError: another program listens at one of the addresses.
     """
     for address, name in bound.items():
         if (found := _TCP.fullmatch(address)) and not _can_be_bound(found[1].strip("[]"), int(found[2])):

@@ -1,4 +1,4 @@
-"""After the end of a run: its summary, its report, and the notifications."""
+"""Work after the end of a run: notifications, summary and report."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ TABLE = "metadata.csv"  # written by the component Metadata
 
 @dataclass(frozen=True)
 class EndedRun:
-    """A run that is over."""
+    """Name, folder and outcome of a run that has ended."""
 
     name: str
     folder: Path
@@ -74,7 +74,7 @@ def follow(
 
 
 def summary(outcome: RunOutcome, folder: Path) -> list[str]:
-    """Return the summary: why the run ended, processes that ran, restarts, processes given up, and the folder."""
+    """Return the lines of the summary: reason of the end, processes, restarts, measurements and folder."""
     lines = [f"{outcome.text}, after {duration_text(outcome.duration_s)}"]
     lines.append(f"ran: {', '.join(report.name for report in outcome.reports if report.starts)}")
     for report in outcome.reports:
@@ -124,7 +124,7 @@ def _times(count: int) -> str:
 
 
 def report(folder: Path, log: RunLog) -> None:
-    """Write the report of a recorded run, in a process of its own that can neither harm nor delay the run."""
+    """Write the report of a recorded run, in a separate process that can't harm or delay the run."""
     if not (folder / JOURNAL_FILE).is_file():
         return  # no record, no report
     log.write(LOGGED_AS, logging.INFO, "writing the report …")
@@ -155,7 +155,7 @@ def report(folder: Path, log: RunLog) -> None:
 
 
 def tell(ended: EndedRun, targets: Targets, on: tuple[str, ...], clock: Clock, log: RunLog) -> None:
-    """Send the notification that a run has ended. Failed deliveries are repeated for half a minute."""
+    """Send a notification of the run's end. Failed deliveries are repeated for half a minute."""
     is_lost = ended.outcome.why in (EndReason.LOST, EndReason.PLANS_LOST)
     what = GIVEN_UP if is_lost and GIVEN_UP in on else END
     if what not in on:

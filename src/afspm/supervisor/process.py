@@ -46,7 +46,7 @@ class Task:
         folder: working directory; None: the supervisor's.
         environment: variables in addition to the supervisor's.
         hidden: variables of the supervisor that the process does not get.
-        beats: whether it sends heartbeats; without them only its exit shows that it is dead.
+        beats: whether it sends heartbeats; without heartbeats only an exit shows that a process is dead.
     """
 
     launch: Launch
@@ -70,7 +70,7 @@ class Task:
 
 
 def from_start(start: ProcessStart) -> Task:
-    """Return the task of a process: Python classes run in `host`, other languages under `foreign`."""
+    """Return the task for a process to start: Python classes run in `host`, other languages under `foreign`."""
     # modules come from beside the experiment file, never from the directory where the run was started
     ours = (*python_command(GUARD), "--", *start.command) if start.command else python_command(HOST)
     before = [*start.python_path, *filter(None, [os.environ.get("PYTHONPATH", "")])]
@@ -91,8 +91,8 @@ class ChildProcess:
     """A running child, whose output and exit are passed to `tell`, from threads of this object.
 
     The child has a process group of its own: Ctrl-C in the terminal reaches the supervisor alone, and killing includes
-    the child's own children. Its standard input stays open until `close_stdin`; when it ends, the parent wants the
-    child to stop, or is dead (then the system closes it).
+    the child's own children. The end of its standard input asks the child to stop: closed by `close_stdin`, or by the
+    system after the death of the supervisor.
 
     Args:
         has_tip: whether the child may have to retract a tip after the supervisor was killed.
@@ -212,7 +212,7 @@ class _WindowsJob:
     """Windows job object of a child and its own children; elsewhere `reaper` does its work.
 
     Args:
-        has_tip: whether the child retracts a tip first: it then ends by itself, not with the supervisor.
+        has_tip: whether the child retracts a tip first, and so is not ended with the supervisor.
     """
 
     def __init__(self, child: subprocess.Popen[bytes], *, has_tip: bool) -> None:
@@ -234,7 +234,7 @@ class _WindowsJob:
             self._kernel.TerminateJobObject(ctypes.c_void_p(self._handle), _KILLED)
 
     def close(self) -> None:
-        """Close the job; processes left in it end, unless one of them has a tip."""
+        """Close the job; processes left in the job end, unless the child has a tip."""
         if self._handle:
             handle, self._handle = self._handle, 0
             with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
-"""Kills processes that a killed supervisor leaves behind. Runs as a process that waits for the supervisor's end.
+"""The reaper: a process that waits for the supervisor's end, and kills processes left behind by a killed supervisor.
 
-A child normally ends by itself at the end of its standard input. A child that can't notice it (a library holds Python's
-lock), or has children of its own, is killed from here some seconds later.
+A child normally ends by itself at the end of its standard input. A child that can't notice that (a library holds
+Python's lock), or that has children of its own, is killed from here some seconds later.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ if __name__ != "__main__":  # as a script it starts without site packages, to be
     from afspm.transport.process.parent import END_WITHIN_S, TIP_WITHIN_S
 
 GRACE_S = 1.0
-"""Added to the time that a process has to end by itself."""
+"""Real time added to the time that a process has to end by itself."""
 CLOSED_WITHIN_S = 1.0
-"""Real time to end at the end of input."""
+"""Real time that the reaper has to end after its input is closed."""
 
 
 class Reaper:
-    """The supervisor's connection to the reaper process, which gets its living process groups.
+    """The supervisor's connection to the reaper process, which is sent the running process groups.
 
     Windows has a job object instead, see `process`.
     """
@@ -32,7 +32,7 @@ class Reaper:
         self._popen: subprocess.Popen[bytes] | None = None
 
     def begin(self) -> None:
-        """Start the reaper process. If that fails (too many processes), the run goes on without it."""
+        """Start the reaper process. If that fails (too many processes), the run goes on without a reaper."""
         if sys.platform == "win32":
             return
         with contextlib.suppress(OSError):
@@ -45,7 +45,7 @@ class Reaper:
             )
 
     def watch(self, pid: int, *, has_tip: bool) -> None:
-        """Register a process group to kill after the supervisor's end; later if it may have a tip to retract."""
+        """Register a process group to kill after the supervisor's end, with a longer delay if it may retract a tip."""
         self._send(f"{pid} {(TIP_WITHIN_S if has_tip else END_WITHIN_S) + GRACE_S}")
 
     def forget(self, pid: int) -> None:

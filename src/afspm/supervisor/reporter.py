@@ -1,6 +1,6 @@
-"""Reports process states and log lines to the scheduler, and receives the scheduler's orders.
+"""The reporter: sends process states and log lines to the scheduler, and receives the scheduler's orders.
 
-It runs in a thread of its own, so that a slow or dead scheduler never delays the supervisor.
+The reporter has a thread of its own, so that a slow or dead scheduler never delays the supervisor.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ RESEND_AFTER_S = 5.0
 MOST_LINES = 5000
 """Limit on lines that wait for a missing scheduler; the oldest are dropped."""
 LONGEST_LINE = 2000
-"""Characters."""
+"""Limit on the length of a line, in characters."""
 _BATCH_BYTES = LONGEST_ANNOUNCEMENT // 4
 _CLOSE_WITHIN_S = 1.0
 # each reason is logged once; ever new reasons must not fill the memory
@@ -67,7 +67,7 @@ _MOST_FAILURES = 100
 
 @dataclass(frozen=True, slots=True)
 class ReportFailed:
-    """The error that the scheduler does not accept reports."""
+    """The event that the scheduler has not accepted a report."""
 
     text: str
 
@@ -77,7 +77,7 @@ _REQUESTS = {AskUse: CLOCK_REQUEST, EndExperiment: int(ControlRequest.END_EXPERI
 
 
 class ReportQueue:
-    """Newest states, and lines, still to be reported. Thread-safe.
+    """A thread-safe queue of the newest process states, and of log lines, to report.
 
     Args:
         clock: of the experiment.
@@ -173,7 +173,7 @@ class Reporter:
             self._wake()
 
     def line(self, name: str, level: int, text: str) -> None:
-        """Queue a line of a process or of the supervisor; `level` is a number of `logging`."""
+        """Queue a log line of a process or of the supervisor; `level` is a number of `logging`."""
         if level > logging.DEBUG and self._queue.put_line(name, logging.getLevelName(level), text):
             self._wake()
 
@@ -304,10 +304,10 @@ def reporter_of(
     run: str = "",
     keys: Mapping[str, object] | None = None,
 ) -> Reporter | None:
-    """Return a reporter for the processes started here; None if the scheduler can't be asked, or may not be afspm's.
+    """Return a reporter for the processes started here; None if the scheduler is unreachable or not afspm's.
 
     Args:
-        keys: made for the reporter; None: the file gives a keys folder, or there are no keys.
+        keys: keys made for the reporter; None: the file gives a keys folder, or there are no keys.
     """
     scheduler = next((start for start in starts if start.role is Role.SCHEDULER), None)
     here = computer_name()

@@ -1,4 +1,4 @@
-"""`afspm run --resume`: a run that was killed or stopped goes on in its folder."""
+"""`afspm run --resume`: continues a killed or stopped run in its folder."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ ZMTP = b"\xff"
 # orphans end within seconds; the reaper kills the rest
 GONE_WITHIN_S = 10.0
 STEP_NS = 1_000_000
-"""Simulated time between two lives of a run, so that no new packet has the time of an old one."""
+"""Simulated time between the last packet and the resumed run, so that no two packets have the same time."""
 
 
 @dataclass(frozen=True)
 class ResumableRun:
-    """A run that can go on.
+    """A run that can be continued.
 
     Attributes:
-        homes: folders of the files that the experiment was made of.
+        homes: folders of the original experiment files.
         added: names of components that the run did not have before.
     """
 
@@ -64,7 +64,7 @@ class ResumableRun:
         return replace(self, experiment=experiment, added=(*self.added, *added))
 
     def options(self, options: RunOptions) -> RunOptions:
-        """Return the options restricted to the processes that ran on this computer, and those added now."""
+        """Return the options restricted to the processes that ran on this computer, and to added components."""
         names = self.experiment.component_names  # without components added by an overlay at an earlier resume
         only, without = ([name for name in self.facts.get(which, ()) if name in names] for which in (ONLY, WITHOUT))
         return replace(options, only=(*only, *self.added) if only else (), without=tuple(without))
@@ -95,9 +95,10 @@ def find(where: Path) -> ResumableRun:
 
 
 def resume(found: ResumableRun, options: RunOptions, terminal: TextIO | None = None) -> FinishedRun:
-    """Go on with a run until it ends; every process finds its saved memory. Raises as `run.run`, and
+    """Continue a run until it ends; every process starts from its saved memory.
 
-    FileError: the run is still going on.
+    Raises:
+        FileError: the run is still going on. Other errors as from `run.run`.
     """
     experiment, folder, facts = found.experiment, found.folder, found.facts
     options = found.options(options)
@@ -201,7 +202,7 @@ def refuse_edited(files: Sequence[Path], begun: Experiment, folder: Path) -> Non
         begun: the experiment as it was at the start.
 
     Raises:
-        ConfigError: the files now make another experiment.
+        ConfigError: the files now describe another experiment.
     """
     differs = differing(_expanded(begun), _expanded(load(*files)))
     if differs:
@@ -221,7 +222,7 @@ def _expanded(experiment: Experiment) -> dict[str, object]:
 
 
 def differing(before: Mapping[str, object], now: Mapping[str, object]) -> list[str]:
-    """Return the differences of two experiments: each section with its keys."""
+    """Return the differences of two expanded experiment files: each differing section with its keys."""
     found = []
     for name in {**before, **now}:
         then, later = before.get(name), now.get(name)

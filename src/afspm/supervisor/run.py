@@ -36,7 +36,7 @@ from afspm.supervisor.supervisor import RunOutcome, Supervisor
 from afspm.transport.heartbeat import HeartbeatListener
 
 TAKES_WHO_COMES = ""
-"""Identity of a run of a real microscope's translator alone: it obeys whichever scheduler connects."""
+"""Run identity for a real microscope's translator that is started alone: it obeys any scheduler that connects."""
 RUN, HOW, HOMES, FILES, ONLY, WITHOUT = "run", "how", "homes", "files", "only", "without"
 
 # a hanging disk must not keep the supervisor from ending
@@ -56,7 +56,7 @@ class RunOptions:
         speed: experiment seconds in a real second, instead of the file's; for simulated microscopes only.
         report: whether to write the report at the end.
         metadata: entries that override [metadata] of the file.
-        log_level: of `logging`, for the terminal and for what processes write at all.
+        log_level: lowest level of log lines, of `logging`, for the processes and the terminal.
     """
 
     runs: Path = Path("runs")
@@ -70,7 +70,7 @@ class RunOptions:
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run that has ended."""
+    """Folder and outcome of a run that has ended."""
 
     folder: Path
     outcome: RunOutcome
@@ -109,7 +109,8 @@ def go(
     """Run an experiment in an existing, locked folder until it ends.
 
     Args:
-        name: of the experiment; names: of its processes.
+        name: name of the experiment.
+        names: names of its processes.
     """
     if experiment.resolved.sections.clock.waits:
         common = replace(common, clock=common.clock.waiting_in(folder / STATE_DIR / CLOCK_FILE))
@@ -166,9 +167,9 @@ def addresses_of(starts: Sequence[ProcessStart]) -> dict[str, str]:
 
 
 def facts_to_resume(experiment: Experiment, starts: Sequence[ProcessStart], options: RunOptions) -> dict[str, object]:
-    """Return the entries of run.json from which the run can be resumed, without any other file.
+    """Return the entries of run.json that are needed to resume the run, without any other file.
 
-    The recorder and other implied processes are named there like all others, and so are chosen by name.
+    Implied processes, such as the recorder, are listed by name like all others.
     """
     here = [start.launch.name for start in starts]
     elsewhere = [name for name in experiment.component_names if name not in here]
@@ -259,11 +260,10 @@ def common_identity(
     options: RunOptions,
     terminal: TextIO | None,
 ) -> RunIdentity:
-    """Return the identity of the whole experiment: the scheduler's, if only other parts are started here.
+    """Return the identity of the whole run, from the scheduler if the scheduler is started elsewhere.
 
     Raises:
-        ConfigError: time is simulated, but the microscope is not certain to be; or the speed differs from the
-            scheduler's.
+        ConfigError: time is simulated, but the microscope may be real; or the speed differs from the scheduler's.
     """
     roles = {start.launch.name: start.role for start in starts}
     launch = None if Role.SCHEDULER in roles.values() else experiment.asking(list(roles))

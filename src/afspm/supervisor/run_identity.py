@@ -18,7 +18,7 @@ from afspm.transport.zmq_port import open_port
 
 AGAIN_S = 1.0
 REFUSED_S = 10.0
-"""Real time for which a refusal may be temporary: the scheduler still has the connection of a host that lost power."""
+"""Real time for which a refusal may be temporary: the scheduler may still hold the connection of a dead computer."""
 _SAME_S = 1e-3  # clocks of two processes of one computer differ by less
 
 
@@ -27,7 +27,7 @@ class RunIdentity:
     """Identity and clock of a run, the same on all of its computers.
 
     Attributes:
-        run: random identity of the run; empty: not known here.
+        run: random identity of the run; empty if unknown here.
         simulated: True only if the microscope is certain to be simulated.
     """
 
@@ -41,10 +41,10 @@ def new_identity() -> str:
 
 
 def ask_scheduler(launch: Launch, tell: Callable[[str], None]) -> RunIdentity:
-    """Wait for the scheduler at `launch`, and return its identity. A scheduler without a clock uses real time.
+    """Wait for the scheduler, and return the identity of its run. A scheduler without a clock uses real time.
 
     Raises:
-        ConfigError: the scheduler does not answer this request.
+        ConfigError: the scheduler refuses the request.
     """
     wall = ExperimentClock.real()
     port = open_port(launch, wall)

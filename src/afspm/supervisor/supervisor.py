@@ -64,7 +64,7 @@ REPORT_PERIOD_S = 0.1
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """Outcome of a run; `duration_s` is real time up to its end, without the time that components need to finish."""
+    """Outcome of a run; `duration_s` is real time until the end begins, without the time that components then take."""
 
     why: EndReason
     text: str
@@ -77,7 +77,7 @@ class RunOutcome:
 
 
 class Supervisor:
-    """A runner of tasks until the experiment ends, all are done, an essential process is lost, or a person stops it."""
+    """A runner of a run's tasks, until the run ends by itself or a person stops the run."""
 
     def __init__(
         self,
@@ -260,7 +260,7 @@ TOLERANCE_S = 5.0
 
 
 class ClockCheck:
-    """A single warning if experiment time and wall clock differ; time simulated at another speed is not checked."""
+    """A check that warns once if experiment time and wall clock differ, in a run at real speed."""
 
     def __init__(self, clock: ExperimentClock) -> None:
         self._clock = clock

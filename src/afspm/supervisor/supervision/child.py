@@ -19,10 +19,10 @@ class RestartPolicy:
 
     Attributes:
         budget: number of restarts allowed within `window_s`; at one more the process is given up.
-        first_delay_s: before the second restart in a row; the first is at once.
-        factor: growth of the delay with each further restart,
-        longest_delay_s: up to this.
-        healthy_s: a life longer than this ends a row of failures.
+        first_delay_s: delay before the second restart in a row; the first restart is immediate.
+        factor: growth of the delay with each further restart.
+        longest_delay_s: upper limit of the delay.
+        healthy_s: time that a process must run for the next crash to count as a first failure again.
     """
 
     budget: int = 10
@@ -34,7 +34,7 @@ class RestartPolicy:
 
 
 class RestartBudget:
-    """Restarts of one child."""
+    """The counter of one child's recent restarts, checked against the policy."""
 
     def __init__(self, policy: RestartPolicy) -> None:
         self._policy = policy
@@ -59,16 +59,14 @@ class RestartBudget:
 
 @dataclass(frozen=True)
 class ChildPolicy:
-    """Liveness and restart policies of one child."""
-
     liveness: LivenessPolicy = field(default_factory=LivenessPolicy)
     restart: RestartPolicy = field(default_factory=RestartPolicy)
     beats: bool = True
-    """Whether it sends heartbeats."""
+    """Whether the child sends heartbeats."""
     final_codes: Collection[int] = frozenset({ExitCode.DONE, ExitCode.CONFIG, ExitCode.ENDED})
-    """Exit codes after which it is not restarted. Not ORPHAN: a child stopped by another program is still needed."""
+    """Exit codes that cause no restart. Not ORPHAN: a child stopped by another program is still needed."""
     quiet_codes: Collection[int] = frozenset({ExitCode.CONFIG, ExitCode.ENDED})
-    """Final codes that need no log line: refused settings are logged when it is given up, the end by the scheduler."""
+    """Final codes that need no log line here: wrong settings and the experiment's end are logged elsewhere."""
 
 
 class HeartbeatReport(Protocol):
@@ -83,19 +81,17 @@ class HeartbeatReport(Protocol):
 
 
 class ChildPhase(Enum):
-    """Phase of a child's life."""
-
     IDLE = auto()
     """Not started yet."""
     RUNNING = auto()
     KILLING = auto()
-    """It was killed as dead or frozen; its exit is awaited."""
+    """The process was killed as dead or frozen; its exit is awaited."""
     WAITING = auto()
-    """It crashed; it is restarted after the delay."""
+    """The process crashed, and is restarted after the delay."""
     STOPPING = auto()
-    """It was asked to end."""
+    """The process was asked to end."""
     DONE = auto()
-    """It has ended, on purpose or because it was asked to."""
+    """The process has ended, on purpose or as requested."""
     GIVEN_UP = auto()
 
 
@@ -113,7 +109,7 @@ class KillChild:
 
 @dataclass(frozen=True, slots=True)
 class GiveUpChild:
-    """The effect that ends restarts of the process, with a log line. The scheduler stops waiting for it, too."""
+    """The effect that gives the process up, with a log line: the process is not restarted any more."""
 
     why: str
 
@@ -137,7 +133,7 @@ _WHY = {
 
 
 class ChildWatch:
-    """One child, over all its lives. Methods take the real monotonic time, and return effects in order."""
+    """Supervision of one child over all its restarts. Methods take real monotonic time, and return effects in order."""
 
     def __init__(self, policy: ChildPolicy | None = None) -> None:
         self._policy = policy or ChildPolicy()
@@ -173,12 +169,12 @@ class ChildWatch:
         return self.tick(now_s)
 
     def waits(self, now_s: float) -> None:
-        """Restart the time allowed for its start: the process exists, but still waits for the scheduler."""
+        """Extend the time limit of the start, since the process still waits for the scheduler."""
         if self._liveness is not None:
             self._liveness.waits(now_s)
 
     def exited(self, code: int, now_s: float, how: str = "", fault: OwnFault | None = None) -> list[ChildEffect]:
-        """Process an exit: by code, or by signal if below zero; `how` describes it for people."""
+        """Process an exit; a `code` below zero is a signal's number, `how` describes the exit for people."""
         how = how or f"exit code {code}"
         phase, self._liveness = self.phase, None
         if phase in (ChildPhase.STOPPING, ChildPhase.DONE):
@@ -204,7 +200,7 @@ class ChildWatch:
         return self._failed(now_s, f"could not be started: {why}")
 
     def restart(self, now_s: float) -> list[ChildEffect]:
-        """Restart the child by order, in any phase. This is no failure, and uses no restart of the budget."""
+        """Restart the child on a person's order; the restart counts neither as a failure nor in the budget."""
         if self.phase is ChildPhase.STOPPING:
             return []
         self._fault = None
@@ -216,7 +212,7 @@ class ChildWatch:
         return [said, *self._start(now_s)]
 
     def stop(self, now_s: float) -> list[ChildEffect]:
-        """Restart the child no more: the caller has asked it to end."""
+        """Stop restarting the child; the caller has asked the child to end."""
         if self.phase in (ChildPhase.RUNNING, ChildPhase.KILLING):
             self.phase = ChildPhase.STOPPING
         elif self.phase in (ChildPhase.IDLE, ChildPhase.WAITING):
@@ -242,7 +238,7 @@ class ChildWatch:
         return [ChildLog("WARNING", f"killed: {why}"), KillChild(why)]
 
     def deadline_s(self) -> float | None:
-        """Return when `tick` is due at the latest; None if there is no deadline."""
+        """Return the latest time for the next `tick`; None if there is no deadline."""
         if self.phase is ChildPhase.WAITING:
             return self._again_s
         if self.phase is ChildPhase.RUNNING and self._liveness is not None:

@@ -1,6 +1,7 @@
-"""Liveness of a process by its heartbeats: busy is not dead, nor is late if this computer slept.
+"""Liveness of a process, judged by its heartbeats.
 
-A process without heartbeats that is seen to work is alive, too: some code keeps its heartbeat thread from running.
+A busy process counts as alive, as does a process with late heartbeats after this computer slept. A process without
+heartbeats counts as alive while it works, since some code keeps the heartbeat thread from running.
 """
 
 from __future__ import annotations
@@ -10,20 +11,20 @@ from enum import Enum, auto
 
 
 class ProcessHealth(Enum):
-    """Health of a process."""
+    """Health of a process, by its heartbeats and its activity."""
 
     STARTING = auto()
     ALIVE = auto()
     SLOW_START = auto()
     """No first heartbeat within the limit for a start."""
     BUSY = auto()
-    """Heartbeats have stopped, but it is seen to work, within the limit for one step."""
+    """Heartbeats have stopped, but the process works, within the limit for one step."""
     SILENT = auto()
     """Heartbeats have stopped: the whole process hangs."""
     FROZEN = auto()
     """Its current step exceeds the limit for one step."""
     NOT_CLOSING = auto()
-    """It announced that it closes, but still runs."""
+    """The process announced its end, but still runs."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class LivenessPolicy:
     """Time limits for a process; all in real seconds.
 
     Attributes:
-        beat_period_s: between two heartbeats.
+        beat_period_s: time between two heartbeats.
         missed_beats: number of missing heartbeats after which the process counts as dead.
         start_s: limit until the first heartbeat.
         longest_step_s: limit for one step, unless the process declares its own.
@@ -50,10 +51,10 @@ class LivenessPolicy:
 
 
 class Liveness:
-    """Heartbeats of one life of a process.
+    """The liveness of a process from one start to its exit.
 
     Args:
-        beats: whether it sends any; without them only its exit shows that it is dead.
+        beats: whether it sends heartbeats; without heartbeats only an exit shows that a process is dead.
     """
 
     def __init__(self, policy: LivenessPolicy, now_s: float, *, beats: bool = True) -> None:
@@ -69,7 +70,7 @@ class Liveness:
     def beat(self, now_s: float, step_age_s: float = 0.0, longest_step_s: float | None = None) -> None:
         """Process a heartbeat, with the age of the current step and the limit for one step.
 
-        A heartbeat after `closing` cancels the announcement: the process is not closing, or another one announced it.
+        A heartbeat after `closing` cancels the announcement: it came from another process, or by mistake.
         """
         longest_s = self._policy.longest_step_s if longest_step_s is None else longest_step_s
         self._vital = ProcessHealth.ALIVE
@@ -78,21 +79,21 @@ class Liveness:
         self._deadline_s = now_s + self._policy.silence_s
 
     def waits(self, now_s: float) -> None:
-        """Restart the time allowed for its start: the process must still wait."""
+        """Extend the time limit of the start, since the process must still wait."""
         if self._vital is ProcessHealth.STARTING:
             self._deadline_s = now_s + self._policy.start_s
 
     def closing(self, now_s: float) -> None:
-        """Process its announcement that it closes on purpose."""
+        """Process the announcement of an end on purpose."""
         self._vital = ProcessHealth.NOT_CLOSING
         self._step_began_s, self._longest_s = now_s, self._policy.longest_step_s
         self._deadline_s = now_s + self._policy.closing_s
 
     def check(self, now_s: float, *, works: bool | None = None) -> ProcessHealth:
-        """Return the health. Call it at least once a beat period: a longer gap counts as sleep of this computer.
+        """Return the health. Call this at least once a beat period: a longer gap counts as sleep of this computer.
 
         Args:
-            works: whether the process was seen to work recently; None: unknown.
+            works: whether the process was observed to work recently; None: unknown.
         """
         asleep_s = now_s - self._checked_s - self._policy.beat_period_s
         self._checked_s = now_s
@@ -115,7 +116,7 @@ class Liveness:
         )
 
     def next_check_s(self) -> float:
-        """Return when to call `check` at the latest."""
+        """Return the latest time for the next `check`, real monotonic."""
         next_s = self._checked_s + self._policy.beat_period_s
         # a deadline that has passed was handled: the process works on without heartbeats
         is_due = not self._has_no_deadline and self._deadline_s > self._checked_s

@@ -10,7 +10,7 @@ from afspm.supervisor.supervision.liveness import LivenessPolicy
 from afspm.supervisor.supervision.supervised_child import ChildLife, SupervisedChild
 
 SILENT_PERIODS = 2.5
-"""Beat periods without a heartbeat after which a process is shown as silent; a little later it is killed."""
+"""Beat periods without a heartbeat after which a process is shown as silent; a little later, the process is killed."""
 
 _WITHOUT_PROCESS = {
     ChildPhase.IDLE: ProcessCondition.STARTING,
@@ -21,7 +21,7 @@ _WITHOUT_PROCESS = {
 
 
 class ProcessStatus:
-    """The condition of each process, with the time since when it lasts."""
+    """The condition of each process, and the time of its last change."""
 
     def __init__(self, liveness: LivenessPolicy) -> None:
         self._liveness = liveness
@@ -34,7 +34,8 @@ class ProcessStatus:
         """Return the state of each process, and whether any has changed since the last call.
 
         Args:
-            now_s: real monotonic time; now_ns: experiment time.
+            now_s: real monotonic time.
+            now_ns: experiment time.
         """
         found, changed = [], False
         for child in children:

@@ -21,8 +21,6 @@ LEAVE_AFTER_S = 3.0  # after being killed
 
 
 class EndReason(Enum):
-    """Reason why a run ended."""
-
     EXPERIMENT_ENDED = auto()
     ALL_DONE = auto()
     STOPPED = auto()
@@ -60,13 +58,13 @@ _EXIT_CODES = {
 
 
 class EndStep(Enum):
-    """Next step with processes that still run."""
+    """One step in ending the processes that still run."""
 
     ASK = auto()
-    """Close their standard input, so that they end cleanly."""
+    """Close the processes' standard input, so that they end cleanly."""
     KILL = auto()
     LEAVE = auto()
-    """Killing does not end them (a driver hangs in the kernel): log it, and leave them."""
+    """Log the processes that survive the kill (a driver hangs in the kernel), and leave them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +75,9 @@ class RunEnd:
         ask_s, kill_s: when to ask and to kill, in real monotonic time.
         latest_s: deadline for busy processes; then they are asked to end.
         last: the last step taken.
-        in_haste: whether a person wants the run to end now.
-        busy_s: when a process was last seen busy after it was asked.
-        began_s: when the end began.
+        in_haste: whether a person has asked to end the run at once.
+        busy_s: time at which a process was last busy after the request to end.
+        began_s: time at which the end began.
     """
 
     why: EndReason
@@ -94,7 +92,7 @@ class RunEnd:
 
     @classmethod
     def begin(cls, why: EndReason, text: str, now_s: float) -> RunEnd:
-        """Return the end that begins now.
+        """Return the first state of an end that begins now.
 
         After an announced end, processes first have OWN_PACE_S to close by themselves.
         """
@@ -104,7 +102,7 @@ class RunEnd:
         return cls(why, text, ask_s, ask_s + KILL_AFTER_S, latest_s=now_s + FAREWELL_S, began_s=now_s)
 
     def hurried(self, now_s: float) -> RunEnd:
-        """Return the end in haste: processes are asked now, or killed if they were asked already."""
+        """Return a faster end: processes are asked to end now, or killed if already asked."""
         if self.last in (EndStep.KILL, EndStep.LEAVE):
             return self
         if self.last is None and self.why is not EndReason.STOPPED:
@@ -112,7 +110,7 @@ class RunEnd:
         return replace(self, kill_s=now_s, last=EndStep.ASK, in_haste=True)
 
     def deadline_s(self) -> float | None:
-        """Return when `step` is next due; None: never again."""
+        """Return the time of the next `step`, real monotonic; None: never again."""
         match self.last:
             case None:
                 return self.ask_s
@@ -124,12 +122,12 @@ class RunEnd:
                 return None
 
     def step(self, now_s: float, *, busy: bool = False) -> tuple[RunEnd, EndStep | None]:
-        """Return the end after this moment, and the step that is due, if any.
+        """Return the next state of the end, and the step that is due now, if any.
 
         Args:
-            busy: whether a process still works on a step, within the limit it declared. Before processes are asked this
-                is a component (drawing a picture of the night, say); afterwards a translator, which does not leave
-                before the tip is safe, or any process that is seen to work on its end.
+            busy: whether `unfinished` processes remain. Before the request to end, these are components at work on a
+                step (drawing a picture of the night, say); afterwards translators, which do not leave before the tip is
+                safe, and processes at work on their end.
         """
         deadline_s = self.deadline_s()
         seen = replace(self, busy_s=now_s) if busy and self.last is EndStep.ASK else self
@@ -149,7 +147,7 @@ class RunEnd:
 def unfinished(
     ending: RunEnd, children: Mapping[str, SupervisedChild], now_s: float, liveness: LivenessPolicy
 ) -> list[str]:
-    """Return the processes still at work; after the request to end, only those closing and busy translators."""
+    """Return the processes still at work; after the request to end, only closing processes and busy translators."""
     is_asked, has_ended = ending.last is not None, ending.why.is_announced
     # a scheduler on another computer counts as alive
     can_hear = all(child.life for child in children.values() if child.spec.role is Role.SCHEDULER)
@@ -171,15 +169,15 @@ ASK_AGAIN_S = 5.0
 
 @dataclass(slots=True)
 class IdleWatch:
-    """Watch for an idle run: no process with a plan is left.
+    """A detector of an idle run, in which no process with a plan is left.
 
     Attributes:
         ends: whether an idle run ends.
-        since_s: since when the run is idle, in real monotonic time; None: it is not.
-        asked_s: when the scheduler was last asked whether the microscope is in use.
+        since_s: begin of the idle time, real monotonic; None: not idle.
+        asked_s: time of the last question to the scheduler whether the microscope is in use.
         is_logged, is_postponed: whether idleness, and its postponement, were logged.
         is_ending: whether the scheduler was asked to end the experiment.
-        starts: number of process starts up to then.
+        starts: number of process starts at the last `look`.
     """
 
     ends: bool = False
@@ -207,21 +205,21 @@ class IdleWatch:
         return now_s >= self.since_s + IDLE_AFTER_S
 
     def asks(self, now_s: float) -> bool:
-        """Return whether to ask now if the microscope is in use, and note the time."""
+        """Return whether to ask the scheduler now if the microscope is in use; note the time."""
         if not self.ends or self.is_ending or now_s < self.asked_s + ASK_AGAIN_S:
             return False
         self.asked_s = now_s
         return True
 
     def deadline_s(self) -> float | None:
-        """Return when to look again; None if only an event can change anything."""
+        """Return the time of the next `look`; None if only an event can change anything."""
         if self.since_s is None or self.is_ending or (self.is_logged and not self.ends):
             return None
         return max(self.since_s + IDLE_AFTER_S, self.asked_s + ASK_AGAIN_S)
 
 
 def describe_idle(children: Collection[SupervisedChild]) -> str:
-    """Return why nothing is left to run: "series is done, grid was given up"."""
+    """Return why nothing is left to run, as in "series is done, grid was given up"."""
     acting = [child for child in children if child.spec.acts]
     return ", ".join(f"{child.spec.name} {'was given up' if child.given_up else 'is done'}" for child in acting)
 

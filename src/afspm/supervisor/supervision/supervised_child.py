@@ -1,4 +1,4 @@
-"""State of one supervised process: its lives, its heartbeats, and its exits."""
+"""State of one supervised process: its starts, its heartbeats, and its exits."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from afspm.supervisor.supervision.child import ChildWatch, HeartbeatReport
 from afspm.supervisor.supervision.liveness import LivenessPolicy
 
 LATE_START_S = 15.0
-"""Real time for a process that restarts during the end: to send its first heartbeat unless it is seen to work, and
-then to receive the packets that it missed."""
+"""Real time allowed for a process that restarts during the end: for its first heartbeat, unless the process is seen to
+work, and then for the packets that it missed."""
 CLOSES_WITHIN_S = 1.5
-"""Processor time that a process may use for its end, after it was asked to end."""
+"""Processor time that a process may use to end, after the request to end."""
 
 
 @dataclass(frozen=True)
@@ -20,9 +20,9 @@ class ChildSpec:
     """A process to supervise.
 
     Attributes:
-        beats: whether it sends heartbeats; without them only its exit shows that it is dead.
+        beats: whether it sends heartbeats; without heartbeats only an exit shows that a process is dead.
         leaves_last: whether it stays until the other components have ended, to record their last packets.
-        acts: whether it follows a plan of its own, as a series does, or that is unknown; the others react.
+        acts: whether it follows a plan of its own, as a series does (True if unknown), or only reacts.
     """
 
     name: str
@@ -39,13 +39,14 @@ class ChildSpec:
 
 @dataclass(slots=True)
 class ChildLife:
-    """One life of a child: a running process.
+    """One life of a child: a running process, from its start to its exit.
 
     Attributes:
         beat: its last heartbeat, at `beat_s`; None before the first.
         first_beat_s: time of its first heartbeat.
-        works: whether it is seen to work although it sends no heartbeats; None: unknown.
-        processor_s: processor time used; `asked_processor_s`: that used until it was asked to end.
+        works: whether it was observed to work although it sends no heartbeats; None: unknown.
+        processor_s: processor time used since its start.
+        asked_processor_s: value of `processor_s` at the request to end.
     """
 
     pid: int
@@ -62,7 +63,7 @@ class ChildLife:
         return self.beat is not None and self.beat.closing
 
     def overdue_s(self, liveness: LivenessPolicy) -> float | None:
-        """Return when a missing heartbeat or exit is so late that the operating system is asked about the process."""
+        """Return the time at which a heartbeat or exit is so late that the process's activity is sampled."""
         if self.beat is None:
             return None
         return self.beat_s + (liveness.closing_s if self.beat.closing else liveness.silence_s) / 2.0
@@ -72,7 +73,7 @@ class ChildLife:
         return due_s is not None and now_s >= due_s
 
     def is_busy(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether the process works on a step, by heartbeat or sample, within the limit that it declared."""
+        """Return whether heartbeats or samples show the process at work on a step, within its declared limit."""
         if self.beat is None or self.beat.closing:
             return False
         longest_s, age_s = self.beat.longest_step_s or liveness.longest_step_s, self.beat.step_age_s or 0.0
@@ -92,17 +93,17 @@ class ChildLife:
         return self.processor_s - self.asked_processor_s < CLOSES_WITHIN_S
 
     def is_silent(self, now_s: float, liveness: LivenessPolicy) -> bool:
-        """Return whether its heartbeat is long overdue and it does not work either."""
+        """Return whether the heartbeat is long overdue, and the process is not at work."""
         beating = self.beat is not None and not self.beat.closing
         return beating and now_s - self.beat_s >= liveness.silence_s and not self.is_busy(now_s, liveness)
 
 
 @dataclass(slots=True)
 class SupervisedChild:
-    """A process over all its lives.
+    """A supervised process over all its restarts.
 
     Attributes:
-        starts, ordered: number of starts, and of those ordered by a person.
+        starts, ordered: number of starts, and number of restarts ordered by a person.
         rescued: whether it was started once more after the end of the experiment.
         last_exit: description of its last exit.
     """
@@ -123,8 +124,8 @@ class SupervisedChild:
     def may_still_finish(self, now_s: float, liveness: LivenessPolicy, *, can_hear: bool) -> bool:
         """Return whether the process may have work left.
 
-        True if the process is starting, briefly silent, frozen and can be restarted, or was restarted and
-        has yet to receive the packets that it missed, if it still can.
+        True if the process is starting; if it is late with a heartbeat and can still be restarted; or if it was
+        restarted, and can still receive the packets that it missed.
         """
         life = self.life
         if life is None or not self.spec.beats or self.spec.role is not Role.COMPONENT:
@@ -140,7 +141,7 @@ class SupervisedChild:
 
 @dataclass(frozen=True)
 class ProcessReport:
-    """Fate of one process; `ordered` counts the starts that a person ordered."""
+    """Summary of one process for the end of a run; `ordered` counts the restarts ordered by a person."""
 
     name: str
     starts: int

@@ -58,7 +58,7 @@ SCHEDULER_ANSWERS_WITHIN_S = 15.0
 
 
 class SupervisorCore:
-    """The decisions which processes to start, kill and ask to end, and which lines to log.
+    """Decisions on processes to start, to kill and to ask to end, and on lines to log.
 
     Args:
         awaits_scheduler: whether components begin only after the scheduler has answered.
@@ -137,7 +137,7 @@ class SupervisorCore:
         return self.ending is None or self.children[name].rescued
 
     def deadline_s(self) -> float | None:
-        """Return when `TimePassed` is due at the latest; None if there is no deadline."""
+        """Return the latest time for the next `TimePassed`; None if there is no deadline."""
         if self.ending is not None:
             found = [self.ending.deadline_s()]
         else:
@@ -148,10 +148,10 @@ class SupervisorCore:
         return min((s for s in found if s is not None), default=None)
 
     def overdue(self, now_s: float) -> tuple[dict[str, int], float]:
-        """Return the ids of processes to sample from outside, by name, and the time span over which to judge them.
+        """Return the process ids to sample for activity, by name, and the time span to judge, in s.
 
-        These are processes whose heartbeat is late, at the end of a run also starting ones, and all that were asked to
-        end.
+        These are processes with a late heartbeat; at the end of a run also starting processes, and all processes that
+        were asked to end.
         """
         overdue: dict[str, int] = {}
         for name, child in self.children.items():

@@ -1,4 +1,4 @@
-"""Events for the supervisor's decisions, and the effects that come out."""
+"""Events that the supervisor decides on, and effects that result."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Beaten:
 
 @dataclass(frozen=True, slots=True)
 class ActivitySeen:
-    """The operating system's answer whether a process without heartbeats works; None: unknown.
+    """The event that the activity of a process without heartbeats was sampled; `works` is None if unknown.
 
     Attributes:
         processor_s: processor time used since the process started; None: unknown.
@@ -84,12 +84,12 @@ class RestartOrdered:
 
 @dataclass(frozen=True, slots=True)
 class SchedulerAnswered:
-    """The event that the scheduler of this run has answered: components may send it requests."""
+    """The event that the scheduler of this run has answered, so that components may send requests."""
 
 
 @dataclass(frozen=True, slots=True)
 class UseReported:
-    """The scheduler's answer whether the microscope is in use; `why` is empty if it is not."""
+    """The scheduler's answer whether the microscope is in use; an empty `why` means that it is not in use."""
 
     why: str
 
@@ -103,7 +103,7 @@ class EndRefused:
 
 @dataclass(frozen=True, slots=True)
 class TimePassed:
-    """The event that time has passed, up to a deadline or another event: deadlines are checked."""
+    """The event that time has passed, so that deadlines are checked."""
 
 
 SupervisorEvent = (
@@ -128,11 +128,11 @@ class ProcessAction(Enum):
     START = auto()
     """`ProcessStarted` or `StartFailed` follows."""
     KILL = auto()
-    """Kill it, and the processes that it has started."""
+    """Kill the process, and the processes that it has started."""
     CLOSE_INPUT = auto()
-    """Ask it to end, by closing its standard input."""
+    """Ask the process to end, by closing its standard input."""
     ABANDON = auto()
-    """Wait for it no longer: it can't be killed."""
+    """Stop waiting for the process, which can't be killed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,17 +145,17 @@ class ProcessCommand:
 
 @dataclass(frozen=True, slots=True)
 class ReleaseComponents:
-    """The effect that lets components begin which wait for the scheduler."""
+    """The effect that lets the components begin that wait for the scheduler."""
 
 
 @dataclass(frozen=True, slots=True)
 class AskUse:
-    """The effect that asks the scheduler if the microscope is in use; `UseReported` follows if the scheduler knows."""
+    """The effect that asks the scheduler if the microscope is in use; `UseReported` is the answer."""
 
 
 @dataclass(frozen=True, slots=True)
 class EndExperiment:
-    """The effect that asks the scheduler to end the experiment; `EndRefused` follows if it refuses."""
+    """The effect that asks the scheduler to end the experiment; `EndRefused` follows a refusal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +193,7 @@ _WINDOWS_REASONS = {
 
 
 def describe_exit(code: int) -> str:
-    """Return a description of an exit code."""
+    """Return an exit code as text for people, such as "killed by SIGKILL"."""
     if code in _WINDOWS_REASONS:
         return f"killed by Windows: {_WINDOWS_REASONS[code]} (0x{code:08X})"
     if code < 0:
