@@ -79,7 +79,7 @@ class ControlSettings:
     __pydantic_config__: ClassVar[object] = SECTION
 
     def rules(self, problems: ProblemNames) -> Rules:
-        """Return the part that the arbitration table needs.
+        """Return the settings that the arbitration table needs.
 
         Raises:
             InvalidValue: an unknown problem in `end_on`.

@@ -104,7 +104,7 @@ class SchedulerShell:
 
     @property
     def over(self) -> bool:
-        """The experiment has ended, and the grace period after it."""
+        """Whether the experiment and the grace period after it have ended."""
         return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
     def handle(self, ready: list[Source]) -> None:

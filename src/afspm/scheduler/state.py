@@ -98,7 +98,7 @@ class SchedulerState:
         )
 
     def saved_parts(self) -> tuple[object, ...]:
-        """The parts whose changes are saved before they are published."""
+        """Return the parts whose changes are saved before they are published."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
         return (
             *saved,
@@ -125,7 +125,7 @@ class SchedulerState:
 
 @dataclass(frozen=True)
 class Environment:
-    """Everything that a step needs beside the state.
+    """The settings, the codec and the packet cache that a step needs beside the state.
 
     Attributes:
         cache: the packets published last; the one part that changes in place, since it may hold hundreds of megabytes.

@@ -42,7 +42,10 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
 
 
 def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Answer a request that is not sent; of a repeated one it stays unknown whether it was carried out before."""
+    """Answer a request that is not sent.
+
+    The outcome of a repeated request stays unknown: it may have been carried out before.
+    """
     unknown = ResponseDetail.OUTCOME_UNKNOWN
     if job.is_repeated:
         reason = f"outcome unknown: it was sent once, and is not sent again ({response.reason})"
@@ -64,7 +67,7 @@ def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status:
 
 
 def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Return what a request has used of its limits and of its approval."""
+    """Undo the uses that a request counted against its limits and its approval."""
     draft.grants = draft.grants.not_done(job.client, job.request)
     mapped = job.mapped
     draft.limits = draft.limits.not_done(job.client, job.outgoing, None if mapped is None else mapped.names)

@@ -46,12 +46,12 @@ class Limit:
 
     @property
     def bounds_changes(self) -> bool:
-        """True where a check needs the value in force."""
+        """Whether a check needs the value in force."""
         return self.step is not None or self.rate_per_s is not None
 
     @property
     def is_of_a_number(self) -> bool:
-        """True where the parameter must be a number."""
+        """Whether the parameter must be a number."""
         return self.bounds_changes or self.low is not None or self.high is not None
 
 
