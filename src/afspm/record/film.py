@@ -1,4 +1,4 @@
-"""Scans of one place as a film that stands still: `run.film()`, and `afspm export --to gif` or `mp4`.
+"""Scans of one place as a film aligned on the sample: `run.film()`, and `afspm export --to gif` or `mp4`.
 
 Theory of operation. Scans with one channel in common whose regions overlap by half or more, after the recorded drift is
 subtracted, are scans of one place. The first of them is the window of the film. Each scan is levelled as small pictures
@@ -89,7 +89,7 @@ class Film:
 
     @property
     def range(self) -> ValueRange:
-        """The values at the ends of the colours, one for all frames."""
+        """The values at the ends of the colour map, the same for all frames."""
         return shared_range(self.frames)
 
     def images(self, width_px: int = WIDTH_PX) -> Iterator[Image.Image]:
@@ -158,8 +158,8 @@ def film_of(
 
     Args:
         rows: the scans, in the order of the film; interrupted scans show the lines taken.
-        channel: None: the first of the first scan.
-        drift: of `recorded_drift`; None: read from the run.
+        channel: the shown channel; None: the first channel of the first scan.
+        drift: the result of `recorded_drift`; None: read from the run.
 
     Raises:
         InvalidValue: fewer than two scans, not of one place, or a scan without the channel.

@@ -27,7 +27,7 @@ PART = ".part"
 
 
 class MeasuredFiles:
-    """A writer of measurements, in the open transaction.
+    """The writer of measurement files and their journal rows, within the open transaction.
 
     Args:
         folder: of the run.

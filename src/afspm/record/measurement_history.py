@@ -144,7 +144,7 @@ class MeasurementHistory:
 
     @property
     def places(self) -> Sequence[FoundPlace]:
-        """The newest list of places of each channel, joined."""
+        """The places in the newest list of each channel."""
         return tuple(place for found in self._places.values() for place in found)
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
@@ -213,7 +213,7 @@ class MeasurementHistory:
         _keep(self._drift, at_ns, point)
 
     def set_places(self, message: Any) -> None:
-        """Replace the places of a channel by those of a `SpatialPointWithScoreList` message that are lengths."""
+        """Replace a channel's places by the places with length units in a `SpatialPointWithScoreList` message."""
         found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
         self._places[message.channel] = tuple(
             FoundPlace(

@@ -122,7 +122,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
 
 
 def facts_of(path: Path) -> Plain:
-    """Return the facts stored in a file beside its values. Raises FileError: it is damaged."""
+    """Return the facts stored in a file beside its values. Raises FileError if the file is damaged."""
     with hdf5.opened(path) as file:
         return about_of(file)
 

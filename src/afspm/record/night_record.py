@@ -39,12 +39,12 @@ class Thumbnail:
 
     @property
     def kind(self) -> tuple[str, float]:
-        """Return unit and width: thumbnails with equal unit and width share a range, since they are compared."""
+        """The unit and the width in m; thumbnails of one kind share a range of values, since they are compared."""
         return self.unit, float(f"{self.width_m:.3g}")
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the levelled values in the steps of the colour scale; NaN at unmeasured pixels."""
+        """The levelled values in the steps of the colour scale; NaN at unmeasured pixels."""
         step = (self.span.high - self.span.low) / (LEVELS - 1)
         return np.where(self.levels == UNMEASURED, np.nan, self.span.low + step * self.levels)
 

@@ -63,7 +63,7 @@ def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: s
 
 
 def write_frame(instrument: h5py.Group, scan: Scan) -> None:
-    """Write region and pixels of a scan; start and end are those of the unrotated frame."""
+    """Write region and pixels of a scan; start and end refer to the unrotated frame."""
     rows, columns = scan.shape
     _write_pattern(instrument, scan.region.center_m, scan.region, (columns, rows))
 

@@ -45,18 +45,18 @@ def cut_off_message(folder: Path) -> str:
 
 
 def other_computer(folder: Path) -> str:
-    """Return the name of the computer that started a run; empty if that is this one, or unknown."""
+    """Return the name of the computer that started a run; empty for this computer, or if unknown."""
     name = str(run_json_or_empty(folder).get(COMPUTER) or "")
     return "" if name == platform.node() else name
 
 
 def goes_on(folder: Path) -> bool:
-    """Return whether a run is still going on, as far as this computer can know: not ended, and not cut off."""
+    """Return whether a run has neither ended nor been cut off, as far as this computer can know."""
     return not run_json_or_empty(folder).get(ENDED) and not cut_off_message(folder)
 
 
 def describe_state(folder: Path) -> str:
-    """Describe how a run ended, or that it goes on or was cut off."""
+    """Return the state of a run as text: its end, running, or cut off."""
     if ended := run_json_or_empty(folder).get(ENDED):
         return str(ended)
     if name := other_computer(folder):

@@ -68,7 +68,7 @@ class RunningScan:
         """Return (fraction done, ns remaining); None if it can't be estimated.
 
         Args:
-            expected_ns: the duration of such a scan; None: extrapolate from the received lines.
+            expected_ns: the expected duration of the whole scan; None: extrapolate from the received lines.
         """
         if self.began_ns is None:
             return None

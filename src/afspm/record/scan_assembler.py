@@ -1,4 +1,4 @@
-"""`ScanAssembler`: assembles packets into measurements: the channels of a scan, its lines, its end."""
+"""`ScanAssembler`: the assembly of packets into measurements: the channels of a scan, its lines, its end."""
 
 from __future__ import annotations
 

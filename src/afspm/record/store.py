@@ -1,4 +1,4 @@
-"""`RecordStore`: writes the record of a run: the journal, and a file for each scan and spectrum.
+"""`RecordStore`: the writer of a run's record: the journal, and a file for each scan and spectrum.
 
 Each call is recorded completely or not at all, and a repeated packet is recorded once: files are written under
 temporary names and renamed before the journal names them, in one transaction.
@@ -98,7 +98,7 @@ class RecordStore:
             self.note(name, value)
 
     def waiting(self) -> list[Packet]:
-        """Return the packets that wait for others of their scan."""
+        """Return the packets that wait for other packets of their scan."""
         return list(self._gathering.waiting())
 
     def take(self, packets: Iterable[tuple[Packet, str]]) -> None:

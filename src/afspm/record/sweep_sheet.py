@@ -120,7 +120,7 @@ def _picture(scan: Scan) -> NDArray[np.float64]:
 
 
 def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSetting, ...]]:
-    """Return distinct settings: numbers ascending, other values in the order of occurrence."""
+    # numbers ascending, other values in the order of occurrence
     found = list(dict.fromkeys(settings))
     seen: list[Any] = [one.value for each in found for one in each]
 

@@ -105,7 +105,7 @@ class SpectrumRow:
 
 @dataclass(frozen=True, slots=True)
 class ControlRow:
-    """Control from `time_ns` on."""
+    """The control state from `time_ns` on."""
 
     time_ns: int
     state: ControlState
@@ -286,7 +286,7 @@ _CELL: Final = 'style="text-align:left;white-space:nowrap;max-width:18em;overflo
 
 
 def table_html(columns: Mapping[str, Sequence[object]], count: int) -> str:
-    """Return columns of `count` rows each, without empty columns."""
+    """Return an HTML table of columns of `count` rows each, without empty columns."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
     columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
     filled = [_column(name, values) for name, values in columns.items() if any(map(_has_content, values))]

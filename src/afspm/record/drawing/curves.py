@@ -15,7 +15,7 @@ Pixel = tuple[float, float]
 
 
 def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
-    """Return about `most` points at most: minimum and maximum of each interval, so that peaks survive."""
+    """Thin a curve to about `most` points: the minimum and maximum of each interval, so that peaks survive."""
     if len(x) <= most:
         return x, y
     edges = np.linspace(0, len(x), most // 2 + 1).astype(int)
@@ -50,7 +50,7 @@ def _multiples(step: float, low: float, high: float) -> list[float]:
 
 
 def profile(values: Array, size_m: tuple[float, float], begin: Pixel, end: Pixel) -> tuple[Array, Array]:
-    """Return (distances in m, values) along a line in the scan, linear between pixels, about one point a pixel.
+    """Return the profile along a line in a scan: (distances in m, interpolated values), about one point per pixel.
 
     Args:
         values: [y, x], y ascending; NaN where nothing was measured.

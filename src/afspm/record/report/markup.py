@@ -1,4 +1,4 @@
-"""Building blocks of the page: sections, tables, enlarging pictures, and times in UTC with local ones beside."""
+"""Building blocks of the page: sections, tables, enlarging pictures, and times in UTC and local time."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def figure(
     ratio: float = 1.0,
     place: str = "",
 ) -> str:
-    """Return a figure that fills the page while its name is the anchor in the address.
+    """Return the HTML of a figure that fills the page while its name is the anchor in the address.
 
     Args:
         name: of the figure on the page.

@@ -50,7 +50,7 @@ class Refusals:
 
 @dataclass(frozen=True)
 class RunStory:
-    """A run, summed up. Times in ns of experiment time since the Unix epoch.
+    """The summary of a run. Times in ns of experiment time since the Unix epoch.
 
     Attributes:
         start_ns: the first known time of the run.
@@ -60,10 +60,10 @@ class RunStory:
         problems: spans of all problems except routine ones, in the order of time.
         actions: treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
-        ledger: totals of what was done to tip and sample.
+        ledger: totals of the treatments of tip and sample.
         comparisons: planned and measured work of each component with a plan.
         agents: the work of each agent.
-        bands: the values of other instruments that measuring needed.
+        bands: the values of other instruments that the conditions allowed.
     """
 
     name: str
@@ -128,7 +128,7 @@ class RunStory:
         return [scan for scan in self.scans if scan.registration not in well]
 
     def why_unregistered(self, scan: ScanRow) -> str:
-        """Return why the position of a scan is uncertain."""
+        """Return the reason why the position of a scan is uncertain."""
         began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
         points = (point for point in self.overview.drift if began_ns <= point.time_ns <= scan.time_ns)
         return next((point.reason for point in points), "")

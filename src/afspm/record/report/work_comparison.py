@@ -1,4 +1,4 @@
-"""The planned work of a run beside the measured work."""
+"""The comparison of a run's planned and measured work."""
 
 from __future__ import annotations
 
