@@ -35,7 +35,7 @@ class FeedbackQuality(Enum):
 
 @dataclass(frozen=True)
 class FeedbackError:
-    """Error signal of one scan.
+    """Measures of the error signal of one scan.
 
     Attributes:
         over: share of the pixels, 0 to 1, where the signal exceeds the setpoint by more than the threshold: in tapping
@@ -70,7 +70,7 @@ class FeedbackLimits:
     relief: float = 0.2
 
     def judge(self, error: FeedbackError) -> FeedbackQuality:
-        """Return the quality of one scan. WELL needs half the limits, as a margin."""
+        """Return the quality of the feedback in one scan; WELL needs half the limits, as a margin."""
         worst = max(error.share / self.pixels, error.missed / self.relief)
         if worst <= 1.0:
             return FeedbackQuality.WELL if worst <= 0.5 else FeedbackQuality.BARELY
@@ -102,7 +102,7 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
 
 def feedback_error(error: Array, threshold: float, height_m: Array | None = None, gap_m: float = 0.0) -> FeedbackError:
-    """Return the error signal of one scan.
+    """Return the measures of the error signal of one scan.
 
     A loop that lags leaves in the error the relief that is missing in the height. Compared in metres, this ratio is the
     same for every sample, speed and noise, since white noise has no correlation from pixel to pixel. A loop that
@@ -140,7 +140,7 @@ def _smooth_variance(values: Array) -> float:
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
 ) -> Generator[float, FeedbackQuality | None, float | None]:
-    """Search a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
+    """Search for a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
 
     Yields gains to try, `start` first; send it the quality at each, or None if the gain was refused. Returns the gain
     to keep, or None if no gain was good.

@@ -1,4 +1,4 @@
-"""`FeedbackTuner`: searches a better integral gain when `feedback-non-optimal` is flagged."""
+"""`FeedbackTuner`: the search for a better integral gain when `feedback-non-optimal` is flagged."""
 
 from __future__ import annotations
 

@@ -329,7 +329,7 @@ class RegionGrid(PlannedScans):
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Return two numbers, which JSON delivers as a list, as a tuple."""
+    """Return a pair of numbers as a tuple; JSON delivers it as a list."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])

@@ -91,7 +91,7 @@ class RoundSchedule:
             raise InvalidValue(f"a period of {self.period_s} s")
 
     def next_due_s(self, done_s: float | None) -> float:
-        """Return when the next round is due after one that ended at `done_s`; None: none has ended yet."""
+        """Return when the next round is due after a round that ended at `done_s`; None: no round has ended yet."""
         if done_s is None or self.period_s == 0.0:
             return self.start_s
         beats = math.floor((done_s - self.start_s) / self.period_s) + 1
@@ -102,7 +102,7 @@ class RoundSchedule:
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
     def too_slow_for(self, left_out: int, pace_s: float) -> int:
-        """Return how many of these rounds were missed because one takes `pace_s`, longer than the period."""
+        """Return how many of these rounds were missed because a round takes `pace_s`, longer than the period."""
         return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
 
 
@@ -118,7 +118,7 @@ class PlanRest:
     last: int
 
     def since(self, row: int, *, downwards: bool) -> PlanRest:
-        """Return the rows from one of these on, with some before it, as a part of the whole scan.
+        """Return the rows from a row of this part on, with a few rows of overlap before it.
 
         Args:
             row: index in this part.

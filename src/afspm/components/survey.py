@@ -35,8 +35,8 @@ USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 class Survey(Component):
     """A wide scan, a search for targets in it, and a zoom and curves at each target.
 
-    It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture: the
-    survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
+    It writes a table into the run folder (number, position, height, outcome, files of zoom and curves) and a picture:
+    the survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
     instance by a limit, the table has the reason, and the survey goes on with the next target. With a Drift Compensated
     Scheduler, positions are those on the sample.
 

@@ -1,4 +1,4 @@
-"""`TipClassifier`: detects in the scans that the tip has changed, and that it is good again."""
+"""`TipClassifier`: the detection, in scans, of a changed tip and of a tip that is good again."""
 
 from __future__ import annotations
 

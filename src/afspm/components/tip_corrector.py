@@ -1,4 +1,4 @@
-"""`TipCorrector`: repairs a tip that was flagged, with the treatments that it is allowed."""
+"""`TipCorrector`: the repair of a flagged tip, with the treatments that it is allowed."""
 
 from __future__ import annotations
 

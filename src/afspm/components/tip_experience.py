@@ -29,15 +29,15 @@ OUTCOMES = (CURED, WORSENED, UNCHANGED)
 UNKNOWN_FLAW = "unknown"
 
 PRIOR = {CURED: 0.2, WORSENED: 0.1, UNCHANGED: 0.4}
-"""Counts of a treatment without experience: little knowledge, and rather no cure."""
+"""Prior counts of an untried treatment: of little weight, and most for no effect."""
 MOST_OF_PAST_NIGHTS = 2.0
-"""Outcomes of a treatment that count from past nights."""
+"""Largest number of outcomes of a treatment that count from past nights."""
 MOST_COUNTED = 12.0
-"""Outcomes of a treatment that count altogether: older ones fade."""
+"""Largest number of outcomes of a treatment that count altogether: older ones fade."""
 IMPROBABLE = 0.02
 """Probability of a run of failures below which the counts of its flaw are weakened."""
 LEFT_AFTER_SURPRISE = 1.0
-"""Outcomes of a treatment that count after such a run."""
+"""Largest number of outcomes of a treatment that count after such a run."""
 SHARPNESS = 5.0
 """Factor on all counts for a draw. Plain Thompson sampling (1) explores for longer than a night has repairs."""
 _RAREST_CURE = 1e-3  # probability assumed at least, so that no expected repair is infinitely long
@@ -45,7 +45,7 @@ _RAREST_CURE = 1e-3  # probability assumed at least, so that no expected repair 
 
 @dataclass(frozen=True)
 class OutcomeCounts:
-    """Outcomes of one treatment of one flaw; older ones count less than one."""
+    """Outcome counts of one treatment for one flaw; an older outcome counts less than one."""
 
     cured: float = 0.0
     worsened: float = 0.0
@@ -72,7 +72,7 @@ class OutcomeCounts:
 
 
 Counts = dict[str, dict[str, OutcomeCounts]]
-"""By flaw, then by treatment."""
+"""Outcome counts by flaw, then by treatment."""
 
 
 @dataclass
@@ -92,7 +92,7 @@ class TipExperience:
     doubt: dict[str, float] = field(default_factory=dict)
 
     def choose(self, flaw: str, allowed: Sequence[Treatment]) -> Treatment:
-        """Return the one of the allowed treatments with the shortest expected repair under a draw from the counts."""
+        """Return the allowed treatment with the shortest expected repair under a draw from the counts."""
         draw = random.Random(f"{self.nights} {self.outcomes}")
         drawn = {
             one: [self._drawn(one, treatment, draw) for treatment in allowed]

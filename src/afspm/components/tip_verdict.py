@@ -33,7 +33,7 @@ GOOD, UNCLEAR = 1.0, 0.5
 
 @dataclass(frozen=True)
 class LineVerdict:
-    """The tip has changed during a scan.
+    """The verdict that the tip has changed during a scan.
 
     Attributes:
         region, shape: of the whole scan.
@@ -58,7 +58,7 @@ class LineVerdict:
 
 
 def line_verdict_message(verdict: LineVerdict) -> Any:
-    """Return a `TipVerdict`."""
+    """Return a verdict as a `TipVerdict` message."""
     message: Any = wire.message_type(OF_LINES)(
         channel=verdict.channel,
         row=verdict.row,

@@ -1,4 +1,4 @@
-"""Record of a survey: its targets and the measurements at each, as a table and a picture."""
+"""Record of a survey: its targets and the measurements at each target, as a table and a picture."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class Visit:
     Attributes:
         number: counts from 1, in the order of the targets.
         center_m: (x, y) from which offsets of curves are counted: the target's position in the survey, or in its zoom.
-        zoom: None: not taken, or not yet.
+        zoom: the scan of the target; None: not taken, or not yet.
         curves: by their names.
         refusals: reasons of refusals.
-        registration: source of the zoom's position on the sample, if drift is corrected; None: it is not.
+        registration: how the zoom's position on the sample is known; None without drift correction.
         position_sd_m: standard deviation of that position; None: unknown.
     """
 
