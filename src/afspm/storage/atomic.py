@@ -99,7 +99,7 @@ def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: boo
 
 
 class FileBatch:
-    """New files that get their names together; each is synced in a thread during the write of the next.
+    """New files that get their final names together; each is synced in a thread during the write of the next.
 
     Args:
         suffix: suffix of a file until it gets its name.

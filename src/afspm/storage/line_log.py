@@ -16,7 +16,7 @@ REQUESTS_FOLDER = "requests"
 
 
 class LineLog:
-    """Appends lines to a file.
+    """A writer that appends lines to a file.
 
     A write error must not end the experiment: it is logged once, and the log ends there until a restart.
     """

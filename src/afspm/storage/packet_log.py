@@ -30,7 +30,7 @@ CAPACITY_BYTES = 64 << 20
 """Smallest size of the log; it is also never smaller than twice the cached packets."""
 MOST_UNRECORDED_BYTES = 1 << 30
 SPARE_BYTES = 256 << 20
-"""Bytes kept in spare files: what a flood of packets needs until it is recorded."""
+"""Bytes kept in spare files, enough for a flood of packets until it is recorded."""
 SYNCED_WITHIN_S = 5.0
 _SPARE_SUFFIX = ".spare"
 
