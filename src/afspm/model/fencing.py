@@ -44,7 +44,7 @@ class Epoch:
 
 
 class SchedulerFence:
-    """Decision whether a translator obeys a sender.
+    """The decision whether a translator obeys a sender.
 
     Args:
         run: the identity of the translator's run; empty: the first scheduler is obeyed while it stays connected.

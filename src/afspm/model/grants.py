@@ -12,7 +12,7 @@ MOST_STEPS = 1000
 MOST_COUNT = 10_000
 LONGEST_GRANT_S = 7 * 86_400.0
 LONGEST_PROPOSAL = 60_000
-"""Characters of a plan or of a preflight."""
+"""Largest length of a plan or a preflight, in characters."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Grant:
         run: the run for which the approval is valid.
         limits: digest of the limits that the plan was checked against.
         since_ns: the time of that check. A flagged problem, or MANUAL, since then makes the approval stale.
-        offset_m: the microscope's coordinates of the components' origin at that check.
+        offset_m: the origin of component coordinates in microscope coordinates at that check.
         drift_m: largest change of the offset; empty offset: not checked.
 
     Raises:

@@ -81,8 +81,8 @@ class IdempotencyCache:
         clients: maximum number of clients.
         sent_actions: actions sent to the translator, kept over a restart. The translator would not repeat such an
             action, but the scheduler must not move the microscope in preparation for it again.
-        floors: the saved ones are kept over a restart.
-        table: the older and the latest ids of each client.
+        floors: the highest forgotten numbers, kept over a restart.
+        table: the outcomes of the older and the latest ids of each client.
     """
 
     per_client: int = 256

@@ -64,7 +64,7 @@ class InstrumentReadings:
     """A report of an instrument: all of its values, and the outcomes of orders since the last report.
 
     Attributes:
-        token: of the scheduler's last answer; the report was made after it.
+        token: the token of the scheduler's last answer, which precedes the report.
     """
 
     time_ns: int
@@ -96,7 +96,7 @@ class InstrumentOrders:
     """The scheduler's answer to a report.
 
     Attributes:
-        token: for the next report.
+        token: the token to repeat in the next report.
     """
 
     token: int

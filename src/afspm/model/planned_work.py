@@ -12,7 +12,7 @@ from afspm.model.geometry import Region
 N = TypeVar("N", int, float)
 
 BYTES_A_PIXEL = 8
-"""Of a recorded value before compression: a float64."""
+"""Bytes of a recorded value before compression: a float64."""
 SPEED_UNKNOWN = "the file sets no scan-speed"
 
 
