@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
-"""How late a deadline may be noticed while messages come: computing the next deadline after each message would cost as
-much as processing some of them."""
+"""Tolerated lateness of a deadline while messages arrive.
+
+Computing the next deadline after each message would cost as much as processing some messages.
+"""
 _TOGETHER_BYTES = 1 << 20
 """Packets are written together up to this size: the first one must not wait long for the others."""
 _WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBLM]))

@@ -165,8 +165,8 @@ class StateDraft(StateParts):
     """One step in progress: the parts of the state so far, the effects so far, and the time.
 
     Attributes:
-        now_s: real and monotonic, for timeouts.
-        now_ns: of the experiment, for everything that has a meaning in it.
+        now_s: real monotonic time, for timeouts.
+        now_ns: experiment time, for everything that has a meaning in the experiment.
         raised: inputs raised by this step; the frame processes them within it.
         before: the state before this step.
     """

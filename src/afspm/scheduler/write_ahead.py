@@ -24,7 +24,7 @@ class StateFile:
     """The file of the scheduler's state (mode, holder, problems …), saved before each publication.
 
     Args:
-        path: of the file; None: nothing is stored.
+        path: the path of the file; None: nothing is stored.
     """
 
     def __init__(self, path: Path | None, log: logging.Logger) -> None:
@@ -85,7 +85,7 @@ class WriteAhead:
     as far as they are still cached.
 
     Args:
-        log: None: no packets are stored.
+        log: the packet log; None: no packets are stored.
         cached: returns the packets in the scheduler's cache.
     """
 

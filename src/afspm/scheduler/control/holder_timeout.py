@@ -20,8 +20,8 @@ class Lease:
     Attributes:
         lease_ns: longest idle time by the experiment file; None: no limit.
         asked_s: longest idle time that the holder requested; None: no such request.
-        token: of the process that was granted control.
-        announced: the last holder in the log.
+        token: the session token of the process that was granted control.
+        announced: the holder named last in the log.
     """
 
     lease_ns: int | None = None

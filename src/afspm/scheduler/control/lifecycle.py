@@ -12,11 +12,11 @@ from afspm.scheduler.control.supervisor_registry import OVER
 from afspm.scheduler.events import RequestIn
 
 SHUTDOWN_GRACE_S = 3.0
-"""How long (real) the scheduler stays after the end: late and restarting components still get the last scans and the
-end itself. The time starts again with each report of a component that still runs."""
+"""Real time that the scheduler stays after the end, so that late components still get the last scans and the end. The
+time starts again with each report of a component that still runs.
+"""
 LONGEST_GRACE_S = 20.0
-"""How long (real) the scheduler stays at most: a supervisor takes this time at the end to find a silent component, kill
-it and restart it."""
+"""Longest real time that the scheduler stays after the end: a supervisor needs it to restart a silent component."""
 # bounded, since requests come from peers
 _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")
@@ -30,9 +30,9 @@ class StartupBarrier:
 
     Attributes:
         patience_s: the longest wait, real.
-        until_s: when the barrier opens at the latest, in real monotonic time; None: it is open.
-        is_restart: this scheduler continues a run.
-        opened_s: when the barrier opened, in real monotonic time.
+        until_s: the latest opening of the barrier, in real monotonic time; None: the barrier is open.
+        is_restart: whether this scheduler continues a run.
+        opened_s: the opening of the barrier, in real monotonic time.
         kept: requests that arrived before the barrier opened.
     """
 
@@ -82,10 +82,10 @@ class ExperimentEnd:
     The scheduler itself stays for a grace period.
 
     Attributes:
-        by_s: when the experiment ends at the latest, in real monotonic time; None: it does not end, or has ended.
+        by_s: the latest end of the experiment, in real monotonic time; None: no end in progress.
         kept: the delayed answers.
-        leave_at_s: when the scheduler leaves; inf: the experiment has not ended.
-        latest_s: when the scheduler leaves at the latest.
+        leave_at_s: the time at which the scheduler exits; inf: the experiment has not ended.
+        latest_s: the latest time at which the scheduler exits.
     """
 
     by_s: float | None = None

@@ -63,9 +63,9 @@ class MeasuringCondition:
     """A condition of the experiment file.
 
     Attributes:
-        bands: by parameter; all must hold.
-        actions: the actions that are refused while it does not hold.
-        problem: the problem flagged while it does not hold; empty: no problem.
+        bands: the bands by parameter; all must hold.
+        actions: the actions refused while the condition does not hold.
+        problem: the problem flagged while the condition does not hold; empty: no problem.
         source: where it was set, e.g. "experiment.toml:42".
     """
 
@@ -77,11 +77,11 @@ class MeasuringCondition:
 
 @dataclass(frozen=True)
 class InstrumentSettings:
-    """The instruments of an experiment, and its conditions.
+    """The instruments and the conditions of an experiment.
 
     Attributes:
         instruments: the components that report values.
-        conditions: by name.
+        conditions: the conditions by name.
         problems: the number of each problem that a condition flags.
     """
 
@@ -104,7 +104,7 @@ class ConditionState:
 
     Attributes:
         inside_since_ns: by parameter, the experiment time since which the value is inside its band.
-        reason: why the condition does not hold; empty: it holds.
+        reason: the reason why the condition does not hold; empty if it holds.
     """
 
     inside_since_ns: Mapping[str, int] = field(default_factory=dict)

@@ -38,7 +38,7 @@ class PacketCache:
     """The latest packets of each envelope, oldest first over all envelopes.
 
     Args:
-        envelopes: how packets are named and how many of each name are kept.
+        envelopes: the envelope of each packet, and the number of packets kept for each envelope.
         max_bytes: total size. Beyond it, the oldest packets are dropped whose envelope has a newer packet.
     """
 
@@ -70,7 +70,7 @@ class PacketCache:
         return self._bytes
 
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
-        """Return the packet to publish, and how many packets of its envelope are kept (0: this one is not).
+        """Return the packet to publish, and how many packets of its envelope are kept (0: not this packet).
 
         The packet keeps the translator's time. It gets a later time if that would not follow the newest published
         time: a clock was set back or is far ahead, or the peer sent no time.

@@ -150,9 +150,9 @@ class Envelopes:
     """The mapping from packets to envelopes, by the rules of the experiment file.
 
     Args:
-        rules: tried in their order; then the defaults.
+        rules: the rules, tried in order before the defaults.
         mapping: a function of the user that names the envelope instead of rules and defaults.
-        history: how many packets to keep, by message, instead of the number in the declaration.
+        history: the number of packets to keep, by message, instead of the number in the declaration.
     """
 
     def __init__(

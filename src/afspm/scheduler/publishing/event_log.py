@@ -45,7 +45,7 @@ SCHEDULER = "scheduler"
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
 _STARTS = frozenset({names.START_SCAN, names.START_SPEC})
 _STARTS_KEPT = 16
-"""Starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
+"""Number of starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
 _CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
@@ -55,7 +55,7 @@ class AnsweredRequest(NamedTuple):
     Attributes:
         took_s: real time from the request to its answer.
         late: the answer came after the client had got "no response".
-        sent_ns: when it was forwarded to the translator; None: it was not.
+        sent_ns: the time of forwarding to the translator; None if not forwarded.
     """
 
     time_ns: int
@@ -134,7 +134,7 @@ class EventLog:
     """The entries that are not published yet.
 
     Attributes:
-        due_s: when they are due, in real monotonic time; None: there are none.
+        due_s: the due time of their publication, in real monotonic time; None without entries.
         left_out: the number of requests beyond `most`.
         starts: the last starts of measurements, each saved before forwarding, since a kill loses the gathered entries.
     """

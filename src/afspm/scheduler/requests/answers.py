@@ -1,4 +1,4 @@
-"""The answers to requests: each request gets one, which is remembered under its id and written to the event log."""
+"""The answers to requests: each request gets one answer, remembered under its id and written to the event log."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reply(draft: StateDraft, event: RequestIn, response: Response) -> None:
 
 
 def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = ControlResponse.FAILURE) -> None:
-    """Refuse a peer that may not use its name; logged once for each connection."""
+    """Refuse a peer that may not use its name; log the refusal once for each connection."""
     draft.pending, was_refused = refused_again(draft.pending, event.connection)
     if not was_refused:
         draft.log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")

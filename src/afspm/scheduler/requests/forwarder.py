@@ -56,17 +56,17 @@ class ForwardedRequest(NamedTuple):
 
     Attributes:
         client: the name of the client; empty for a request of the scheduler itself.
-        command: whether only the holder of control may give it.
-        deadline_s: when it must be answered at the latest, real; 0: none yet.
-        sent_s: when it was sent, real; None while it waits.
-        answered: the client has got "no response in time".
-        connection: the connection that it arrived by.
-        states_seen: how many states the microscope had reported when it was sent.
+        command: whether only the holder of control may send the request.
+        deadline_s: the real time by which the request must be answered; 0: no deadline yet.
+        sent_s: the real time of sending; None while the request waits.
+        answered: whether the client has got "no response in time".
+        connection: the connection over which the request arrived.
+        states_seen: the number of states that the microscope had reported at sending.
         mapped: the request in the coordinates of the microscope, if they differ.
-        heard_s: when it arrived, real.
-        sent_ns: when it was sent, experiment time; None: it was not.
-        is_repeated: it was sent before under its id, with an unknown outcome.
-        purpose: of a request of the scheduler itself; None: it is for the tip's safety.
+        heard_s: the real time of arrival.
+        sent_ns: the experiment time of sending; None if not sent.
+        is_repeated: whether the request was sent before under its id, with an unknown outcome.
+        purpose: the purpose of a request of the scheduler itself; None: the tip's safety.
     """
 
     client: str
@@ -119,10 +119,10 @@ class Forwarder:
     """The queue of requests to the translator.
 
     Attributes:
-        timeout_s: how long (real) a client waits for an answer.
+        timeout_s: the real time that a client waits for an answer.
         patience_s: how much longer to wait for an overdue answer before the next request is sent.
-        longest_queue: how many requests may wait.
-        up: the translator is connected.
+        longest_queue: the largest number of waiting requests.
+        up: whether the translator is connected.
         flight: the request that the translator is serving.
         own: waiting requests of the scheduler itself, in order; they go first.
         queue: waiting requests of clients, in order.

@@ -1,4 +1,4 @@
-"""Waiting requests: the next one during its reads and moves, and those whose sender is not clear yet."""
+"""Waiting requests: the next request during its reads and moves, and requests whose sender is not clear yet."""
 
 from __future__ import annotations
 

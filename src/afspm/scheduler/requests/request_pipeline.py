@@ -97,7 +97,7 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
 
 
 def admit(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is new; if not, it was answered, or waits."""
+    """Return whether a request is new; a request that is not new was answered, or waits."""
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False

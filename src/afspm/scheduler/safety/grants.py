@@ -157,10 +157,10 @@ class AgentPlace:
 
 @dataclass(frozen=True)
 class GrantBook:
-    """Approvals and their uses; survives a restart.
+    """The approvals and their uses, which survive a restart.
 
     Attributes:
-        plans, grants: by agent.
+        plans, grants: the approved plans and the grants, by agent.
         spent: by agent, the requests of the last hour, oldest first.
         placed: the places set by the agent in control.
         disturbed_ns: the last time at which a problem was flagged or MANUAL was set.

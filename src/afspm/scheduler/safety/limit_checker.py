@@ -89,7 +89,7 @@ class LimitChecker:
 
         Args:
             used: the parameters that `who` sets; the others of the request only change with them. None: all.
-            is_repeated: this request was sent before with an unknown outcome: it is not a second use.
+            is_repeated: whether this request was sent before with an unknown outcome, and is no second use.
         """
         try:
             self._check(_Use(who, request.id, now_ns, is_repeated), request, used)

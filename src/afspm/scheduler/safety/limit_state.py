@@ -17,7 +17,7 @@ class KnownValue:
     """A value in force.
 
     Attributes:
-        since_ns: when it was last set, or first known, in experiment time.
+        since_ns: the experiment time at which the value was last set, or first known.
         origin: the value at that time. A value only read since then may differ: controllers round, and a person may
             turn a knob.
     """

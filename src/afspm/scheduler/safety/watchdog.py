@@ -37,7 +37,7 @@ class TipEvent(Enum):
     ENDANGERED = "endangered"
     """The holder lost control and left the tip in danger."""
     SEEN_TO = "seen-to"
-    """A person or a solver attends to the tip, or it is out of danger."""
+    """A person or a solver attends to the tip, or the tip is out of danger."""
     SENT = "sent"
     """The microscope is asked to retract the tip."""
     NOT_YET = "not-yet"
@@ -46,11 +46,11 @@ class TipEvent(Enum):
     RETRACTED_LATE = "retracted-late"
     """The microscope has retracted the tip after the deadline."""
     IMPOSSIBLE = "impossible"
-    """The microscope has no such action."""
+    """The microscope has no action to retract the tip."""
     FAILED = "failed"
     """The microscope refuses, or does not end the retract in time."""
     DUE = "due"
-    """It is time to try again."""
+    """A postponed retract is due again."""
     LEFT = "left"
     """The run is stopped with the tip in danger."""
 
@@ -82,9 +82,9 @@ class WatchdogSettings:
         dangerous: the states in which the tip is retracted when its holder loses control: names of ScopeState, and
             "feedback-off".
         retract: the action that retracts the tip; None: never.
-        attempts: how often an action without a response is tried.
-        again_s: how long (real) to wait for the microscope to be free, to have stopped, or to be connected. A tip that
-            could not be retracted is tried again after this time, then after twice as long each time.
+        attempts: the number of attempts at an action without a response.
+        again_s: the real time to wait for the microscope to be free, to have stopped, or to be connected. A failed
+            retract is repeated after this time, then after twice as long each time.
         longest_s: the longest time (real) between two such attempts.
     """
 
@@ -138,7 +138,7 @@ class Watchdog:
         refused_at: number of states seen at the last answer NOT_FREE.
         told_to_stop: a stop was sent for the running measurement.
         unstoppable: the running measurement did not stop.
-        due_s: when `look_again` is due, real.
+        due_s: the real time at which `look_again` is due.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
