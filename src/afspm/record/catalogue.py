@@ -1,4 +1,4 @@
-"""The catalogue of all runs under a folder, with an SQLite index beside them that can be rebuilt at any time."""
+"""The catalogue of all runs under a folder, with an SQLite index that can be rebuilt at any time."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RunSummary:
 
     Attributes:
         folder: relative to the folder of all runs, with "/".
-        name: of the experiment.
+        name: the name of the experiment.
         began_ns, ended_ns: start and end (or last publication) in experiment time; None if nothing was published.
         state: running, ended or cut off, in words.
         metadata: sample, person, project, technique … where known.
@@ -53,9 +53,9 @@ class RunSummary:
         problems: the names of all flagged problems.
         notes: the texts of all notes.
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
-        treatments: how often each action that is not a measurement was executed, by its name.
+        treatments: the number of executions of each action that is not a measurement, by name.
         judged: the number of scans with a verdict on the tip, and of scans with a good last verdict.
-        damage: why the record can't be read; empty if it can.
+        damage: the reason why the record can't be read; empty if it can.
     """
 
     folder: str
@@ -281,12 +281,12 @@ class ProbeHistory:
     """The use of one probe over all its runs.
 
     Attributes:
-        name: of [metadata] `probe`; `UNNAMED` for all runs without one, which may be several probes.
+        name: the name in [metadata] `probe`; `UNNAMED` for all runs without a name, perhaps several probes.
         runs: their folders, oldest first.
         first_ns, last_ns: begin of the first and end of the last run, in experiment time; None: not known.
         scans, spectra: numbers of complete scans and spectra.
         scanned_m: the path along scan lines, trace and retrace, in metres.
-        treatments: how often each was executed, by the name of its action.
+        treatments: the number of executions of each treatment, by the name of its action.
         flagged: the number of runs in which a problem was flagged.
         judged, good: the number of scans with a verdict on the tip, and of scans with a good verdict.
         simulated: whether all runs were simulated.

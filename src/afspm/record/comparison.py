@@ -78,7 +78,7 @@ class ComparedRegion:
 
     Attributes:
         scans: one for each run, in the order of runs; None in a run without a readable scan of the region.
-        differences: by the index of the run, from the first run with a scan.
+        differences: the differences from the first run with a scan, by the index of the run.
     """
 
     name: str
@@ -92,7 +92,7 @@ class RunComparison:
 
     Attributes:
         names: the names of the runs' folders.
-        facts: by heading, a text for each run.
+        facts: a text for each run, by heading.
         settings: keys of the experiment file whose values differ, with a text for each run.
         unread: reasons why settings or scans are missing.
         left_out: the number of common regions that are not shown.

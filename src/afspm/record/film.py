@@ -67,13 +67,13 @@ class Film:
 
     Attributes:
         frames: levelled values, shape (scans, rows, columns), [y, x] ascending; NaN where a scan does not reach.
-        channel, unit: of the values.
+        channel, unit: channel and unit of the values.
         numbers, times_ns: number and end of each scan.
         window: the region of each frame, which is the region of the first scan.
         drift_m: displacement of the sample since the first scan that was subtracted, shape (scans, 2), in m; zeros
             where none was recorded.
         aligned_by: "sample coordinates", "recorded drift", or "" if the scans are as they were measured.
-        name: of the experiment; simulated: whether the microscope was.
+        name: the name of the experiment; simulated: whether the microscope was simulated.
     """
 
     frames: Array

@@ -30,8 +30,8 @@ class MeasuredFiles:
     """The writer of measurement files and their journal rows, within the open transaction.
 
     Args:
-        folder: of the run.
-        facts: of the run, written into every file.
+        folder: the folder of the run.
+        facts: facts of the run, written into every file.
     """
 
     def __init__(

@@ -35,8 +35,8 @@ class ScanSummary:
         shape: (rows, columns).
         holder: the component in control; None if the microscope was free, or the holder is unknown.
         interrupted: the scan is incomplete.
-        setpoint: of the feedback at the start, in the unit of the operating mode; None if it was not published.
-        number: of the scan in the run, from 1; all channels of a scan share it.
+        setpoint: the feedback setpoint at the start, in the unit of the operating mode; None if it was not published.
+        number: the number of the scan in the run, from 1, the same for all its channels.
     """
 
     time_ns: int
@@ -92,11 +92,11 @@ class DriftPoint:
         matched: whether the scan was registered; otherwise the point is a prediction.
         lost: the position of the sample is no longer known.
         correcting: whether components received sample coordinates.
-        reason: why the scan was not registered, or only coarsely.
+        reason: the reason why the scan was not registered, or only coarsely.
         outcome: how the position of the scan is known.
         sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
         failures: the number of errors of the estimator over the scan.
-        filename: of the scan.
+        filename: the file of the scan.
     """
 
     time_ns: int

@@ -49,7 +49,7 @@ class FileProvenance:
     Attributes:
         time_ns: the end of the measurement; began_ns: its start.
         facts: all else, in JSON's types: holder, mode, problems, feedback, drift, the run, its seed …
-        header: of the controller's own file.
+        header: the header of the controller's own file.
     """
 
     time_ns: int

@@ -29,7 +29,7 @@ class Thumbnail:
     Attributes:
         levels: [y, x], y upwards: indices into a colour map.
         span: the values of the first and the last colour, in `unit`.
-        width_m: of the scan.
+        width_m: the width of the scan.
     """
 
     levels: NDArray[np.uint8]

@@ -136,7 +136,7 @@ class ProcessHistory:
     """The past conditions and restarts of the processes.
 
     Attributes:
-        timelines: of the conditions of each process, by name; a busy process counts as alive.
+        timelines: the timeline of each process's conditions, by name; a busy process counts as alive.
         reported_ns: the time of the last report on each process, by name.
         restarts: newest last, bounded.
     """
@@ -167,8 +167,8 @@ class Overview:
         newest_ns: the time of the newest packet; 0 before the first.
         status, control: the newest state of the microscope and of control; None before the first.
         processes, progress_reports: the newest of each, by name.
-        proposals: of agents, by id, newest last, bounded.
-        approvals: of persons, in force.
+        proposals: the proposals of agents by id, newest last, bounded.
+        approvals: the approvals in force.
         log, notes, entries, refusals: newest last, bounded.
     """
 
@@ -288,9 +288,9 @@ class Overview:
 
         Args:
             message: its name, e.g. "Scan2d".
-            thing: as `wire.decode` returns it.
-            time_ns: of the packet.
-            envelope: of the packet; by default the name of the message.
+            thing: the decoded message from `wire.decode`.
+            time_ns: the time of the packet.
+            envelope: the envelope of the packet; by default the name of the message.
         """
         key = envelope or message
         # a scheduler gives each packet a new time: within one envelope, a packet that is not newer is a repetition

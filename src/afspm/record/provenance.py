@@ -74,7 +74,7 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
     """Return the drift mapping published just before a scan; None if there was none.
 
     Args:
-        filenames: of the channels of the scan.
+        filenames: the controller's files of the scan's channels.
     """
     row = journal.execute(
         "SELECT payload FROM packets WHERE message = 'DriftMapping' AND time_ns <= ? AND time_ns > ?"

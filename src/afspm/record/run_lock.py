@@ -1,4 +1,4 @@
-"""The lock that the supervisor of a run holds: it shows whether the run goes on, has ended, or was cut off."""
+"""The lock held by the supervisor of a run: it shows whether the run continues, has ended, or was cut off."""
 
 from __future__ import annotations
 

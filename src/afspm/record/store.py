@@ -56,7 +56,7 @@ class RecordSettings:
 
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
-        frame: of published positions.
+        frame: the coordinate frame of published positions.
         measured: write scans and spectra; otherwise only the journal.
     """
 
@@ -70,7 +70,7 @@ class RecordStore:
     """The record of one run.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
 
     Raises:
         FileError: the journal is damaged.

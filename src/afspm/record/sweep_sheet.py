@@ -28,7 +28,7 @@ Values = tuple[object, ...]
 
 
 def draw(run: Run, title: str) -> None:
-    """Draw `sweep.png` into the folder of a run with scans of a sweep; a second sweep has a number in its name."""
+    """Draw `sweep.png` into the folder of a run with sweep scans; further sweeps have a number in the file name."""
     swept: dict[tuple[str, ...], list[ScanRow]] = {}
     for row in run.scans:
         if row.settings and row.file and not row.interrupted:

@@ -56,11 +56,11 @@ def treatment_ledger(
     """Return the ledger of a run, from its journal and published states.
 
     Args:
-        journal: in the order of time.
+        journal: the journal entries in the order of time.
         positions: times and positions of the probe.
         scanned: beginnings and regions of scans.
-        feedback: times at which its state was published, and whether it was on.
-        end_ns: of the run.
+        feedback: times at which the feedback's state was published, and whether it was on.
+        end_ns: the end of the run.
         keep_away_m: distance from scanned regions within which a treatment counts as near.
     """
     ledger, values, retracted = TreatmentLedger(), dict[str, float](), list[tuple[int, bool]]()

@@ -54,7 +54,7 @@ def profile(values: Array, size_m: tuple[float, float], begin: Pixel, end: Pixel
 
     Args:
         values: [y, x], y ascending; NaN where nothing was measured.
-        size_m: of the scan.
+        size_m: (width, height) of the scan in m.
         begin, end: (column, row), fractions of pixels allowed; positions outside are moved to the border.
     """
     ny, nx = values.shape

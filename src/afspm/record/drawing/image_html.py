@@ -67,7 +67,7 @@ def round_length_m(length_m: float) -> float:
 
 
 def scale_bar(size_m: tuple[float, float]) -> str:
-    """Return the HTML of a scale bar of round length, in the lower left corner of an image of this size."""
+    """Return a scale bar of round length as HTML, for the lower left corner of an image of this size."""
     length_m = round_length_m(size_m[0] / 3.0)
     return (
         f'<div style="position:absolute;left:4%;bottom:4%;width:{100.0 * length_m / size_m[0]:.3g}%">'

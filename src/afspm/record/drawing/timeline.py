@@ -134,7 +134,7 @@ def timeline_html(
     """Return the HTML of a timeline from `begin_ns` (None: the first interval) to `end_ns`, with a time axis.
 
     Args:
-        zone: of the axis; None: this computer's.
+        zone: the time zone of the axis; None: this computer's zone.
         local_too: add a second axis in this computer's zone.
         pictures: (time, HTML) of each, shown above the rows; of overlapping pictures only the last is shown.
         curves: shown below the rows, on the same axis of time.

@@ -38,9 +38,9 @@ class TopographyPicture:
     """A scan with images of its topography; None if its values can't be read.
 
     Attributes:
-        image: in colour, levelled.
-        thumbnail: for the figure of the night.
-        is_bad: drawn with a frame.
+        image: the levelled image in colour.
+        thumbnail: the image for the figure of the night.
+        is_bad: whether the image is drawn with a frame.
         changed_row: the first row with a changed tip, found in the lines of the running scan; None: no change found.
     """
 

@@ -25,7 +25,7 @@ def compare(
     """Return the comparison of each component with a plan.
 
     Args:
-        planned: by component; None: no estimate.
+        planned: the planned work by component; None: no estimate.
         scans, spectra: all of the run; each counts if it began while the component was in control.
     """
     all_scans, all_spectra = list(scans), list(spectra)
