@@ -83,7 +83,8 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
     Args:
         signal: the signal that the feedback holds at the setpoint, such as the amplitude; NaN where not measured.
-        setpoint: in the same unit; None: the signal's median, which equals it unless the feedback is far off.
+        setpoint: the setpoint in the same unit; None: the signal's median, which equals it unless the feedback is far
+            off.
         exponential: whether the signal falls exponentially with the distance, as a tunnelling current of either sign
             does: then its logarithm is compared.
 
@@ -110,8 +111,8 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
     Args:
         error: result of `relative_error`, [y, x].
-        threshold: of the relative error.
-        height_m: of the same pixels; None: the relief is unknown.
+        threshold: the threshold of the relative error.
+        height_m: the heights of the same pixels; None if unknown.
         gap_m: excess height of the tip at a relative error of one.
     """
     there = error[np.isfinite(error)]
@@ -147,7 +148,8 @@ def gain_search(
 
     Args:
         start: within the bounds.
-        factor: of one step, above 1. Between a gain that is too low and one that is too high the steps get smaller.
+        factor: the factor of one step, above 1. Between a gain that is too low and one that is too high the steps get
+            smaller.
         lowest, highest: bounds of the gain.
         most_tries: limit on the number of gains.
     """

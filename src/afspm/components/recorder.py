@@ -1,4 +1,4 @@
-"""`Recorder`: the component that keeps the record of a run. It is part of every experiment unless [record] excludes it."""
+"""`Recorder`: the component that keeps the record of a run, in every experiment unless [record] excludes it."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ DISK_ERRORS = (OSError, sqlite3.OperationalError)
 
 
 class SourcedPacket(NamedTuple):
-    """A packet with its publisher's address; `before` is its position in the log, None if it is not from the log."""
+    """A packet with its publisher's address; `before` is its position in the log, None if not from the log."""
 
     packet: Packet
     source: str = SCHEDULER
@@ -49,7 +49,7 @@ class RecordWriter:
     """A thread that records packets of the log, and packets given by `put`.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
         log: folder of the packet log; without one, all packets are given by `put`.
         step: context manager entered around every slow operation.
         wake: called when the result of `check` or `wants_replay` may have changed.

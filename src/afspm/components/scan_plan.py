@@ -22,7 +22,7 @@ class PlanStep:
     Attributes:
         index: its place in the plan, from 0.
         key: idempotency key, the same after a restart of the component: a measurement is taken only once for each key.
-        region: where to scan.
+        region: the region to scan.
         shape: pixels as (rows, columns); None leaves them unchanged.
         starts_round: whether it waits for the plan's period; later steps of the round do not.
     """
@@ -39,7 +39,7 @@ class ScanPlan:
     """Regions that are scanned one after the other, in one or more rounds.
 
     Attributes:
-        regions: of one round.
+        regions: the regions of one round.
         shape: pixels as (rows, columns); None leaves them unchanged.
         rounds: number of rounds; None: without end.
     """
@@ -79,8 +79,8 @@ class RoundSchedule:
     at the next multiple.
 
     Attributes:
-        start_s: when the first is due.
-        period_s: between two rounds; 0: no pause.
+        start_s: the due time of the first round.
+        period_s: the time between the starts of two rounds; 0: no pause.
     """
 
     start_s: float
@@ -146,7 +146,7 @@ class PlanRest:
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:
-    """Return the points of a grid about a centre, starting at the row of smallest y; every other row runs backwards.
+    """Return the points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
 
     Args:
         counts: (columns, rows).

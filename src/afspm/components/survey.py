@@ -349,8 +349,8 @@ class TargetFinder:
     Attributes:
         function: the user's, "module.name"; None: find particles.
         count: largest number of targets.
-        min_height: of a particle, in the unit of the scan; None: six times the noise.
-        separation_m: of two particles that are nearer to each other only the higher counts.
+        min_height: the least height of a particle, in the unit of the scan; None: six times the noise.
+        separation_m: the least distance of two particles; of a nearer pair only the higher counts.
         widest_m: width of the survey: a particle that fills its zoom must not be taken for ground.
         refines: whether targets are found again in their zooms.
     """

@@ -18,8 +18,8 @@ class RepairCost:
     Attributes:
         pulses: their number.
         depth_m: sum of the depths of crashes.
-        area_m2: of the places used up, each a square with the distance between places as its side.
-        time_s: of repairs, from gaining control to releasing it.
+        area_m2: the area of the used places, each a square with the distance between places as its side.
+        time_s: the time of repairs, from gaining control to releasing it.
     """
 
     pulses: int = 0

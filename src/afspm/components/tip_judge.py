@@ -65,7 +65,7 @@ class Verdict:
     """Opinion on one scan, with a reason for people.
 
     Attributes:
-        flaws: of a bad tip, as far as the scan shows them, the ones hiding others first; a subset of `FLAWS`.
+        flaws: the visible flaws of a bad tip, a subset of `FLAWS`; flaws that hide others come first.
     """
 
     opinion: Opinion
@@ -109,7 +109,7 @@ class KnownPlace:
     """The usual metrics of a region in scans with a good tip.
 
     Attributes:
-        center_m: in the coordinates of the scans.
+        center_m: the centre in the coordinates of the scans.
         usual: mean metrics.
         expected: mean autocorrelation of the slopes.
         scans: number of scans in the means.
@@ -134,8 +134,8 @@ class TipReference:
     """The reference for one kind of scan (same size, angle and shape), from scans with a good tip.
 
     Attributes:
-        size_m, angle_rad, shape: of those scans.
-        places: where they were taken, the last seen at the end.
+        size_m, angle_rad, shape: size, angle and shape of these scans.
+        places: the places of these scans, the last seen at the end.
         first: metrics of the scans that were learnt from.
         deviations: differences of such scans at the same place: detail and unrest as ratios, ghost as it is.
         suspect: whether a fault was found at a known place and is not over yet.
@@ -362,7 +362,7 @@ class TipJudge:
 
 
 class VerdictCounter:
-    """A counter of opinions: a number of bad ones in a row sets the flag, a number of good ones clears it."""
+    """A counter of opinions: several bad opinions in a row set the flag, several good opinions clear it."""
 
     def __init__(self, flag_after: int, clear_after: int) -> None:
         if flag_after < 1 or clear_after < 1:

@@ -36,7 +36,7 @@ class LineVerdict:
     """The verdict that the tip has changed during a scan.
 
     Attributes:
-        region, shape: of the whole scan.
+        region, shape: region and shape of the whole scan.
         began_ns: its start, as in its lines.
         row: index of the row that raised the alarm.
         since_row: index of the first row with the change, by estimate.

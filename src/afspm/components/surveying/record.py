@@ -34,7 +34,7 @@ class Visit:
         number: counts from 1, in the order of the targets.
         center_m: (x, y) from which offsets of curves are counted: the target's position in the survey, or in its zoom.
         zoom: the scan of the target; None: not taken, or not yet.
-        curves: by their names.
+        curves: the measured curves, by name.
         refusals: reasons of refusals.
         registration: how the zoom's position on the sample is known; None without drift correction.
         position_sd_m: standard deviation of that position; None: unknown.
@@ -55,7 +55,7 @@ class SurveyRecord:
 
     Args:
         survey: the wide scan.
-        targets: in the order of their visits.
+        targets: the targets in the order of their visits.
         curves: names of the curves of each target.
 
     Attributes:

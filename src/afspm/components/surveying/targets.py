@@ -40,7 +40,7 @@ class Target:
 
     Attributes:
         position_m: (x, y), in the frame of the scan that it was found in.
-        height: above the ground around it, in the unit of the scan; None: unknown.
+        height: the height above the ground around the target, in the unit of the scan; None: unknown.
     """
 
     position_m: XY
@@ -61,8 +61,8 @@ def find_particles(
 
     Args:
         count: largest number of particles; None: all.
-        min_height: above the ground, in the unit of the scan; None: six times the noise.
-        separation_m: of two particles that are nearer to each other only the higher counts.
+        min_height: the least height above the ground, in the unit of the scan; None: six times the noise.
+        separation_m: the least distance of two particles; of a nearer pair only the higher counts.
         widest_m: wider features count as ground; None: a fifth of the scan's shorter side.
 
     Raises:
