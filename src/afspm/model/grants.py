@@ -52,8 +52,8 @@ class Grant:
         agent: "component:name".
         plan: the id of the approved plan; empty: a grant.
         steps: all requests of the plan, in order.
-        region_m: of a grant: x and y of the centre, width, height; empty: no place may be set.
-        ranges, counts: of a grant: the parameters and actions allowed; all others are refused.
+        region_m: the region of a grant: x and y of the centre, width, height; empty: no place may be set.
+        ranges, counts: the parameters and actions that a grant allows; all others are refused.
         lasts_s: experiment time; 0: all approvals of the agent end.
         run: the run for which the approval is valid.
         limits: digest of the limits that the plan was checked against.
@@ -113,10 +113,10 @@ class Approval:
     """An approval in force.
 
     Attributes:
-        plan: empty: a grant.
+        plan: the id of the approved plan; empty: a grant.
         by: the person who approved.
-        left: of a grant: the actions still allowed.
-        region_m, ranges, counts: of a grant, as in `Grant`.
+        left: the actions that a grant still allows.
+        region_m, ranges, counts: the bounds of a grant, as in `Grant`.
     """
 
     agent: str

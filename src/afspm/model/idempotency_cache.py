@@ -51,7 +51,7 @@ class Floors:
 
     Attributes:
         most: maximum number of sessions.
-        numbers: by client and session, in the order of their last change.
+        numbers: the forgotten numbers by client and session, in the order of their last change.
     """
 
     most: int = 1000

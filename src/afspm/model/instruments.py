@@ -24,10 +24,10 @@ class InstrumentReading:
     """One value of an instrument.
 
     Attributes:
-        name: of the parameter, such as "cryo.temperature".
-        value: in `unit`; None if unknown, then `reason` gives the cause.
+        name: the name of the parameter, such as "cryo.temperature".
+        value: the value in `unit`; None if unknown, then `reason` gives the cause.
         age_s: real time since the instrument measured it; None: never.
-        target: in `unit`; None: it can't be set.
+        target: the target in `unit`; None if the parameter can't be set.
         busy: whether the value is on its way to the target.
     """
 
@@ -50,7 +50,7 @@ class OrderOutcome:
     """The outcome of an order.
 
     Attributes:
-        number: of the order.
+        number: the number of the order.
         response: a `ControlResponse`.
     """
 
@@ -80,7 +80,7 @@ class InstrumentOrder:
 
     Attributes:
         number: identifies the order in its outcome.
-        id: of the client's request: an id is carried out once.
+        id: the id of the client's request, which is carried out once.
         rate_per_s: the fastest change allowed, in `rate_unit` per real second; None: no limit.
     """
 

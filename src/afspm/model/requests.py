@@ -36,12 +36,16 @@ RELAY_REQUEST = 102
 RESTART_REQUEST = 103
 """Request to restart the process named by its subject; an extension of afspm."""
 LEASE_REQUEST = 104
-"""Request of the holder to lose control after a time without another command or lease request, also while a scan is
-running; the subject is this time in real seconds. An extension of afspm."""
+"""Request of the holder to lose control after an idle time, also while a scan is running; an extension of afspm.
+
+The subject is the time in real seconds without another command or lease request.
+"""
 LONGEST_LEASE_S = 86_400.0
 GRANT_REQUEST = 105
-"""Request of a person to approve a plan of an agent, to give it a grant, or to revoke its approvals; the subject is a
-Grant. An extension of afspm."""
+"""Request of a person to approve an agent's plan, to give a grant, or to revoke its approvals; an extension of afspm.
+
+The subject is a Grant.
+"""
 
 OTHER_RUN_RESPONSE = 100
 """Response to a component that named another run than the scheduler's; an extension of afspm."""
@@ -98,7 +102,7 @@ class RescanKind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter by name: without a value in a request to read it, with a value when it is set or published.
+    """A parameter by name: without a value in a request to read the parameter, else with a value.
 
     Attributes:
         value: as text, in `unit`; None to read it.
@@ -146,7 +150,7 @@ class Response:
     Attributes:
         code: the number of a ControlResponse.
         payload: an object in bytes, such as a parameter; mostly empty.
-        reason: why the request failed, for people.
+        reason: the reason of a failure, for people.
         id: id of the answered request, if it had one.
         detail: further facts for programs.
     """

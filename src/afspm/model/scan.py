@@ -334,9 +334,9 @@ class ScanLines:
     """Neighbouring rows of one channel, published while the scan is running.
 
     Attributes:
-        region: of the whole scan.
-        shape: of the whole scan, (rows, columns).
-        channel, unit: of the values.
+        region: the region of the whole scan.
+        shape: (rows, columns) of the whole scan.
+        channel, unit: channel and unit of the values.
         first_row: index in the whole scan of the first of these rows.
         values: [rows, columns], y and x ascending, independent of the scan direction.
         began_ns: start of the scan, ns since the Unix epoch: the same for all lines of a scan.
