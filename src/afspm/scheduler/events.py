@@ -113,7 +113,7 @@ class ProblemSeen:
     """The appearance or disappearance of a problem, found by the scheduler's own process.
 
     Attributes:
-        name: the component in whose name it is flagged.
+        name: the component in whose name the problem is flagged.
     """
 
     problem: int
@@ -203,7 +203,7 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """The effect that answers the peer `name` over `connection`, the newest open one of that name.
+    """The effect that answers the peer `name` over `connection`, its newest open connection.
 
     Attributes:
         asked: the kind of the answered request.

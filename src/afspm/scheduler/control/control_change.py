@@ -37,7 +37,7 @@ class _Change:
     """A change of control, with the input and the row of the table that caused it.
 
     Attributes:
-        had_died: the request comes from a later process of the holder than the one that got control.
+        had_died: whether the request comes from a later process of the holder than the process that got control.
     """
 
     before: ArbitrationState

@@ -89,8 +89,8 @@ class SupervisorRegistry:
         """Return the real time since which a process has ended for good.
 
         Returns:
-            -inf if it ended before a restart of the scheduler. None if it has not ended, or if another supervisor with
-            a recent report has a process of this name that has not.
+            -inf if it ended before a restart of the scheduler. None if it has not ended, or if another supervisor
+            recently reported a process of this name that has not ended.
         """
         having = [one for one in self.supervisors.values() if process in one.processes]
         since_s = max((one.over[process][1] for one in having if process in one.over), default=None)

@@ -79,7 +79,7 @@ class Instruments:
         return instrument_of(parameter) in self.settings.instruments
 
     def reading(self, parameter: str, now_s: float) -> InstrumentReading:
-        """Return the last reading of a parameter, without a value if there is no recent one."""
+        """Return the last reading of a parameter, without a value if there is no recent reading."""
         known = self._of(instrument_of(parameter)).readings.get(parameter)
         if known is None:
             return InstrumentReading(parameter, reason=f"{instrument_of(parameter)} has not reported it")

@@ -33,7 +33,7 @@ from afspm.scheduler.control.descriptions import request_text
 PERIOD_S = 0.1
 """Real time between two publications, at least."""
 MOST = 1000
-"""The largest number of requests logged within `PERIOD_S`; further ones are only counted."""
+"""The largest number of requests logged within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000
 """The longest text of a request or a reason, in characters."""
 

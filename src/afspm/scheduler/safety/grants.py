@@ -1,4 +1,4 @@
-"""Approvals of agents: the requests that a person has approved, and how many of them are left.
+"""Approvals of agents: the requests that a person has approved, and the number of requests left.
 
 An agent is a component whose commands need the approval of a person (`Rules.agents`). An approval is either of one
 plan, whose requests the agent sends in order and exactly as approved, or a grant: a region, ranges and counts within

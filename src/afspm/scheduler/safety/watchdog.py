@@ -109,11 +109,11 @@ class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
-        calls_people: a person must still be called, who decides how to go on: the tip was retracted, or could not be.
+        calls_people: whether a person must still be called: the tip was retracted, or could not be.
         stops: actions to send before the tip is retracted.
-        for_feedback: the tip is in danger because the feedback is off.
-        may_come: the scheduler was killed after it sent a retract: the translator may still have it in its queue, and
-            its answer goes to the killed process.
+        for_feedback: whether the tip is in danger because the feedback is off.
+        may_come: whether a retract sent before a kill of the scheduler may still be in the translator's queue; its
+            answer goes to the killed process.
     """
 
     duty: TipDuty = TipDuty.NONE
@@ -134,10 +134,10 @@ class Watchdog:
     Attributes:
         starting: the action that stops the measurement just started.
         sent: the action that was sent and is not answered.
-        can_retract: the microscope has the action, as far as known.
+        can_retract: whether the microscope has the action to retract, as far as known.
         refused_at: number of states seen at the last answer NOT_FREE.
-        told_to_stop: a stop was sent for the running measurement.
-        unstoppable: the running measurement did not stop.
+        told_to_stop: whether a stop was sent for the running measurement.
+        unstoppable: whether the running measurement failed to stop.
         due_s: the real time at which `look_again` is due.
     """
 
