@@ -101,7 +101,7 @@ def find_runs(
     """Return the runs under a folder whose texts contain all words, the newest first.
 
     Args:
-        root: searched with all its subfolders; keeps the index `runs.sqlite` where it can be written.
+        root: the folder to search with all its subfolders; it gets the index `runs.sqlite` if it is writable.
         words: each in any field, or as "sample:gold" in that field; case is ignored.
         since, until: the first and last day (UTC) with publications.
 

@@ -113,7 +113,7 @@ class Film:
 
         Raises:
             InvalidValue: another ending, or no rate of frames.
-            FileError: it can't be written, or the extra is missing.
+            FileError: the film can't be written, or the extra is missing.
         """
         path = Path(path)
         if path.suffix not in FORMATS:

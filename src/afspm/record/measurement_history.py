@@ -200,7 +200,7 @@ class MeasurementHistory:
         _keep(self._spectra, (measured_ns, spectrum.kind, spectrum.position_m), summary)
 
     def add_drift(self, message: Any) -> None:
-        """Add a `DriftMapping` message; one without a mapping is ignored."""
+        """Add a `DriftMapping` message; a message without a mapping is ignored."""
         if len(message.matrix) != 6 or len(message.center) != 2:
             return
         drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)

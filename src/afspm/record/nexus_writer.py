@@ -166,7 +166,7 @@ def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[s
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return unique names that NeXus allows; the original ones are stored as `long_name`."""
+    """Return unique names that NeXus allows; the original names are stored as `long_name`."""
     found, used = [], set(taken)
     for name in names:
         plain = re.sub(r"[^a-z0-9_]+", "_", name.lower()).strip("_") or "value"

@@ -101,7 +101,7 @@ class NightRecord:
         return record
 
     def add(self, entry: Plain) -> bool:
-        """Add an entry; return False for a known one (packets are replayed after a restart)."""
+        """Add an entry; return False for a known entry (packets are replayed after a restart)."""
         kind, time_ns = entry["kind"], int(entry["time_ns"])
         identity = f"{kind} {time_ns} {entry.get('by', '')}"
         if identity in self._known:
@@ -143,7 +143,7 @@ class NightRecord:
 
     @property
     def problems(self) -> list[int]:
-        """All problems except routine ones, in the order of their first flag."""
+        """All non-routine problems, in the order of their first flag."""
         found = dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems)
         return [problem for problem in found if self.problem_spans(problem)]
 
@@ -158,7 +158,7 @@ class NightRecord:
         return self._spans(lambda state: state.holder == holder, holder)
 
     def problem_spans(self, problem: int) -> list[Span]:
-        """Return the spans in which a problem was flagged, except routine ones."""
+        """Return the spans in which a problem was flagged, except routine spans."""
         spans = self._spans(lambda state: problem in state.problems)
         if problem != Problem.THERMAL_DRIFT:
             return spans

@@ -229,7 +229,7 @@ class Overview:
 
     @property
     def problem_spans(self) -> list[Span]:
-        """The spans of all problems except routine ones, in the order of time."""
+        """The spans of all non-routine problems, in the order of time."""
         spans = (span for lane in self.timelines.problems.values() for span in lane.spans)
         return sorted((span for span in spans if not self.is_routine(span)), key=lambda span: span.start_ns)
 

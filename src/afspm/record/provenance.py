@@ -24,7 +24,7 @@ from afspm.record.drift_mapping import drift_knowledge
 _BACK = 20
 """The number of earlier states that are searched for the start of a measurement."""
 _READINGS_NS = 60 * 10**9
-"""Readings of instruments are published every 10 s at least; older ones belong to an instrument that is gone."""
+"""Readings of instruments are published every 10 s at least; older readings come from a lost instrument."""
 
 
 @dataclass(frozen=True)

@@ -64,10 +64,10 @@ def open_run(path: str | Path = "runs") -> Run:
         [entry.reason for entry in run.refusals]
 
     Args:
-        path: the folder of the run, or of all runs: then the newest run. A replay opens the replayed run.
+        path: the folder of the run, or of all runs: then the newest run. For a replay, the replayed run is opened.
 
     Raises:
-        FileError: there is no record, or it is damaged.
+        FileError: the record is missing or damaged.
     """
     return Run(_folder(Path(path)))
 
@@ -87,7 +87,7 @@ class Run:
 
     @property
     def scans(self) -> KeyedTable[ScanRow]:
-        """One row for each scan, also interrupted ones, in the order of recording."""
+        """One row for each scan, also if interrupted, in the order of recording."""
         return read_scans(self._query)
 
     @property
@@ -208,7 +208,7 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Each flag of a problem, except routine ones.
+        """Each flag of a non-routine problem.
 
         Routine is thermal-drift while the first scan of a run with drift correction is taken in both directions.
         """
@@ -377,7 +377,7 @@ class Run:
         return Frame(self._note("frame") or Frame.TIP.value)
 
     def numbered(self, number: int) -> ScanRow:
-        """Return the scan with a number, as in reports and exports. Raises InvalidValue: there is none."""
+        """Return the scan with a number, as in reports and exports. Raises InvalidValue without such a scan."""
         rows = {row.number: row for row in self.scans}
         if number not in rows:
             hint = f"the last is {max(rows)}" if rows else "there is none yet"

@@ -34,7 +34,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 def cut_off_message(folder: Path) -> str:
     """Return a message about a run that was cut off; empty if it goes on, or has ended.
 
-    Only the computer that ran it can know.
+    Only the computer that ran the run can know.
     """
     facts = run_json_or_empty(folder)
     if not facts or facts.get(ENDED) or other_computer(folder) or not _is_left(folder):

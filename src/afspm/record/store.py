@@ -105,7 +105,7 @@ class RecordStore:
         """Record packets, each with its source, in the order of publication.
 
         Raises:
-            OSError, sqlite3.OperationalError: the disk is full …; then none of them is recorded.
+            OSError, sqlite3.OperationalError: the disk is full …; then no packet is recorded.
         """
         with self._all_or_nothing():
             for packet, source in packets:
@@ -119,12 +119,12 @@ class RecordStore:
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """End every scan, also one with lines only. Raises as `take`."""
+        """End every scan, also a scan with lines only. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
     def has(self, packet: Packet) -> bool:
-        """Return whether a packet is recorded, or waits for others of its scan."""
+        """Return whether a packet is recorded, or waits for other packets of its scan."""
         row = self._journal.execute(
             "SELECT 1 FROM packets WHERE time_ns = ? AND envelope = ?", (packet.time_ns, packet.envelope)
         )

@@ -54,7 +54,7 @@ def _scan(run: Run, row: ScanRow) -> Scan | None:
 def draw_sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], path: Path, title: str) -> None:
     """Draw scans in rows and columns by their settings: the last parameter along a row, all others down the rows.
 
-    All have one range of colours. Of two scans with the same settings the later one is drawn.
+    All scans share one range of colours. Of two scans with the same settings the later scan is drawn.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

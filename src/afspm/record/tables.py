@@ -34,7 +34,7 @@ class SweptSetting(NamedTuple):
 
     @property
     def column(self) -> str:
-        """The name of its column: "scan-speed [m/s]"."""
+        """The column name of the setting: "scan-speed [m/s]"."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
@@ -60,7 +60,7 @@ class ScanRow:
         key: the key of the request, `scope.scan(…, key="tile-1")`; empty without a key.
         registration: how its position on the sample is known; None without drift correction.
         position_sd_m: standard deviation of that position along its most uncertain axis; None if unknown.
-        settings: parameters that a sweep had set for it, as the microscope reported them; a column for each.
+        settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
     """
 
     number: int

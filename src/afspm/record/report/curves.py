@@ -58,7 +58,7 @@ class SpectrumCurves:
 
 @dataclass(frozen=True)
 class SpectrumGroup:
-    """Spectra of one kind with the same variables; `count` includes unread ones."""
+    """Spectra of one kind with the same variables; `count` includes unread spectra."""
 
     measured: Sequence[SpectrumCurves]
     count: int

@@ -114,7 +114,7 @@ def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
 
 
 def topography(scans: ScanSet) -> str:
-    """Return the displayed channel of a scan: one named like a height, else the first."""
+    """Return the displayed channel of a scan: the first with a name like a height, else the first of all."""
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
 
 

@@ -55,9 +55,9 @@ class RunStory:
     Attributes:
         start_ns: the first known time of the run.
         real_s: the duration in real time; None if it is unknown, or the clock ran at real speed.
-        ended: the end of the run as text; or that it goes on, or was cut off.
+        ended: the state of the run as text: its end, running, or cut off.
         frame: the coordinate frame of all positions.
-        problems: spans of all problems except routine ones, in the order of time.
+        problems: spans of all non-routine problems, in the order of time.
         actions: treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
         ledger: totals of the treatments of tip and sample.

@@ -26,7 +26,7 @@ def compare(
 
     Args:
         planned: the planned work by component; None: no estimate.
-        scans, spectra: all of the run; each counts if it began while the component was in control.
+        scans, spectra: all scans and spectra of the run; each counts for the component in control at its start.
     """
     all_scans, all_spectra = list(scans), list(spectra)
     return [
