@@ -107,7 +107,7 @@ def feedback_error(error: Array, threshold: float, height_m: Array | None = None
 
     A loop that lags leaves in the error the relief that is missing in the height. Compared in metres, this ratio is the
     same for every sample, speed and noise, since white noise has no correlation from pixel to pixel. A loop that
-    oscillates moves height and error together; one that lags moves the height by the sum of the error.
+    oscillates moves height and error together; a lagging loop moves the height by the sum of the error.
 
     Args:
         error: result of `relative_error`, [y, x].

@@ -1,4 +1,4 @@
-"""`Notifier`: notifies people during the experiment. Part of every experiment whose file has [notify]."""
+"""`Notifier`: the component that notifies people during the experiment; in every experiment with [notify]."""
 
 from __future__ import annotations
 

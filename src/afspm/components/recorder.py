@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 REST_S = 0.5
 """Shortest real time to stay after the end of the experiment, for the last packets of other components."""
 LONGEST_REST_S = 30.0
-"""Longest such real time; usually the supervisor ends the recorder before, after the other components."""
+"""Longest real time to stay after the end; usually the supervisor ends the recorder before."""
 SIGNS_OF_LIFE = ("ControlState",)
 """The subscription to a scheduler whose log is read: only a sign that the scheduler is alive."""
 

@@ -20,11 +20,11 @@ class PlanStep:
     """One measurement of a plan.
 
     Attributes:
-        index: its place in the plan, from 0.
+        index: the place of the measurement in the plan, from 0.
         key: idempotency key, the same after a restart of the component: a measurement is taken only once for each key.
         region: the region to scan.
         shape: pixels as (rows, columns); None leaves them unchanged.
-        starts_round: whether it waits for the plan's period; later steps of the round do not.
+        starts_round: whether the step waits for the plan's period; later steps of the round do not.
     """
 
     index: int
@@ -130,7 +130,7 @@ class PlanRest:
         return PlanRest(max(self.first, min(at - REST_OVERLAP, self.last - FEWEST_ROWS + 1)), self.last)
 
     def of(self, step: PlanStep) -> PlanStep:
-        """Return the step that measures only these rows, under a key of its own."""
+        """Return the step that measures only these rows, under its own key."""
         rows, columns = step.shape or (0, 0)
         if (self.first, self.last) == (0, rows - 1):
             return step

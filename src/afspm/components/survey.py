@@ -1,4 +1,4 @@
-"""`Survey`: a wide scan, the targets found in it, and a zoom and curves at each."""
+"""`Survey`: a wide scan, the targets found in it, and a zoom and curves at each target."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: registration often refuses narrower ones, and all below 8 px."""
+"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, and below 8 px never."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 

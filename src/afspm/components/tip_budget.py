@@ -16,7 +16,7 @@ class RepairCost:
     """The cost of past repairs, or of one treatment.
 
     Attributes:
-        pulses: their number.
+        pulses: the number of pulses.
         depth_m: sum of the depths of crashes.
         area_m2: the area of the used places, each a square with the distance between places as its side.
         time_s: the time of repairs, from gaining control to releasing it.

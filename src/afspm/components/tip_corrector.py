@@ -70,7 +70,7 @@ class TipCorrector(Component):
         problem: the problem to solve.
         policy: "list" makes the treatments in the order of the lists; "learn" chooses among them, again and again.
         most_treatments: of one repair, with policy = "learn".
-        experience: file of what was learnt, relative to the folder of the runs, with policy = "learn".
+        experience: file of the learnt experience, relative to the folder of the runs, with policy = "learn".
         night_pulses: most pulses of all repairs of a run, also over restarts; by default no bound.
         night_depth: largest sum of the depths of its crashes.
         night_places: most places of treatments, each with an area of `place_spacing` squared.

@@ -5,15 +5,15 @@ worsened it, or did nothing. The next treatment is chosen by Thompson sampling: 
 from the counts, and the treatment with the shortest expected repair under this draw is taken. So a treatment is tried
 the more often the more likely it is the best, and a new one is tried now and then.
 
-The counts of a night become the prior of the next one. They are weakened then, since another night may have another
-answer. Within a night the weight of old outcomes falls with each new one, and a run of failures that the counts call
-improbable weakens the counts of its flaw at once: the tip may have begun to answer otherwise.
+The counts of a night, weakened, become the prior of the next night, since the tip may then answer otherwise. Within a
+night the weight of old outcomes falls with each new one, and a run of failures that the counts call improbable weakens
+the counts of its flaw at once: the tip may have begun to answer otherwise.
 
 Nothing here knows time, files or messages. Each draw follows from the number of the night and of its outcomes, so a
 restarted process, or a replay, chooses the same treatment.
 
-The constants were chosen among some twenty sets, on nights of the public half of the simulated answers and on those of
-one sealed key (`benchmarks/tip_learning.py` judges other nights).
+The constants were chosen among some twenty sets, on nights with the public half of the simulated answers and with one
+sealed key (`benchmarks/tip_learning.py` judges other nights).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PRIOR = {CURED: 0.2, WORSENED: 0.1, UNCHANGED: 0.4}
 MOST_OF_PAST_NIGHTS = 2.0
 """Largest number of outcomes of a treatment that count from past nights."""
 MOST_COUNTED = 12.0
-"""Largest number of outcomes of a treatment that count altogether: older ones fade."""
+"""Largest number of outcomes of a treatment that count altogether: older outcomes fade."""
 IMPROBABLE = 0.02
 """Probability of a run of failures below which the counts of its flaw are weakened."""
 LEFT_AFTER_SURPRISE = 1.0

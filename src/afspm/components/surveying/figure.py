@@ -1,4 +1,4 @@
-"""Picture of a survey: the wide scan with its numbered targets, their zooms, and the curves under each."""
+"""Picture of a survey: the wide scan with its numbered targets, their zooms, and the curves under each zoom."""
 
 from __future__ import annotations
 

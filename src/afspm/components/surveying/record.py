@@ -28,7 +28,7 @@ class Outcome(Enum):
 
 @dataclass(eq=False)
 class Visit:
-    """A target and the measurements at it.
+    """A target with its measurements.
 
     Attributes:
         number: counts from 1, in the order of the targets.
@@ -59,7 +59,7 @@ class SurveyRecord:
         curves: names of the curves of each target.
 
     Attributes:
-        visits: one for each target; fill them in as they are measured.
+        visits: a visit for each target; to be filled in as the targets are measured.
     """
 
     def __init__(self, survey: Scan, targets: Sequence[Target], curves: Sequence[str] = ()) -> None:
