@@ -50,7 +50,7 @@ class PacketLog:
 
     Args:
         folder: created with the first packet.
-        most_unrecorded_bytes: most bytes that wait for the recorder; beyond them the oldest packets are given up.
+        most_unrecorded_bytes: most bytes that wait for the recorder; beyond that the oldest packets are dropped.
 
     Attributes:
         has_grown: a segment was filled since the last `clean`.
@@ -225,7 +225,7 @@ def expect_recorder(folder: Path) -> None:
 
 
 def commit(folder: Path, position: Position) -> None:
-    """Commit a position: everything before it is recorded and on the disk.
+    """Commit a position: all packets before it are recorded and on the disk.
 
     Raises:
         OSError: the disk refuses.
