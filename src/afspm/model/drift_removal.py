@@ -1,4 +1,4 @@
-"""Scans without the drift during their own acquisition."""
+"""Removal of the drift during a scan from its values."""
 
 from __future__ import annotations
 

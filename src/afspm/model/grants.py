@@ -17,7 +17,7 @@ LONGEST_PROPOSAL = 60_000
 
 @dataclass(frozen=True, slots=True)
 class GrantedStep:
-    """One request of an approved plan, exactly as it will be sent.
+    """One request of an approved plan, exactly as sent later.
 
     Attributes:
         request: the number of a ControlRequest.

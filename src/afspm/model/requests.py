@@ -95,7 +95,7 @@ class RescanKind(IntEnum):
     AGAIN = 1
     """Scan the same region again."""
     OPPOSITE = 2
-    """Scan it in the other direction of the slow axis."""
+    """Scan the region in the other direction of the slow axis."""
     SEARCH = 3
     """Scan a wider region, until the sample is found."""
 
@@ -137,7 +137,7 @@ class ResponseDetail(IntEnum):
 
     NONE = 0
     NOT_SENT = 1
-    """A NO_RESPONSE to a request that was certainly not carried out: it may be asked again."""
+    """A NO_RESPONSE to a request that was certainly not carried out, and may be repeated."""
     OUTCOME_UNKNOWN = 2
     """A NO_RESPONSE to a request that may have been carried out."""
     EXPERIMENT_ENDED = 3

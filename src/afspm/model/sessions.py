@@ -1,4 +1,4 @@
-"""Sessions: the one connection that owns a name, over restarts, and with two processes under one name.
+"""Sessions: the decision which connection owns a name, over restarts, and with two processes under one name.
 
 A name belongs to one session at a time: one life of one process. Its first connection binds the name. Later
 connections show the session's token in their request ids ("<name>/<token>/<n>"). For peers without ids, the connection
