@@ -438,7 +438,7 @@ def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> Arbi
 
 
 def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
-    """Return the reason given with a refusal; empty for a success."""
+    """Return the text of a refusal; empty for a success."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
     return row.why.format(

@@ -1,4 +1,4 @@
-"""The registry of supervisors: their processes, and the restarts still to be ordered from each."""
+"""The registry of supervisors: their processes, and the open restart orders of each supervisor."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from afspm.scheduler.control.arbitration import ArbitrationState, ControlInput, 
 from afspm.scheduler.control.descriptions import request_text
 
 PERIOD_S = 0.1
-"""Real time between two publications, at least."""
+"""Least real time between two publications."""
 MOST = 1000
 """The largest number of requests logged within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000

@@ -120,7 +120,7 @@ class Forwarder:
 
     Attributes:
         timeout_s: the real time that a client waits for an answer.
-        patience_s: how much longer to wait for an overdue answer before the next request is sent.
+        patience_s: the further time to wait for an overdue answer before the next request is sent.
         longest_queue: the largest number of waiting requests.
         up: whether the translator is connected.
         flight: the request that the translator is serving.
@@ -171,7 +171,7 @@ class Forwarder:
     def ask_own(
         self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
     ) -> tuple[Forwarder, ForwardedRequest | None]:
-        """Queue a request of the scheduler before those of clients. Return None if no translator is connected."""
+        """Queue a request of the scheduler before clients' requests; return None if no translator is connected."""
         if not self.up:
             return self, None
         number, deadline_s = self.number + 1, now_s + self.timeout_s
