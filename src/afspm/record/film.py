@@ -39,7 +39,7 @@ FORMATS: Final = (".gif", ".mp4")
 WIDTH_PX: Final = 480
 FRAMES_PER_S: Final = 8.0
 _MOST_OFFSET: Final = 0.5
-"""Of a width: scans further apart are of different places."""
+"""Largest offset of scans of one place, as a share of their width."""
 _SIZE_TOLERANCE: Final = 0.05
 _TURN_TOLERANCE_RAD: Final = math.radians(1.0)
 _FONT_PX: Final = 15

@@ -195,7 +195,7 @@ def _late_flags(journal: Iterable[JournalEntry]) -> list[JournalEntry]:
 
 
 def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
-    """Return equal refusals grouped, in the order of their first occurrence."""
+    """Group equal refusals, in the order of their first occurrence."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for entry in refusals:
         groups.setdefault((entry.who, entry.what, entry.reason), []).append(entry.time_ns)
