@@ -27,7 +27,7 @@ from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import experiment_name
 
 MOST_TOLD = 1000
-"""Limit on the delivered notifications to remember: a component that logs ever new texts must not fill the memory."""
+"""Limit on the remembered notifications: a component that logs ever new texts must not fill the memory."""
 LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 

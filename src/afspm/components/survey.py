@@ -49,21 +49,21 @@ class Survey(Component):
         zoom: (width, height) of each zoom, or one length for both.
         curves: places of curves, by name: a pair is an offset (x, y) from the target; a length is a distance, at which
             the lowest place of the zoom is taken; 0 is the target itself, e.g. {top = "0 nm", beside = "150 nm"}.
-        kind: of the curves, if the microscope has several, e.g. "IV" or "force".
+        kind: kind of the curves, if the microscope has several, e.g. "IV" or "force".
         count: largest number of targets to visit.
         center: (x, y) of the middle of the survey.
-        angle: of survey and zooms, counter-clockwise.
+        angle: angle of survey and zooms, counter-clockwise.
         pixels: (columns, rows) of the survey. By default 128, or, up to 512, the number at which a zoom is 20 pixels of
             the survey wide: with fewer, drift between survey and zoom may not be followed.
         zoom_pixels: (columns, rows) of each zoom.
         channel: channel in which targets are found.
-        min_height: of a particle above the ground around it; by default six times the noise.
-        separation: of two particles that are nearer to each other only the higher counts; by default half a zoom.
+        min_height: least height of a particle above the ground around it; by default six times the noise.
+        separation: least distance of two particles, else only the higher counts; by default half a zoom.
         targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it gets the
             `Scan`, and returns positions (x, y) in metres, the best first.
         refine: whether to find the target again in its zoom, so that curves are taken at its place there.
-        parameters: set before the survey, e.g. {scan-speed = "10 um/s"}.
-        zoom_parameters: set before the zooms.
+        parameters: parameters to set before the survey, e.g. {scan-speed = "10 um/s"}.
+        zoom_parameters: parameters to set before the zooms.
         end_when_done: whether to end the whole experiment after the last target.
         file: name of the table and of the picture in the run folder, without `.csv` and `.png`.
     """

@@ -96,7 +96,7 @@ def read_line_verdict(message: Any) -> LineVerdict | None:
 
 
 def verdict_message(scan: Scan, score: float) -> Any:
-    """Return a `SpatialROIWithScoreList` with one place: the scan's, with its time and channel."""
+    """Return a `SpatialROIWithScoreList` with the region, time and channel of a scan, and a score."""
     message: Any = wire.message_type(MESSAGE)(channel=scan.channel)
     if scan.time_ns is not None:
         message.timestamp.FromNanoseconds(scan.time_ns)
