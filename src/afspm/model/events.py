@@ -19,7 +19,7 @@ LOGGED_AS = "afspm"
 LONGEST_ANNOUNCEMENT = 256 * 1024
 """Most bytes of log lines that a supervisor sends in one message."""
 PERSON = ":"
-"""Separates a component from the person it acts for: "dashboard:Ada"."""
+"""The separator of a component and the person it acts for: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
 """In bytes: files are named after processes, on every system."""
 LONGEST_NOTE = 1000

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from afspm.model.requests import Parameter
 
 SEPARATOR = "."
-"""Separates the component's name from the rest in the name of a parameter: "cryo.temperature"."""
+"""The separator of component and parameter in a parameter's name: "cryo.temperature"."""
 PARTS = ("target", "busy")
-"""Endings of names that only read: "cryo.temperature.target", "cryo.temperature.busy"."""
+"""Suffixes of read-only parameter names: "cryo.temperature.target", "cryo.temperature.busy"."""
 
 
 def instrument_of(parameter: str) -> str:
