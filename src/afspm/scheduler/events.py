@@ -269,7 +269,7 @@ class Kill:
     """The effect that ends the experiment: the signal KILL is published, and the sockets are closed.
 
     Attributes:
-        tip_is_safe: the translator may leave; if False, it retracts the tip itself when it is stopped.
+        tip_is_safe: whether the translator may exit; if False, the translator retracts the tip when it is stopped.
     """
 
     tip_is_safe: bool = True

@@ -30,7 +30,7 @@ from afspm.scheduler.safety.watchdog import WatchdogSettings
 
 DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SPEC", "feedback-off"]
 AdjustableParameter = Literal["zctrl-setpoint", "zctrl-pgain", "zctrl-igain", "tip-bias-voltage"]
-"""None of these moves the tip elsewhere, so a person may set it while a component measures."""
+"""Parameters that a person may set while a component measures, since none of them moves the tip elsewhere."""
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ class MeasuringCondition:
         bands: the bands by parameter; all must hold.
         actions: the actions refused while the condition does not hold.
         problem: the problem flagged while the condition does not hold; empty: no problem.
-        source: where it was set, e.g. "experiment.toml:42".
+        source: the place in the experiment file, e.g. "experiment.toml:42".
     """
 
     bands: Mapping[str, AllowedBand] = field(default_factory=dict)

@@ -11,9 +11,9 @@ from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, Ins
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 
 PUBLISH_S = 10.0
-"""Unchanged readings are published at this interval, real."""
+"""Interval of publications of unchanged readings, real."""
 PUBLISH_CHANGED_S = 1.0
-"""Changed numbers are published at this interval, real, at least."""
+"""Least interval of publications of changed numbers, real."""
 _MOST_PARAMETERS = 100  # of one instrument: memory must stay bounded
 _NEVER_S = float("-inf")
 _JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age is still one

@@ -57,7 +57,7 @@ class ForwardedRequest(NamedTuple):
     Attributes:
         client: the name of the client; empty for a request of the scheduler itself.
         command: whether only the holder of control may send the request.
-        deadline_s: the real time by which the request must be answered; 0: no deadline yet.
+        deadline_s: the deadline of the answer, real; 0: no deadline yet.
         sent_s: the real time of sending; None while the request waits.
         answered: whether the client has got "no response in time".
         connection: the connection over which the request arrived.

@@ -6,8 +6,8 @@ which the agent measures by itself. Both are one more set of limits for that nam
 
     comes in      approvals, and ends of approvals; requests of agents, at arrival and right before they are sent
     state         `GrantBook`: approvals in force, and the uses of the last hour; saved before a request is sent
-    always holds  a request is spent at most once under its id, and only a request that was certainly not carried out is
-                  returned; without an approval no command of an agent is sent
+    always holds  a request counts at most once under its id, and only the use of a request that was certainly not
+                  carried out is undone; without an approval no command of an agent is sent
 """
 
 from __future__ import annotations

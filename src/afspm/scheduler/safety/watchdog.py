@@ -248,9 +248,9 @@ class Watchdog:
         """Process the loss of control for `cause` while the action `in_flight` was with the translator.
 
         Args:
-            had_died: the process that got control has died; its restarted successor gives control back.
-            by_holder: the holder itself caused the loss.
-            was_seen_to: the holder was attending to a tip that was not retracted.
+            had_died: whether the process that got control has died; its restarted successor gives control back.
+            by_holder: whether the holder itself caused the loss.
+            was_seen_to: whether the holder was attending to a tip that was not retracted.
         """
         # a holder that gives control back knows the state it leaves, and so does a person who takes control
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
