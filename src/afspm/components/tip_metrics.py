@@ -129,7 +129,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
 
 def ghost(correlation: Array, expected: Array | None = None) -> float:
-    """Return the largest correlation beside the centre, less the expected one."""
+    """Return the largest correlation beside the centre, less the expected correlation."""
     beyond = _smoothed(correlation if expected is None else correlation - expected)
     reach = correlation.shape[0] - 1
     rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]

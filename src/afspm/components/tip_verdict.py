@@ -37,12 +37,12 @@ class LineVerdict:
 
     Attributes:
         region, shape: region and shape of the whole scan.
-        began_ns: its start, as in its lines.
+        began_ns: the start of the scan, as in its lines.
         row: index of the row that raised the alarm.
         since_row: index of the first row with the change, by estimate.
         downwards: whether rows are scanned from the last to the first.
         confidence: share of scans with a good tip that give less evidence.
-        stops: the scan is stopped; else a person may look.
+        stops: whether the scan is stopped; else a person may look.
     """
 
     region: Region
