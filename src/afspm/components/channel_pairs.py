@@ -1,4 +1,4 @@
-"""Channels of a scan, which are published one by one: pairs of trace and retrace, and a warning if one is missing."""
+"""Channels of a scan, which arrive one by one: pairs of trace and retrace, and a warning about missing channels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`FeedbackAnalysis`: judges how well the feedback follows, and flags a problem if it does not."""
+"""`FeedbackAnalysis`: the judge of how well the feedback follows; it flags a problem if the feedback is bad."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ MESSAGE = "FeedbackAnalysis"
 class FeedbackAnalysis(FeedbackObserver):
     """A component that publishes a `FeedbackAnalysis` after each scan: the shares of pixels with too large an error.
 
-    Flags `feedback-non-optimal` when several scans in a row leave too much in the error, and clears the flag when scans
-    leave less than half of that; while a component has control to solve the problem, that component decides. If the
+    It flags `feedback-non-optimal` when several scans in a row have too large an error, and clears the flag when scans
+    have less than half that error; while a component has control to solve the problem, that component decides. If the
     flag was cleared although the feedback is no better, it is not set again until the feedback has followed well in
     between. Scans with the feedback off are not judged.
 

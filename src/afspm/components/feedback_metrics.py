@@ -35,7 +35,7 @@ class FeedbackQuality(Enum):
 
 @dataclass(frozen=True)
 class FeedbackError:
-    """Error signal of one scan.
+    """Measures of the error signal of one scan.
 
     Attributes:
         over: share of the pixels, 0 to 1, where the signal exceeds the setpoint by more than the threshold: in tapping
@@ -70,7 +70,7 @@ class FeedbackLimits:
     relief: float = 0.2
 
     def judge(self, error: FeedbackError) -> FeedbackQuality:
-        """Return the quality of one scan. WELL needs half the limits, as a margin."""
+        """Return the quality of the feedback in one scan; WELL needs half the limits, as a margin."""
         worst = max(error.share / self.pixels, error.missed / self.relief)
         if worst <= 1.0:
             return FeedbackQuality.WELL if worst <= 0.5 else FeedbackQuality.BARELY
@@ -83,7 +83,8 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
     Args:
         signal: the signal that the feedback holds at the setpoint, such as the amplitude; NaN where not measured.
-        setpoint: in the same unit; None: the signal's median, which equals it unless the feedback is far off.
+        setpoint: the setpoint in the same unit; None: the signal's median, which equals it unless the feedback is far
+            off.
         exponential: whether the signal falls exponentially with the distance, as a tunnelling current of either sign
             does: then its logarithm is compared.
 
@@ -102,16 +103,16 @@ def relative_error(signal: Array, setpoint: float | None, exponential: bool) -> 
 
 
 def feedback_error(error: Array, threshold: float, height_m: Array | None = None, gap_m: float = 0.0) -> FeedbackError:
-    """Return the error signal of one scan.
+    """Return the measures of the error signal of one scan.
 
     A loop that lags leaves in the error the relief that is missing in the height. Compared in metres, this ratio is the
     same for every sample, speed and noise, since white noise has no correlation from pixel to pixel. A loop that
-    oscillates moves height and error together; one that lags moves the height by the sum of the error.
+    oscillates moves height and error together; a lagging loop moves the height by the sum of the error.
 
     Args:
         error: result of `relative_error`, [y, x].
-        threshold: of the relative error.
-        height_m: of the same pixels; None: the relief is unknown.
+        threshold: the threshold of the relative error.
+        height_m: the heights of the same pixels; None if unknown.
         gap_m: excess height of the tip at a relative error of one.
     """
     there = error[np.isfinite(error)]
@@ -140,14 +141,15 @@ def _smooth_variance(values: Array) -> float:
 def gain_search(
     start: float, factor: float, lowest: float, highest: float, most_tries: int
 ) -> Generator[float, FeedbackQuality | None, float | None]:
-    """Search a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
+    """Search for a gain at which the feedback follows well: raise it while too slow, lower it while oscillating.
 
     Yields gains to try, `start` first; send it the quality at each, or None if the gain was refused. Returns the gain
     to keep, or None if no gain was good.
 
     Args:
         start: within the bounds.
-        factor: of one step, above 1. Between a gain that is too low and one that is too high the steps get smaller.
+        factor: the factor of one step, above 1. Between a gain that is too low and one that is too high the steps get
+            smaller.
         lowest, highest: bounds of the gain.
         most_tries: limit on the number of gains.
     """

@@ -25,7 +25,7 @@ class FeedbackSignal:
     The microscope is asked once for each unit whether the unit fits the setpoint.
 
     Args:
-        threshold: of the error, as a share of the setpoint (of a current: of its logarithm); None: 0.1, and 0.5 for a
+        threshold: largest error, as a share of the setpoint (of a current: of its logarithm); None: 0.1, and 0.5 for a
             current.
         sensitivity: height in m for 1 V of the channel, or, for a current, for a factor e; None: 50 nm, and 0.05 nm.
     """
@@ -91,7 +91,7 @@ class FeedbackObserver(Component):
     Args:
         channel: the signal that the feedback holds at the setpoint, in a unit that fits the setpoint's.
         height: the channel of the heights; empty if not recorded: then a slightly slow feedback is not detected.
-        threshold: of the error, as a share of the setpoint (of a current: of its logarithm); by default 0.1, and 0.5
+        threshold: largest error, as a share of the setpoint (of a current: of its logarithm); by default 0.1, and 0.5
             for a current.
         limit: share of the pixels that may lie beyond the threshold.
         relief_limit: share of the relief that may be in the error instead of the height.

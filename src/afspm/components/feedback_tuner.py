@@ -1,4 +1,4 @@
-"""`FeedbackTuner`: searches a better integral gain when `feedback-non-optimal` is flagged."""
+"""`FeedbackTuner`: the search for a better integral gain when `feedback-non-optimal` is flagged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ BACK_WITHIN_S = 60.0
 
 
 class FeedbackTuner(FeedbackObserver):
-    """A solver of `feedback-non-optimal`: it scans the current region, and searches a good integral gain.
+    """A solver of `feedback-non-optimal`: it scans the current region, and searches for a good integral gain.
 
     It raises the gain while the feedback is too slow, and lowers it while it oscillates. If no gain is good, it
     restores the original gain, logs that, and clears the flag, so that the experiment continues as before. The original
@@ -23,8 +23,8 @@ class FeedbackTuner(FeedbackObserver):
 
     Args:
         lowest_gain, highest_gain: bounds of the integral gain.
-        factor: of one step.
-        most_tries: test scans of one search.
+        factor: factor on the gain in one step.
+        most_tries: largest number of test scans of one search.
     """
 
     solves: ClassVar = ("feedback-non-optimal",)

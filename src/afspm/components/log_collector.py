@@ -21,7 +21,7 @@ class LogCollector(Component):
     processes; the scheduler also publishes the lines, from INFO on, and this component writes them.
 
     Args:
-        file: its name in the run folder.
+        file: name of the file in the run folder.
         level: lowest level that is written.
     """
 

@@ -32,7 +32,7 @@ class Metadata(Component):
     The file has one header, and each row exactly once, even if processes are killed.
 
     Args:
-        file: its name in the run folder.
+        file: name of the file in the run folder.
     """
 
     listens: ClassVar = ("Scan2d", "Spec1d", "ControlState", "ScopeStateMsg", "Note")

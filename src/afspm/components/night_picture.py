@@ -23,9 +23,9 @@ class NightPicture(Component):
     killed and restarted, it draws the same picture.
 
     Args:
-        channel: shown of each scan.
+        channel: shown channel of each scan.
         file: the picture's name in the run folder.
-        title: above the picture.
+        title: title above the picture.
     """
 
     def __init__(self, channel: str = "Height", file: str = "night.png", title: str = "") -> None:

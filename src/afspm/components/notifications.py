@@ -63,7 +63,7 @@ class Notification:
 
 @dataclass(frozen=True)
 class Targets:
-    """Targets of notifications.
+    """The command and the webhook that get the notifications.
 
     Attributes:
         command: program and arguments; it gets the JSON on its standard input.

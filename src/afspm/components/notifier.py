@@ -1,4 +1,4 @@
-"""`Notifier`: notifies people during the experiment. Part of every experiment whose file has [notify]."""
+"""`Notifier`: the component that notifies people during the experiment; in every experiment with [notify]."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from afspm.model.events import LOGGED_AS
 from afspm.record.run_json import experiment_name
 
 MOST_TOLD = 1000
-"""Limit on the delivered notifications to remember: a component that logs ever new texts must not fill the memory."""
+"""Limit on the remembered notifications: a component that logs ever new texts must not fill the memory."""
 LAST_TRIES = 2  # the end of the experiment does not wait for more
 
 

@@ -45,14 +45,14 @@ class PlannedScans(Component):
     Args:
         keep_control: whether to keep control between scans; by default others may measure meanwhile.
         end_when_done: whether to end the whole experiment after the last scan.
-        parameters: set before the first scan, e.g. {scan-speed = "2 um/s"}.
+        parameters: parameters to set before the first scan, e.g. {scan-speed = "2 um/s"}.
         missed: treatment of scans that were due while control was lost (MANUAL, the repair of a tip). "extend": they
             are taken after the others, with the same period; "catch-up": at once, one after the other; "skip": never;
             "rest": as "extend", and of a scan that a `LineWatch` stopped only the rows since the change are taken.
 
     Attributes:
         plan: the regions, and the number of rounds.
-        beat_s: between the starts of two rounds, experiment time; 0: no pause.
+        beat_s: experiment time between the starts of two rounds; 0: no pause.
         ends_on_time: whether rounds that are left out because a round takes longer than the period count as taken, so
             that the plan ends on time. Rounds missed while no process ran, before a restart, don't count.
     """
@@ -229,10 +229,10 @@ class ScanSeries(PlannedScans):
 
     Args:
         size: (width, height) of the region, e.g. ["2 um", "2 um"].
-        center: (x, y) of its middle.
-        angle: counter-clockwise.
+        center: (x, y) of the middle of the region.
+        angle: angle of the region, counter-clockwise.
         pixels: (columns, rows).
-        every: from the start of one scan to the start of the next, experiment time; 0 for no pause.
+        every: experiment time from the start of one scan to the start of the next; 0 for no pause.
         scans: number of scans.
         duration: time within which scans are started (instead of `scans`).
     """
@@ -276,10 +276,10 @@ class ScanList(PlannedScans):
     """Regions of a list, in order, in one or more rounds.
 
     Args:
-        regions: each with center, size and angle.
-        pixels: (columns, rows) of each.
+        regions: list of regions, each with center, size and angle.
+        pixels: (columns, rows) of each scan.
         rounds: number of rounds.
-        every: from the start of one round to the start of the next, experiment time.
+        every: experiment time from the start of one round to the start of the next.
     """
 
     def __init__(
@@ -302,12 +302,12 @@ class RegionGrid(PlannedScans):
     Args:
         size: (width, height) of each region.
         counts: (columns, rows) of the grid.
-        spacing: (x, y) from one centre to the next; by default the size, so that the regions touch.
+        spacing: (x, y) distance from one centre to the next; by default the size, so that the regions touch.
         center: (x, y) of the middle of the grid.
-        angle: of grid and regions, counter-clockwise.
+        angle: angle of grid and regions, counter-clockwise.
         pixels: (columns, rows) of each scan.
         rounds: number of rounds.
-        every: from the start of one round to the start of the next, experiment time.
+        every: experiment time from the start of one round to the start of the next.
     """
 
     def __init__(
@@ -329,7 +329,7 @@ class RegionGrid(PlannedScans):
 
 
 def pair(values: Sequence[float]) -> XY:
-    """Return two numbers, which JSON delivers as a list, as a tuple."""
+    """Return a pair of numbers as a tuple; JSON delivers it as a list."""
     if len(values) != 2:
         raise InvalidValue(f"{list(values)!r} is not a pair of x and y")
     return float(values[0]), float(values[1])

@@ -1,4 +1,4 @@
-"""`Recorder`: keeps the record of a run. Part of every experiment, unless [record] of its file says otherwise."""
+"""`Recorder`: the component that keeps the record of a run, in every experiment unless [record] excludes it."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 REST_S = 0.5
 """Shortest real time to stay after the end of the experiment, for the last packets of other components."""
 LONGEST_REST_S = 30.0
-"""Longest such time; before, the supervisor asks the recorder to end, after the other components."""
+"""Longest real time to stay after the end; usually the supervisor ends the recorder before."""
 SIGNS_OF_LIFE = ("ControlState",)
-"""Subscription to a scheduler whose log is followed: only to notice that it lives."""
+"""The subscription to a scheduler whose log is read: only a sign that the scheduler is alive."""
 
 
 class Recorder(Component):

@@ -1,4 +1,4 @@
-"""The recorder's thread: follows the packet log and writes the record, so that a slow disk delays no other process."""
+"""The recorder's thread, which follows the packet log and writes the record: a slow disk delays no other process."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from afspm.record.store import RecordSettings, RecordStore
 from afspm.storage.packet_log import SEGMENT_BYTES, START, LogReader, Position, commit, committed
 
 MOST_BYTES = 256 << 20
-"""Limit on waiting packets of other publishers; beyond it all are dropped, and asked for again once there is room."""
+"""Limit in bytes on waiting packets of other publishers; beyond it all are dropped, and requested again later."""
 # backlog above which a warning is logged: the log is finite, and its oldest packets are overwritten
 FAR_BEHIND_BYTES = 64 << 20
 # limits the memory for one batch, and the length of one step
@@ -38,7 +38,7 @@ DISK_ERRORS = (OSError, sqlite3.OperationalError)
 
 
 class SourcedPacket(NamedTuple):
-    """A packet with its publisher's address; `before` is its position in the log, None if it is not from the log."""
+    """A packet with its publisher's address; `before` is its position in the log, None if not from the log."""
 
     packet: Packet
     source: str = SCHEDULER
@@ -49,7 +49,7 @@ class RecordWriter:
     """A thread that records packets of the log, and packets given by `put`.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
         log: folder of the packet log; without one, all packets are given by `put`.
         step: context manager entered around every slow operation.
         wake: called when the result of `check` or `wants_replay` may have changed.
@@ -91,7 +91,7 @@ class RecordWriter:
         self._inbox.put(SourcedPacket(packet, source), is_disk_full=self._told_full)
 
     def wants_replay(self) -> bool:
-        """Return whether to ask publishers for their cached packets: some were missed, and the disk has room now."""
+        """Return whether to request publishers' cached packets: some were missed, and the disk has room again."""
         return self._inbox.wants_replay()
 
     def check(self) -> None:
@@ -258,20 +258,23 @@ class RecordInbox:
             self._changed.notify()
 
     def take(self, *, within_s: float) -> tuple[list[SourcedPacket], bool | None]:
-        """Return queued packets, and the end if it has come. Waits for many packets, or for the end."""
+        """Return the queued packets, and whether the experiment has ended (None: the recording continues).
+
+        Waits up to `within_s` for many packets, or for the end.
+        """
         with self._changed:
             self._changed.wait_for(lambda: self._bytes > AT_ONCE_BYTES or self._ending is not None, within_s)
             queued, self._queue, self._bytes = self._queue, [], 0
             return queued, self._ending
 
     def end(self, until_s: float, *, ended: bool) -> None:
-        """Let the writing end by `until_s`; `ended`: the experiment has ended, too."""
+        """Ask the writer to end by `until_s`; `ended`: whether the experiment has ended."""
         with self._changed:
             self._ending, self._until_s = ended, until_s
             self._changed.notify()
 
     def pause(self) -> float | None:
-        """Wait a while for room on the disk; return the time limit for that, None if there is none."""
+        """Wait a moment for room on the disk; return the time limit for such waits, None without a limit."""
         with self._changed:
             self._changed.wait_for(lambda: False, AGAIN_S if self._ending is None else AGAIN_S / 10)
             return None if self._ending is None else self._until_s
@@ -281,14 +284,14 @@ class RecordInbox:
             self._wants_replay = True
 
     def has_room_for_missed(self) -> bool:
-        """Have publishers asked for their cached packets if some were missed; return whether some were."""
+        """Request publishers' cached packets if some were missed; return whether some were."""
         with self._changed:
             missed, self._missed = self._missed, False
             self._wants_replay = self._wants_replay or missed
             return missed
 
     def wants_replay(self) -> bool:
-        """Return, once, whether to ask publishers for their cached packets."""
+        """Return once whether to request publishers' cached packets."""
         with self._changed:
             wanted, self._wants_replay = self._wants_replay, False
             return wanted
@@ -313,7 +316,7 @@ class LogProgress:
         self._waiting.clear()
 
     def stop(self) -> None:
-        """Commit no more: a packet was read that could not be recorded."""
+        """Stop committing positions, since a packet that was read could not be recorded."""
         self._stopped = True
 
     def read(self) -> list[SourcedPacket]:

@@ -20,11 +20,11 @@ class PlanStep:
     """One measurement of a plan.
 
     Attributes:
-        index: its place in the plan, from 0.
+        index: the place of the measurement in the plan, from 0.
         key: idempotency key, the same after a restart of the component: a measurement is taken only once for each key.
-        region: where to scan.
+        region: the region to scan.
         shape: pixels as (rows, columns); None leaves them unchanged.
-        starts_round: whether it waits for the plan's period; later steps of the round do not.
+        starts_round: whether the step waits for the plan's period; later steps of the round do not.
     """
 
     index: int
@@ -39,7 +39,7 @@ class ScanPlan:
     """Regions that are scanned one after the other, in one or more rounds.
 
     Attributes:
-        regions: of one round.
+        regions: the regions of one round.
         shape: pixels as (rows, columns); None leaves them unchanged.
         rounds: number of rounds; None: without end.
     """
@@ -79,8 +79,8 @@ class RoundSchedule:
     at the next multiple.
 
     Attributes:
-        start_s: when the first is due.
-        period_s: between two rounds; 0: no pause.
+        start_s: the due time of the first round.
+        period_s: the time between the starts of two rounds; 0: no pause.
     """
 
     start_s: float
@@ -91,7 +91,7 @@ class RoundSchedule:
             raise InvalidValue(f"a period of {self.period_s} s")
 
     def next_due_s(self, done_s: float | None) -> float:
-        """Return when the next round is due after one that ended at `done_s`; None: none has ended yet."""
+        """Return when the next round is due after a round that ended at `done_s`; None: no round has ended yet."""
         if done_s is None or self.period_s == 0.0:
             return self.start_s
         beats = math.floor((done_s - self.start_s) / self.period_s) + 1
@@ -102,7 +102,7 @@ class RoundSchedule:
         return max(0, round((next_due_s - due_s) / self.period_s) - 1) if self.period_s else 0
 
     def too_slow_for(self, left_out: int, pace_s: float) -> int:
-        """Return how many of these rounds were missed because one takes `pace_s`, longer than the period."""
+        """Return how many of these rounds were missed because a round takes `pace_s`, longer than the period."""
         return min(left_out, max(0, math.ceil(pace_s / self.period_s - 1e-9) - 1)) if self.period_s else 0
 
 
@@ -118,7 +118,7 @@ class PlanRest:
     last: int
 
     def since(self, row: int, *, downwards: bool) -> PlanRest:
-        """Return the rows from one of these on, with some before it, as a part of the whole scan.
+        """Return the rows from a row of this part on, with a few rows of overlap before it.
 
         Args:
             row: index in this part.
@@ -130,7 +130,7 @@ class PlanRest:
         return PlanRest(max(self.first, min(at - REST_OVERLAP, self.last - FEWEST_ROWS + 1)), self.last)
 
     def of(self, step: PlanStep) -> PlanStep:
-        """Return the step that measures only these rows, under a key of its own."""
+        """Return the step that measures only these rows, under its own key."""
         rows, columns = step.shape or (0, 0)
         if (self.first, self.last) == (0, rows - 1):
             return step
@@ -146,7 +146,7 @@ class PlanRest:
 
 
 def grid_centers(center_m: XY, counts: tuple[int, int], spacing_m: XY, angle_rad: float = 0.0) -> tuple[XY, ...]:
-    """Return the points of a grid about a centre, starting at the row of smallest y; every other row runs backwards.
+    """Return the points of a grid about a centre, from the row of smallest y on; every other row runs backwards.
 
     Args:
         counts: (columns, rows).

@@ -23,11 +23,11 @@ class SpectroscopyGrid(Component):
 
     Args:
         counts: (columns, rows) of the grid.
-        spacing: (x, y) from one point to the next.
+        spacing: (x, y) distance from one point to the next.
         center: (x, y) of the middle of the grid; by default (0, 0).
-        angle: of the grid, counter-clockwise; by default 0.
+        angle: angle of the grid, counter-clockwise; by default 0.
         positions: a list of (x, y) instead of a grid.
-        kind: of the spectrum, if the microscope has several, e.g. "IV" or "force".
+        kind: kind of spectrum, if the microscope has several, e.g. "IV" or "force".
         repeats: number of spectra at each point.
         end_when_done: whether to end the whole experiment after the last.
     """

@@ -1,4 +1,4 @@
-"""`Survey`: a wide scan, the targets found in it, and a zoom and curves at each."""
+"""`Survey`: a wide scan, the targets found in it, and a zoom and curves at each target."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from afspm.transport.process.loading import find_object
 
 MAPPING = "DriftMapping"
 LEAST_ZOOM_PX = 20
-"""Least width of a zoom in pixels of the survey: registration often refuses narrower ones, and all below 8 px."""
+"""Least width of a zoom in pixels of the survey: narrower zooms are often not registered, and below 8 px never."""
 USUAL_PX, MOST_PX, _STEP_PX = 128, 512, 16
 
 
 class Survey(Component):
     """A wide scan, a search for targets in it, and a zoom and curves at each target.
 
-    It leaves a table in the run folder (number, position, height, outcome, files of zoom and curves) and a picture: the
-    survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
+    It writes a table into the run folder (number, position, height, outcome, files of zoom and curves) and a picture:
+    the survey with its numbered targets, their zooms and curves. If the zoom or a curve of a target is refused, for
     instance by a limit, the table has the reason, and the survey goes on with the next target. With a Drift Compensated
     Scheduler, positions are those on the sample.
 
@@ -49,21 +49,21 @@ class Survey(Component):
         zoom: (width, height) of each zoom, or one length for both.
         curves: places of curves, by name: a pair is an offset (x, y) from the target; a length is a distance, at which
             the lowest place of the zoom is taken; 0 is the target itself, e.g. {top = "0 nm", beside = "150 nm"}.
-        kind: of the curves, if the microscope has several, e.g. "IV" or "force".
+        kind: kind of the curves, if the microscope has several, e.g. "IV" or "force".
         count: largest number of targets to visit.
         center: (x, y) of the middle of the survey.
-        angle: of survey and zooms, counter-clockwise.
+        angle: angle of survey and zooms, counter-clockwise.
         pixels: (columns, rows) of the survey. By default 128, or, up to 512, the number at which a zoom is 20 pixels of
             the survey wide: with fewer, drift between survey and zoom may not be followed.
         zoom_pixels: (columns, rows) of each zoom.
         channel: channel in which targets are found.
-        min_height: of a particle above the ground around it; by default six times the noise.
-        separation: of two particles that are nearer to each other only the higher counts; by default half a zoom.
+        min_height: least height of a particle above the ground around it; by default six times the noise.
+        separation: least distance of two particles, else only the higher counts; by default half a zoom.
         targets: a function of yours that finds targets instead of particles, e.g. "my_module.corners": it gets the
             `Scan`, and returns positions (x, y) in metres, the best first.
         refine: whether to find the target again in its zoom, so that curves are taken at its place there.
-        parameters: set before the survey, e.g. {scan-speed = "10 um/s"}.
-        zoom_parameters: set before the zooms.
+        parameters: parameters to set before the survey, e.g. {scan-speed = "10 um/s"}.
+        zoom_parameters: parameters to set before the zooms.
         end_when_done: whether to end the whole experiment after the last target.
         file: name of the table and of the picture in the run folder, without `.csv` and `.png`.
     """
@@ -349,8 +349,8 @@ class TargetFinder:
     Attributes:
         function: the user's, "module.name"; None: find particles.
         count: largest number of targets.
-        min_height: of a particle, in the unit of the scan; None: six times the noise.
-        separation_m: of two particles that are nearer to each other only the higher counts.
+        min_height: the least height of a particle, in the unit of the scan; None: six times the noise.
+        separation_m: the least distance of two particles; of a nearer pair only the higher counts.
         widest_m: width of the survey: a particle that fills its zoom must not be taken for ground.
         refines: whether targets are found again in their zooms.
     """

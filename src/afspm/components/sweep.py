@@ -38,13 +38,13 @@ class Sweep(Component):
         measure: the measurement at each point.
         order: "snake": from point to point one parameter changes, to a neighbouring value; "listed": nested loops over
             the values as listed; "random": shuffled by `seed`.
-        seed: of the random order.
+        seed: seed of the random order.
         size: (width, height) of the scans; by default the present region.
         center: (x, y) of the middle of the scans; (0, 0) if not given.
-        angle: of the scans, counter-clockwise; 0 if not given.
+        angle: angle of the scans, counter-clockwise; 0 if not given.
         pixels: (columns, rows) of the scans; by default the present ones.
         at: (x, y) of the spectra; by default where the probe stands.
-        kind: of the spectra, where the microscope can choose, e.g. "IV" or "force".
+        kind: kind of the spectra, where the microscope can choose, e.g. "IV" or "force".
         end_when_done: whether to end the whole experiment after the last point.
     """
 

@@ -1,4 +1,4 @@
-"""The budget of a night for tip repairs: what the treatments of all repairs together may amount to. Pure."""
+"""The budget of a night for tip repairs: bounds on the treatments of all repairs together. Pure."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ _ROUNDING = 1e-9  # relative: five crashes of 4 nm fit into 20 nm
 
 @dataclass(frozen=True)
 class RepairCost:
-    """What was spent, or one treatment will spend.
+    """The cost of past repairs, or of one treatment.
 
     Attributes:
-        pulses: their number.
+        pulses: the number of pulses.
         depth_m: sum of the depths of crashes.
-        area_m2: of the places used up, each a square with the distance between places as its side.
-        time_s: of repairs, from gaining control to releasing it.
+        area_m2: the area of the used places, each a square with the distance between places as its side.
+        time_s: the time of repairs, from gaining control to releasing it.
     """
 
     pulses: int = 0
@@ -43,7 +43,7 @@ def cost_of(treatment: Treatment, spacing_m: float) -> RepairCost:
 
 @dataclass(frozen=True)
 class RepairBudget:
-    """The most that may be spent; None: no bound. The attributes are those of `RepairCost`."""
+    """The largest cost allowed; None: no bound. The attributes are as in `RepairCost`."""
 
     pulses: int | None = None
     depth_m: float | None = None

@@ -1,4 +1,4 @@
-"""`TipClassifier`: detects in the scans that the tip has changed, and that it is good again."""
+"""`TipClassifier`: the detection, in scans, of a changed tip and of a tip that is good again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _SCORES = {Opinion.GOOD: tip_verdict.GOOD, Opinion.BAD: tip_verdict.BAD, Opinion
 
 
 class TipClassifier(Component):
-    """A judge of scans: it flags `tip-shape-changed` for a blunt or double tip or one with debris, and clears the flag.
+    """A judge of scans: it flags `tip-shape-changed` for a blunt, double or contaminated tip, and clears the flag.
 
     It learns the reference from the first scans of each size and number of pixels, so the tip must be good then; it
     learns nothing while a problem is flagged or after a scan that was not good. It judges best at places that it has
@@ -23,14 +23,14 @@ class TipClassifier(Component):
     `SpatialROIWithScoreList` (1 good, 0.5 unclear, 0 bad).
 
     Args:
-        channel: of the heights.
-        retrace_channel: their retrace; empty if not recorded (then debris is not detected).
+        channel: channel of the heights.
+        retrace_channel: channel of their retrace; empty if not recorded (then debris is not detected).
         reference_scans: number of scans of each kind for the reference.
         flag_after: bad scans in a row until the problem is flagged.
         clear_after: good scans in a row until it is cleared.
         detail: share of the fine detail at a known place below which the tip is blunt.
         ghost: correlation of a ghost image at a known place above which the tip is double.
-        unrest: factor on the disagreement of trace and retrace above which it carries debris.
+        unrest: factor on the disagreement of trace and retrace above which the tip carries debris.
         worn: share of the first scans' fine detail below which the tip is worn, at any place.
         sigmas: standard deviations of the reference beyond which a scan must lie to be bad.
         problem: the problem to flag.

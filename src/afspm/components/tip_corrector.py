@@ -1,4 +1,4 @@
-"""`TipCorrector`: repairs a tip that was flagged, with the treatments that it is allowed."""
+"""`TipCorrector`: the repair of a flagged tip, with the treatments that it is allowed."""
 
 from __future__ import annotations
 
@@ -46,35 +46,35 @@ class TipCorrector(Component):
     Treatments are made at fresh places about `workshop_center`, never within `keep_away` of the experiment's region or
     of the test scan. If control is lost on the way to a place (to a person who moves the probe, say), it continues with
     another place when it has control again. It makes no treatment unless the probe's published position is the place,
-    nor one that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as an
-    `ActionMsg`.
+    nor a treatment that can't be saved, on a full disk: a restart would repeat it. Each treatment made is published as
+    an `ActionMsg`.
 
-    With policy = "learn" it chooses each treatment by what it has learnt of the flaw that the scans show: blunt, double
-    or contaminated. It counts the outcomes, and keeps them in a file for the next nights.
+    With policy = "learn" it chooses each treatment by its experience with the flaw in the scans: blunt, double or
+    contaminated. It counts the outcomes, and keeps them in a file for the next nights.
 
     Args:
         workshop_center: (x, y) about which pulses and crashes are made.
         test_center: (x, y) of a first test scan, so that a worse tip stays off the experiment's region. The next test
             scan is where the fault was seen, which shows best whether the tip is good; without `test_center` it is the
             first.
-        pulse_voltages: of one repair, in order.
-        pulse_duration: of each pulse.
-        crash_depths: of one repair, in order, after the pulses.
-        crash_speed: of each crash.
-        place_spacing: between the places of two treatments.
+        pulse_voltages: voltages of the pulses of one repair, in order.
+        pulse_duration: duration of each pulse.
+        crash_depths: depths of the crashes of one repair, in order, after the pulses.
+        crash_speed: speed of each crash.
+        place_spacing: distance between the places of two treatments.
         keep_away: least distance of a treatment from the experiment's region and the test scans.
         judge: "classifier" waits until the component that judges scans clears the flag; "self" compares the test scans
             with the first scans of the experiment, and clears it.
-        channel, retrace_channel: of the heights, for judge = "self".
-        reference_scans: for judge = "self".
+        channel, retrace_channel: channels of the heights, for judge = "self".
+        reference_scans: number of scans for the reference, for judge = "self".
         problem: the problem to solve.
         policy: "list" makes the treatments in the order of the lists; "learn" chooses among them, again and again.
-        most_treatments: of one repair, with policy = "learn".
-        experience: file of what was learnt, relative to the folder of the runs, with policy = "learn".
+        most_treatments: largest number of treatments of one repair, with policy = "learn".
+        experience: file of the learnt experience, relative to the folder of the runs, with policy = "learn".
         night_pulses: most pulses of all repairs of a run, also over restarts; by default no bound.
-        night_depth: largest sum of the depths of its crashes.
+        night_depth: largest sum of the depths of all crashes of a run.
         night_places: most places of treatments, each with an area of `place_spacing` squared.
-        night_time: longest time of its repairs together. No treatment begins whose test scan would end later.
+        night_time: longest time of all repairs of a run together. No treatment begins whose test scan would end later.
     """
 
     solves: ClassVar = ("tip-shape-changed",)

@@ -5,15 +5,15 @@ worsened it, or did nothing. The next treatment is chosen by Thompson sampling: 
 from the counts, and the treatment with the shortest expected repair under this draw is taken. So a treatment is tried
 the more often the more likely it is the best, and a new one is tried now and then.
 
-The counts of a night become the prior of the next one. They are weakened then, since another night may have another
-answer. Within a night the weight of old outcomes falls with each new one, and a run of failures that the counts call
-improbable weakens the counts of its flaw at once: the tip may have begun to answer otherwise.
+The counts of a night, weakened, become the prior of the next night, since the tip may then answer otherwise. Within a
+night the weight of old outcomes falls with each new one, and a run of failures that the counts call improbable weakens
+the counts of its flaw at once: the tip may have begun to answer otherwise.
 
 Nothing here knows time, files or messages. Each draw follows from the number of the night and of its outcomes, so a
 restarted process, or a replay, chooses the same treatment.
 
-The constants were chosen among some twenty sets, on nights of the public half of the simulated answers and on those of
-one sealed key (`benchmarks/tip_learning.py` judges other nights).
+The constants were chosen among some twenty sets, on nights with the public half of the simulated answers and with one
+sealed key (`benchmarks/tip_learning.py` judges other nights).
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ OUTCOMES = (CURED, WORSENED, UNCHANGED)
 UNKNOWN_FLAW = "unknown"
 
 PRIOR = {CURED: 0.2, WORSENED: 0.1, UNCHANGED: 0.4}
-"""Counts of a treatment without experience: little knowledge, and rather no cure."""
+"""Prior counts of an untried treatment: of little weight, and most for no effect."""
 MOST_OF_PAST_NIGHTS = 2.0
-"""Outcomes of a treatment that count from past nights."""
+"""Largest number of outcomes of a treatment that count from past nights."""
 MOST_COUNTED = 12.0
-"""Outcomes of a treatment that count altogether: older ones fade."""
+"""Largest number of outcomes of a treatment that count altogether: older outcomes fade."""
 IMPROBABLE = 0.02
 """Probability of a run of failures below which the counts of its flaw are weakened."""
 LEFT_AFTER_SURPRISE = 1.0
-"""Outcomes of a treatment that count after such a run."""
+"""Largest number of outcomes of a treatment that count after such a run."""
 SHARPNESS = 5.0
 """Factor on all counts for a draw. Plain Thompson sampling (1) explores for longer than a night has repairs."""
 _RAREST_CURE = 1e-3  # probability assumed at least, so that no expected repair is infinitely long
@@ -45,7 +45,7 @@ _RAREST_CURE = 1e-3  # probability assumed at least, so that no expected repair 
 
 @dataclass(frozen=True)
 class OutcomeCounts:
-    """Outcomes of one treatment of one flaw; older ones count less than one."""
+    """Outcome counts of one treatment for one flaw; an older outcome counts less than one."""
 
     cured: float = 0.0
     worsened: float = 0.0
@@ -72,7 +72,7 @@ class OutcomeCounts:
 
 
 Counts = dict[str, dict[str, OutcomeCounts]]
-"""By flaw, then by treatment."""
+"""Outcome counts by flaw, then by treatment."""
 
 
 @dataclass
@@ -92,7 +92,7 @@ class TipExperience:
     doubt: dict[str, float] = field(default_factory=dict)
 
     def choose(self, flaw: str, allowed: Sequence[Treatment]) -> Treatment:
-        """Return the one of the allowed treatments with the shortest expected repair under a draw from the counts."""
+        """Return the allowed treatment with the shortest expected repair under a draw from the counts."""
         draw = random.Random(f"{self.nights} {self.outcomes}")
         drawn = {
             one: [self._drawn(one, treatment, draw) for treatment in allowed]

@@ -17,7 +17,7 @@ _HEAD = """\
 
 
 def experience_text(experience: TipExperience) -> str:
-    """Return the text of a file."""
+    """Return the text of an experience file."""
     lines = [_HEAD, f"nights = {experience.nights}"]
     for flaw, treatments in sorted(experience.counts.items()):
         lines += ["", f'["{flaw}"]']
@@ -37,10 +37,10 @@ def write_experience(path: Path, experience: TipExperience) -> None:
 
 
 def read_experience(path: Path) -> TipExperience:
-    """Return the experience of a file; none if there is no file.
+    """Return the experience in a file; empty if there is no file.
 
     Raises:
-        FileError: it can't be read, or has other content.
+        FileError: the file can't be read, or has other content.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))

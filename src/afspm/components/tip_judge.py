@@ -1,4 +1,4 @@
-"""Judge of the tip: compares scans with a reference learnt from the first ones.
+"""The judge of the tip, which compares scans with a reference learnt from the first scans.
 
 At a known place the judge compares like with like, and detects small changes. Its reference there follows the good
 scans, since the sample drifts; the first scans stay as the measure of slow wear. Elsewhere it detects only changes that
@@ -47,7 +47,7 @@ MOST_KINDS = 4  # of scans with a reference at the same time
 FOLLOW = 0.25  # least weight of a new good scan in the means of its place
 FLOORS = TipMetrics(detail=0.02, ghost=0.01, unrest_m=0.15, contrast=0.0)  # least spreads: few scans underestimate them
 Fault = tuple[float, str, str]
-"""How far on the way to a bad scan (1), the flaw, and the reason."""
+"""A fault: its size relative to the limit for a bad scan (1), the flaw, and the reason."""
 BLUNT, DOUBLE, CONTAMINATED = FLAWS = ("blunt", "double", "contaminated")
 
 
@@ -65,7 +65,7 @@ class Verdict:
     """Opinion on one scan, with a reason for people.
 
     Attributes:
-        flaws: of a bad tip, as far as the scan shows them, the ones hiding others first; a subset of `FLAWS`.
+        flaws: the visible flaws of a bad tip, a subset of `FLAWS`; flaws that hide others come first.
     """
 
     opinion: Opinion
@@ -106,10 +106,10 @@ class TipTolerance:
 
 @dataclass
 class KnownPlace:
-    """A region as scans with a good tip show it.
+    """The usual metrics of a region in scans with a good tip.
 
     Attributes:
-        center_m: in the coordinates of the scans.
+        center_m: the centre in the coordinates of the scans.
         usual: mean metrics.
         expected: mean autocorrelation of the slopes.
         scans: number of scans in the means.
@@ -131,14 +131,14 @@ class KnownPlace:
 
 @dataclass
 class TipReference:
-    """Scans with a good tip of one kind: of the same size, angle and shape.
+    """The reference for one kind of scan (same size, angle and shape), from scans with a good tip.
 
     Attributes:
-        size_m, angle_rad, shape: of those scans.
-        places: where they were taken, the last seen at the end.
+        size_m, angle_rad, shape: size, angle and shape of these scans.
+        places: the places of these scans, the last seen at the end.
         first: metrics of the scans that were learnt from.
         deviations: differences of such scans at the same place: detail and unrest as ratios, ghost as it is.
-        suspect: whether a fault was found at a known place, and its end not yet.
+        suspect: whether a fault was found at a known place and is not over yet.
         confirmed: whether a comparison was good after the last scan that was learnt from.
     """
 
@@ -193,7 +193,7 @@ class TipReference:
 
 @dataclass
 class JudgeState:
-    """State that survives a restart.
+    """The state of a judge that survives a restart.
 
     Attributes:
         kinds: references, complete and incomplete, the last used at the end.
@@ -247,7 +247,7 @@ class TipJudge:
 
         Args:
             trace, retrace: heights in m, [y, x]; retrace None if not recorded.
-            region: where they were taken.
+            region: the scanned region.
             learns: whether a new kind of scan may be learnt from.
         """
         shape = (trace.shape[0], trace.shape[1])
@@ -362,7 +362,7 @@ class TipJudge:
 
 
 class VerdictCounter:
-    """A counter of opinions: a number of bad ones in a row sets the flag, a number of good ones clears it."""
+    """A counter of opinions: several bad opinions in a row set the flag, several good opinions clear it."""
 
     def __init__(self, flag_after: int, clear_after: int) -> None:
         if flag_after < 1 or clear_after < 1:

@@ -42,7 +42,7 @@ class TipMetrics:
         detail: short-wave against long-wave power of the slopes.
         ghost: largest autocorrelation of the slopes beside the centre, 0 to 1, beyond what was expected there.
         unrest_m: disagreement of trace and retrace over stretches, exceeded in a tenth of the lines; 0 without retrace.
-        contrast: how far the sample's slopes stand above noise; below `LEAST_CONTRAST` the others mean nothing.
+        contrast: power of the sample's slopes relative to noise; below `LEAST_CONTRAST` the other metrics mean nothing.
     """
 
     detail: float
@@ -57,7 +57,7 @@ class Slopes:
 
     Attributes:
         trace, retrace: (rows, columns - 1).
-        difference: of the levelled heights, trace less retrace, (rows, columns).
+        difference: the levelled heights of trace less retrace, (rows, columns).
     """
 
     trace: Array
@@ -129,7 +129,7 @@ def metrics(of: Slopes, correlation: Array, expected: Array | None = None) -> Ti
 
 
 def ghost(correlation: Array, expected: Array | None = None) -> float:
-    """Return the largest correlation beside the centre, less the expected one."""
+    """Return the largest correlation beside the centre, less the expected correlation."""
     beyond = _smoothed(correlation if expected is None else correlation - expected)
     reach = correlation.shape[0] - 1
     rows, columns = np.mgrid[0 : reach + 1, -reach : reach + 1]

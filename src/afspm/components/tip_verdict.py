@@ -33,16 +33,16 @@ GOOD, UNCLEAR = 1.0, 0.5
 
 @dataclass(frozen=True)
 class LineVerdict:
-    """The tip has changed during a scan.
+    """The verdict that the tip has changed during a scan.
 
     Attributes:
-        region, shape: of the whole scan.
-        began_ns: its start, as in its lines.
+        region, shape: region and shape of the whole scan.
+        began_ns: the start of the scan, as in its lines.
         row: index of the row that raised the alarm.
         since_row: index of the first row with the change, by estimate.
         downwards: whether rows are scanned from the last to the first.
         confidence: share of scans with a good tip that give less evidence.
-        stops: the scan is stopped; else a person may look.
+        stops: whether the scan is stopped; else a person may look.
     """
 
     region: Region
@@ -58,7 +58,7 @@ class LineVerdict:
 
 
 def line_verdict_message(verdict: LineVerdict) -> Any:
-    """Return a `TipVerdict`."""
+    """Return a verdict as a `TipVerdict` message."""
     message: Any = wire.message_type(OF_LINES)(
         channel=verdict.channel,
         row=verdict.row,
@@ -96,7 +96,7 @@ def read_line_verdict(message: Any) -> LineVerdict | None:
 
 
 def verdict_message(scan: Scan, score: float) -> Any:
-    """Return a `SpatialROIWithScoreList` with one place: the scan's, with its time and channel."""
+    """Return a `SpatialROIWithScoreList` with the region, time and channel of a scan, and a score."""
     message: Any = wire.message_type(MESSAGE)(channel=scan.channel)
     if scan.time_ns is not None:
         message.timestamp.FromNanoseconds(scan.time_ns)

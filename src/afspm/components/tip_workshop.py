@@ -21,8 +21,8 @@ class TipWorkshop:
     """Treatments of the tip for a component, which must hold control around every call.
 
     Args:
-        center: about which the places lie.
-        spacing: between the places of two treatments, in m.
+        center: the centre of the places.
+        spacing: the distance between the places of two treatments, in m.
         keep_away: least distance of a treatment from scanned regions, in m.
         charge: called before each attempt, whose save keeps its changes of the memory; it may raise.
     """

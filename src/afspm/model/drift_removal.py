@@ -1,4 +1,4 @@
-"""Scans without the drift during their own acquisition."""
+"""Removal of the drift during a scan from its values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def undistorted(values: Array, region: Region, velocity_m_s: XY, duration_s: float, *, upwards: bool = True) -> Array:
-    """Return values on the same grid as at the middle of the scan.
+    """Return a scan's values without drift, on the same grid, as at the middle of the scan.
 
     Rows are taken one after the other. A point at the offset S from the centre c at half time is found at the offset q
     with S = (1 - v a') q, where v is the velocity and a the vector along the slow axis of length duration / height,

@@ -19,7 +19,7 @@ LOGGED_AS = "afspm"
 LONGEST_ANNOUNCEMENT = 256 * 1024
 """Most bytes of log lines that a supervisor sends in one message."""
 PERSON = ":"
-"""Separates a component from the person it acts for: "dashboard:Ada"."""
+"""The separator of a component and the person it acts for: "dashboard:Ada"."""
 LONGEST_PROCESS_NAME = 100
 """In bytes: files are named after processes, on every system."""
 LONGEST_NOTE = 1000
@@ -84,7 +84,7 @@ class JournalEntry:
         kind: "request", "control" (holder, mode or problems changed) or "order" (of a person, e.g. to restart a
             process).
         who: the component; "component:person" if it acts for a person.
-        what: in words, with units.
+        what: the event as text, with units.
         response: the number of a ControlResponse; None for an event without a request.
         reason: reason for the refusal of a request, or the cause of the event.
         took_s: real time from request to answer; None for an event without a request.
@@ -96,7 +96,7 @@ class JournalEntry:
         sent_ns: time of forwarding to the translator; None for requests that the scheduler answers.
         key: key of a measurement that is taken exactly once.
         subject: the action, or the parameter to set; empty for other requests.
-        value, unit: of that parameter, as requested.
+        value, unit: value and unit of that parameter, as requested.
     """
 
     time_ns: int
@@ -246,7 +246,7 @@ class MeasurementSettings:
     Attributes:
         who: the component.
         parameters: empty if its next measurements are not part of a sweep.
-        key: of the measurement, if it is taken exactly once.
+        key: the key of the measurement, if it is taken exactly once.
     """
 
     time_ns: int

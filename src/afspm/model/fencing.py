@@ -1,4 +1,4 @@
-"""The fence of a translator: it obeys only the scheduler of its own run, in that scheduler's newest life.
+"""The fence of a translator, which obeys only the newest life of its own run's scheduler.
 
 A scheduler puts its epoch before each request. Without it, two experiments at the same addresses would command one
 microscope unnoticed.
@@ -44,7 +44,7 @@ class Epoch:
 
 
 class SchedulerFence:
-    """Decision whether a translator obeys a sender.
+    """The decision whether a translator obeys a sender.
 
     Args:
         run: the identity of the translator's run; empty: the first scheduler is obeyed while it stays connected.

@@ -105,7 +105,7 @@ class Region:
         return bool(abs(cos * x + sin * y) <= self.size_m[0] / 2 and abs(cos * y - sin * x) <= self.size_m[1] / 2)
 
     def pixels_m(self, shape: tuple[int, int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return x and y of every pixel of an array of `shape` (ny, nx), each an array of that shape, in m."""
+        """Return the arrays of x and y, in m, of every pixel of an array of `shape` (ny, nx)."""
         import numpy as np
 
         ny, nx = shape

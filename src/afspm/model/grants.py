@@ -12,12 +12,12 @@ MOST_STEPS = 1000
 MOST_COUNT = 10_000
 LONGEST_GRANT_S = 7 * 86_400.0
 LONGEST_PROPOSAL = 60_000
-"""Characters of a plan or of a preflight."""
+"""Largest length of a plan or a preflight, in characters."""
 
 
 @dataclass(frozen=True, slots=True)
 class GrantedStep:
-    """One request of an approved plan, exactly as it will be sent.
+    """One request of an approved plan, exactly as sent later.
 
     Attributes:
         request: the number of a ControlRequest.
@@ -52,13 +52,13 @@ class Grant:
         agent: "component:name".
         plan: the id of the approved plan; empty: a grant.
         steps: all requests of the plan, in order.
-        region_m: of a grant: x and y of the centre, width, height; empty: no place may be set.
-        ranges, counts: of a grant: the parameters and actions allowed; all others are refused.
+        region_m: the region of a grant: x and y of the centre, width, height; empty: no place may be set.
+        ranges, counts: the parameters and actions that a grant allows; all others are refused.
         lasts_s: experiment time; 0: all approvals of the agent end.
         run: the run for which the approval is valid.
         limits: digest of the limits that the plan was checked against.
         since_ns: the time of that check. A flagged problem, or MANUAL, since then makes the approval stale.
-        offset_m: the microscope's coordinates of the components' origin at that check.
+        offset_m: the origin of component coordinates in microscope coordinates at that check.
         drift_m: largest change of the offset; empty offset: not checked.
 
     Raises:
@@ -113,10 +113,10 @@ class Approval:
     """An approval in force.
 
     Attributes:
-        plan: empty: a grant.
+        plan: the id of the approved plan; empty: a grant.
         by: the person who approved.
-        left: of a grant: the actions still allowed.
-        region_m, ranges, counts: of a grant, as in `Grant`.
+        left: the actions that a grant still allows.
+        region_m, ranges, counts: the bounds of a grant, as in `Grant`.
     """
 
     agent: str

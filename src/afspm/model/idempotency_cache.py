@@ -51,7 +51,7 @@ class Floors:
 
     Attributes:
         most: maximum number of sessions.
-        numbers: by client and session, in the order of their last change.
+        numbers: the forgotten numbers by client and session, in the order of their last change.
     """
 
     most: int = 1000
@@ -81,8 +81,8 @@ class IdempotencyCache:
         clients: maximum number of clients.
         sent_actions: actions sent to the translator, kept over a restart. The translator would not repeat such an
             action, but the scheduler must not move the microscope in preparation for it again.
-        floors: the saved ones are kept over a restart.
-        table: the older and the latest ids of each client.
+        floors: the highest forgotten numbers, kept over a restart.
+        table: the outcomes of the older and the latest ids of each client.
     """
 
     per_client: int = 256

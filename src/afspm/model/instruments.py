@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from afspm.model.requests import Parameter
 
 SEPARATOR = "."
-"""Separates the component's name from the rest in the name of a parameter: "cryo.temperature"."""
+"""The separator of component and parameter in a parameter's name: "cryo.temperature"."""
 PARTS = ("target", "busy")
-"""Endings of names that only read: "cryo.temperature.target", "cryo.temperature.busy"."""
+"""Suffixes of read-only parameter names: "cryo.temperature.target", "cryo.temperature.busy"."""
 
 
 def instrument_of(parameter: str) -> str:
@@ -24,10 +24,10 @@ class InstrumentReading:
     """One value of an instrument.
 
     Attributes:
-        name: of the parameter, such as "cryo.temperature".
-        value: in `unit`; None if unknown, then `reason` gives the cause.
+        name: the name of the parameter, such as "cryo.temperature".
+        value: the value in `unit`; None if unknown, then `reason` gives the cause.
         age_s: real time since the instrument measured it; None: never.
-        target: in `unit`; None: it can't be set.
+        target: the target in `unit`; None if the parameter can't be set.
         busy: whether the value is on its way to the target.
     """
 
@@ -50,7 +50,7 @@ class OrderOutcome:
     """The outcome of an order.
 
     Attributes:
-        number: of the order.
+        number: the number of the order.
         response: a `ControlResponse`.
     """
 
@@ -64,7 +64,7 @@ class InstrumentReadings:
     """A report of an instrument: all of its values, and the outcomes of orders since the last report.
 
     Attributes:
-        token: of the scheduler's last answer; the report was made after it.
+        token: the token of the scheduler's last answer, which precedes the report.
     """
 
     time_ns: int
@@ -80,7 +80,7 @@ class InstrumentOrder:
 
     Attributes:
         number: identifies the order in its outcome.
-        id: of the client's request: an id is carried out once.
+        id: the id of the client's request, which is carried out once.
         rate_per_s: the fastest change allowed, in `rate_unit` per real second; None: no limit.
     """
 
@@ -96,7 +96,7 @@ class InstrumentOrders:
     """The scheduler's answer to a report.
 
     Attributes:
-        token: for the next report.
+        token: the token to repeat in the next report.
     """
 
     token: int

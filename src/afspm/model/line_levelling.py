@@ -24,8 +24,7 @@ class Levelling(Enum):
     MEDIANS = "medians"
     """The median of each row."""
     DIFFERENCES = "differences"
-    """The median difference of each row from the row before, summed up: features longer than half a row do no
-    harm."""
+    """The summed median difference of each row from the row before: features longer than half a row do no harm."""
 
 
 def levelled(values: Array, how: Levelling) -> Array:

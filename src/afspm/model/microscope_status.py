@@ -24,7 +24,7 @@ class TipRisk:
     Attributes:
         state: the last known state; a microscope continues in it after the loss of its controller.
         feedback_on: None if unknown.
-        tip_away: the tip is withdrawn, so neither the coarse motor nor a feedback switched off does harm.
+        tip_away: whether the tip is withdrawn, so that neither the coarse motor nor a switched-off feedback does harm.
     """
 
     state: ScopeState = ScopeState.UNDEFINED
@@ -44,7 +44,7 @@ class MicroscopeStatus:
         states_seen: number of states received.
         lost_since_s: real time of the loss of the controller.
         feedback_before: the feedback before a request of unknown outcome.
-        in_doubt: whether there is such a request.
+        in_doubt: whether a request of unknown outcome may have changed the feedback.
         logged: the danger that was logged last.
     """
 

@@ -12,7 +12,7 @@ from afspm.model.geometry import Region
 N = TypeVar("N", int, float)
 
 BYTES_A_PIXEL = 8
-"""Of a recorded value before compression: a float64."""
+"""Bytes of a recorded value before compression: a float64."""
 SPEED_UNKNOWN = "the file sets no scan-speed"
 
 
@@ -23,8 +23,8 @@ class PlannedWork:
     Attributes:
         scans, spectra: number of measurements; scans is None without an end.
         path_m: path of the tip over the surface, trace and retrace; None without an end.
-        pixels: of all scans, in one channel; None without an end.
-        duration_s: from the first scan to the end of the last, pauses included, spectra left out; None if unknown.
+        pixels: the number of pixels of all scans, in one channel; None without an end.
+        duration_s: time from the first scan to the end of the last, with pauses, without spectra; None if unknown.
         at_most: whether the numbers are upper bounds.
         ends_experiment: whether the experiment ends when the work is done.
         why: the reason for an unknown or bounded number.

@@ -37,7 +37,7 @@ class KnownPosition:
     """The last set or published position of scan and probe.
 
     Attributes:
-        region, shape: of the scan; the shape as (rows, columns).
+        region, shape: region and shape of the scan; the shape as (rows, columns).
         probe_m: the probe position.
     """
 

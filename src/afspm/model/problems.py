@@ -10,9 +10,9 @@ from afspm.basics.errors import InvalidValue
 
 HIGHEST_PROBLEM = 255  # one byte on the wire
 STOPPED_BY_AGENT = "stopped-by-agent"
-"""The problem that the tool `stop` of an agent flags; an experiment with an agent has it, with the highest number."""
+"""The problem flagged by an agent's tool `stop`; an experiment with an agent has it, with the highest number."""
 STOPPER = " stop"
-"""Ending of the name under which an agent stops: its own connection may be waiting for the microscope."""
+"""Suffix of the name under which an agent stops, over a second connection: the first may wait for the microscope."""
 
 
 class Problem(IntEnum):

@@ -36,12 +36,16 @@ RELAY_REQUEST = 102
 RESTART_REQUEST = 103
 """Request to restart the process named by its subject; an extension of afspm."""
 LEASE_REQUEST = 104
-"""Request of the holder to lose control after a time without another command or lease request, also while a scan is
-running; the subject is this time in real seconds. An extension of afspm."""
+"""Request of the holder to lose control after an idle time, also while a scan is running; an extension of afspm.
+
+The subject is the time in real seconds without another command or lease request.
+"""
 LONGEST_LEASE_S = 86_400.0
 GRANT_REQUEST = 105
-"""Request of a person to approve a plan of an agent, to give it a grant, or to revoke its approvals; the subject is a
-Grant. An extension of afspm."""
+"""Request of a person to approve an agent's plan, to give a grant, or to revoke its approvals; an extension of afspm.
+
+The subject is a Grant.
+"""
 
 OTHER_RUN_RESPONSE = 100
 """Response to a component that named another run than the scheduler's; an extension of afspm."""
@@ -91,14 +95,14 @@ class RescanKind(IntEnum):
     AGAIN = 1
     """Scan the same region again."""
     OPPOSITE = 2
-    """Scan it in the other direction of the slow axis."""
+    """Scan the region in the other direction of the slow axis."""
     SEARCH = 3
     """Scan a wider region, until the sample is found."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """A parameter by name: without a value in a request to read it, with a value when it is set or published.
+    """A parameter by name: without a value in a request to read the parameter, else with a value.
 
     Attributes:
         value: as text, in `unit`; None to read it.
@@ -133,7 +137,7 @@ class ResponseDetail(IntEnum):
 
     NONE = 0
     NOT_SENT = 1
-    """A NO_RESPONSE to a request that was certainly not carried out: it may be asked again."""
+    """A NO_RESPONSE to a request that was certainly not carried out, and may be repeated."""
     OUTCOME_UNKNOWN = 2
     """A NO_RESPONSE to a request that may have been carried out."""
     EXPERIMENT_ENDED = 3
@@ -146,7 +150,7 @@ class Response:
     Attributes:
         code: the number of a ControlResponse.
         payload: an object in bytes, such as a parameter; mostly empty.
-        reason: why the request failed, for people.
+        reason: the reason of a failure, for people.
         id: id of the answered request, if it had one.
         detail: further facts for programs.
     """

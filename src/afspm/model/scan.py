@@ -135,7 +135,7 @@ class Scan:
 
     @property
     def time(self) -> datetime | None:
-        """Return the time of its end, UTC."""
+        """Return the end of the scan, UTC."""
         return None if self.time_ns is None else utc_time(self.time_ns)
 
     @property
@@ -295,12 +295,12 @@ class ScanSet(Mapping[str, Scan]):
 
     @property
     def time(self) -> datetime | None:
-        """Return the time of its end, UTC."""
+        """Return the end of the scan, UTC."""
         return self.first.time
 
     @property
     def time_ns(self) -> int | None:
-        """Return the time of its end, ns since the Unix epoch."""
+        """Return the end of the scan, ns since the Unix epoch."""
         return self.first.time_ns
 
     def __getitem__(self, channel: str) -> Scan:
@@ -334,12 +334,12 @@ class ScanLines:
     """Neighbouring rows of one channel, published while the scan is running.
 
     Attributes:
-        region: of the whole scan.
-        shape: of the whole scan, (rows, columns).
-        channel, unit: of the values.
+        region: the region of the whole scan.
+        shape: (rows, columns) of the whole scan.
+        channel, unit: channel and unit of the values.
         first_row: index in the whole scan of the first of these rows.
         values: [rows, columns], y and x ascending, independent of the scan direction.
-        began_ns: start of the scan, ns since the Unix epoch: the same for all lines of a scan.
+        began_ns: start of the scan, ns since the Unix epoch; the same for all its lines.
     """
 
     region: Region

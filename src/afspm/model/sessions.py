@@ -1,4 +1,4 @@
-"""Sessions: the one connection that owns a name, over restarts, and with two processes under one name.
+"""Sessions: the decision which connection owns a name, over restarts, and with two processes under one name.
 
 A name belongs to one session at a time: one life of one process. Its first connection binds the name. Later
 connections show the session's token in their request ids ("<name>/<token>/<n>"). For peers without ids, the connection
@@ -56,7 +56,7 @@ class _Session:
 
 
 KEYED = "key"
-"""In place of the token in ids that are the same in every life: "<name>/key/<key>/<n>"."""
+"""Text in place of the token in ids that are the same in every life: "<name>/key/<key>/<n>"."""
 
 
 def token_of(name: str, request_id: str) -> str | None:
@@ -94,7 +94,7 @@ def run_of(name: str, request_id: str) -> str:
 
 @dataclass(frozen=True)
 class SessionTable:
-    """The names in use.
+    """The sessions of the names in use.
 
     Attributes:
         takeover_s: real time for which a transferred name is reserved for its owner. A peer with an unnoticed loss of
@@ -131,7 +131,7 @@ class SessionTable:
         return replace(table, names=names, lost=lost, name_of=_without(self.name_of, connection)), name
 
     def hear(self, connection: int, name: str, request_id: str | None, now_s: float) -> tuple[SessionTable, Hearing]:
-        """Judge a message from `name` by `connection`, and bind the name if it is accepted.
+        """Judge a message from `name` over `connection`; bind the name if the message is accepted.
 
         Args:
             request_id: id of the request, empty without an id; None for a message with a name only.

@@ -59,7 +59,7 @@ class Spectrum:
         return None if self.time_ns is None else utc_time(self.time_ns)
 
     def __getitem__(self, name: str) -> NDArray[np.float64]:
-        """Return one variable by its name, shape (points,)."""
+        """Return the values of a variable, shape (points,)."""
         if name not in self.names:
             raise NoSuchItem(f"no variable {name!r}; there are {', '.join(self.names)}")
         return self.values[:, self.names.index(name)]

@@ -54,7 +54,7 @@ class Feedback:
 
     Attributes:
         on: whether the feedback regulates.
-        proportional_gain, integral_gain, setpoint: in the units of the microscope's operating mode.
+        proportional_gain, integral_gain, setpoint: values in the units of the microscope's operating mode.
     """
 
     on: bool | None = None

@@ -17,7 +17,7 @@ from afspm.record.run_json import EXPERIMENT_FILE
 
 @dataclass(frozen=True)
 class WrittenBand:
-    """The bounds of a condition as they are written; None: no bound."""
+    """The bounds of one parameter in a condition, as the experiment file has them; None: no bound."""
 
     condition: str
     low: str | float | None
@@ -25,7 +25,7 @@ class WrittenBand:
 
 
 AllowedBands = Mapping[str, tuple[WrittenBand, ...]]
-"""By parameter of an instrument."""
+"""The bands of each instrument parameter, by its name."""
 
 
 def allowed_bands(folder: Path) -> AllowedBands:
@@ -44,7 +44,7 @@ def allowed_bands(folder: Path) -> AllowedBands:
 
 
 def instrument_curves(overview: Overview, bands: AllowedBands) -> list[TimelineCurve]:
-    """Return a curve for each parameter of other instruments."""
+    """Return a curve, with its allowed bands, for each parameter of other instruments."""
     curves = []
     for name, one in sorted(overview.instruments.items()):
         converted = (_converted(band, one.unit) for band in bands.get(name, ()))

@@ -1,4 +1,4 @@
-"""The catalogue of all runs under a folder, with an SQLite index beside them that can be rebuilt at any time."""
+"""The catalogue of all runs under a folder, with an SQLite index that can be rebuilt at any time."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ _WORD: Final = re.compile(r"(?:(\w+):)?(.+)", re.DOTALL)
 
 @dataclass(frozen=True)
 class RunSummary:
-    """One run.
+    """The summary of one run.
 
     Attributes:
         folder: relative to the folder of all runs, with "/".
-        name: of the experiment.
+        name: the name of the experiment.
         began_ns, ended_ns: start and end (or last publication) in experiment time; None if nothing was published.
         state: running, ended or cut off, in words.
         metadata: sample, person, project, technique … where known.
@@ -53,9 +53,9 @@ class RunSummary:
         problems: the names of all flagged problems.
         notes: the texts of all notes.
         scanned_m: the path of the probe in scans, trace and retrace, in metres.
-        treatments: how often each action that is not a measurement was executed, by its name.
-        judged: scans with a last verdict, and those of them with a good tip.
-        damage: why the record can't be read; empty if it can.
+        treatments: the number of executions of each action that is not a measurement, by name.
+        judged: the number of scans with a verdict on the tip, and of scans with a good last verdict.
+        damage: the reason why the record can't be read; empty if it can.
     """
 
     folder: str
@@ -98,10 +98,10 @@ FIELDS: Final = tuple(RunSummary("", "").texts())
 def find_runs(
     root: Path, words: Sequence[str] = (), since: date | None = None, until: date | None = None
 ) -> list[RunSummary]:
-    """Return the runs under a folder that contain all words, the newest first.
+    """Return the runs under a folder whose texts contain all words, the newest first.
 
     Args:
-        root: searched with all its subfolders; keeps the index `runs.sqlite` where it can be written.
+        root: the folder to search with all its subfolders; it gets the index `runs.sqlite` if it is writable.
         words: each in any field, or as "sample:gold" in that field; case is ignored.
         since, until: the first and last day (UTC) with publications.
 
@@ -278,17 +278,17 @@ UNNAMED = ""
 
 @dataclass(frozen=True)
 class ProbeHistory:
-    """One probe.
+    """The use of one probe over all its runs.
 
     Attributes:
-        name: of [metadata] `probe`; `UNNAMED` for all runs without one, which may be several probes.
+        name: the name in [metadata] `probe`; `UNNAMED` for all runs without a name, perhaps several probes.
         runs: their folders, oldest first.
         first_ns, last_ns: begin of the first and end of the last run, in experiment time; None: not known.
-        scans, spectra: numbers of whole ones.
+        scans, spectra: numbers of complete scans and spectra.
         scanned_m: the path along scan lines, trace and retrace, in metres.
-        treatments: how often each was executed, by the name of its action.
-        flagged: in how many runs a problem was flagged.
-        judged, good: scans with a verdict on the tip, and those with a good one.
+        treatments: the number of executions of each treatment, by the name of its action.
+        flagged: the number of runs in which a problem was flagged.
+        judged, good: the number of scans with a verdict on the tip, and of scans with a good verdict.
         simulated: whether all runs were simulated.
     """
 
@@ -307,7 +307,7 @@ class ProbeHistory:
 
 
 def probe_histories(runs: Iterable[RunSummary]) -> list[ProbeHistory]:
-    """Return a history for each probe, the one used last first. Damaged runs are left out."""
+    """Return a history for each probe, the most recently used first. Damaged runs are left out."""
     by_probe: dict[str, list[RunSummary]] = {}
     for run in sorted(runs, key=lambda run: (run.began_ns or 0, run.folder)):
         if not run.damage:

@@ -1,4 +1,4 @@
-"""The catalogue of runs as one HTML page: a card for each run, with its picture and a link to its report."""
+"""The catalogue of runs as one HTML page: a card for each run, with pictures and a link to its report."""
 
 from __future__ import annotations
 

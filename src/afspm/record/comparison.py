@@ -1,4 +1,4 @@
-"""Recorded runs beside each other: their facts, differing settings, and scans of the same regions."""
+"""The comparison of recorded runs: their facts, differing settings, and scans of the same regions."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from afspm.record.tables import ScanRow
 
 Array = NDArray[np.float64]
 Aligner = Callable[[Array, Region, Array, Region], tuple[Array, str]]
-"""Takes levelled values and region of two scans; returns the second ones moved onto the first, and the way in words."""
+"""A function that moves the levelled values of a second scan onto the first, and describes the alignment."""
 
 _ALIKE = 0.01  # of a size; regions that differ less are the same
 _CENTRES = 0.05  # of the width: drift between two nights moves no region out of the scanner's frame of reference
@@ -78,7 +78,7 @@ class ComparedRegion:
 
     Attributes:
         scans: one for each run, in the order of runs; None in a run without a readable scan of the region.
-        differences: by the index of the run, from the first run with a scan.
+        differences: the differences from the first run with a scan, by the index of the run.
     """
 
     name: str
@@ -88,11 +88,11 @@ class ComparedRegion:
 
 @dataclass(frozen=True, eq=False)
 class RunComparison:
-    """Several runs beside each other.
+    """The comparison of several runs.
 
     Attributes:
-        names: of the runs: their folders.
-        facts: by heading, a text for each run.
+        names: the names of the runs' folders.
+        facts: a text for each run, by heading.
         settings: keys of the experiment file whose values differ, with a text for each run.
         unread: reasons why settings or scans are missing.
         left_out: the number of common regions that are not shown.
@@ -108,7 +108,7 @@ class RunComparison:
 
 
 def compare(runs: Sequence[Run], align: Aligner, most_regions: int = 24) -> RunComparison:
-    """Return the comparison of runs; scans are compared with those of the first run that has the region.
+    """Compare runs; each scan is compared with the first run's scan of the same region.
 
     Raises:
         InvalidValue: fewer than two runs, or one run given twice.
@@ -161,7 +161,7 @@ def differences(settings: Sequence[Mapping[str, str]]) -> dict[str, list[str]]:
 
 
 def same_region(first: ScanRow, second: ScanRow) -> bool:
-    """Return whether two scans have one key; of scans without keys, whether their regions nearly agree."""
+    """Return whether two scans have the same key or, without keys, nearly the same region."""
     if first.key or second.key:
         return first.key == second.key
     one, other = first.region, second.region

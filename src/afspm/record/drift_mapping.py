@@ -30,7 +30,7 @@ def drift_at(matrix: Array, center_m: Sequence[float]) -> Array:
 
 
 def drift_knowledge(message: OutcomeFields) -> tuple[RegistrationOutcome, float | None]:
-    """Return the kind of knowledge of a scan's position, and its largest standard deviation in m (None: unknown)."""
+    """Return how a scan's position is known, and its largest standard deviation in m (None: unknown)."""
     outcome = RegistrationOutcome.of(message.outcome, matched=message.matched)
     if len(message.covariance) != 4:
         return outcome, None

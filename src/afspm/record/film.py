@@ -1,4 +1,4 @@
-"""Scans of one place as a film that stands still: `run.film()`, and `afspm export --to gif` or `mp4`.
+"""Scans of one place as a film aligned on the sample: `run.film()`, and `afspm export --to gif` or `mp4`.
 
 Theory of operation. Scans with one channel in common whose regions overlap by half or more, after the recorded drift is
 subtracted, are scans of one place. The first of them is the window of the film. Each scan is levelled as small pictures
@@ -39,7 +39,7 @@ FORMATS: Final = (".gif", ".mp4")
 WIDTH_PX: Final = 480
 FRAMES_PER_S: Final = 8.0
 _MOST_OFFSET: Final = 0.5
-"""Of a width: scans further apart are of different places."""
+"""Largest offset of scans of one place, as a share of their width."""
 _SIZE_TOLERANCE: Final = 0.05
 _TURN_TOLERANCE_RAD: Final = math.radians(1.0)
 _FONT_PX: Final = 15
@@ -67,13 +67,13 @@ class Film:
 
     Attributes:
         frames: levelled values, shape (scans, rows, columns), [y, x] ascending; NaN where a scan does not reach.
-        channel, unit: of the values.
+        channel, unit: channel and unit of the values.
         numbers, times_ns: number and end of each scan.
         window: the region of each frame, which is the region of the first scan.
         drift_m: displacement of the sample since the first scan that was subtracted, shape (scans, 2), in m; zeros
             where none was recorded.
         aligned_by: "sample coordinates", "recorded drift", or "" if the scans are as they were measured.
-        name: of the experiment; simulated: whether the microscope was.
+        name: the name of the experiment; simulated: whether the microscope was simulated.
     """
 
     frames: Array
@@ -89,7 +89,7 @@ class Film:
 
     @property
     def range(self) -> ValueRange:
-        """The values at the ends of the colours, one for all frames."""
+        """The values at the ends of the colour map, the same for all frames."""
         return shared_range(self.frames)
 
     def images(self, width_px: int = WIDTH_PX) -> Iterator[Image.Image]:
@@ -113,7 +113,7 @@ class Film:
 
         Raises:
             InvalidValue: another ending, or no rate of frames.
-            FileError: it can't be written, or the extra is missing.
+            FileError: the film can't be written, or the extra is missing.
         """
         path = Path(path)
         if path.suffix not in FORMATS:
@@ -158,8 +158,8 @@ def film_of(
 
     Args:
         rows: the scans, in the order of the film; interrupted scans show the lines taken.
-        channel: None: the first of the first scan.
-        drift: of `recorded_drift`; None: read from the run.
+        channel: the shown channel; None: the first channel of the first scan.
+        drift: the result of `recorded_drift`; None: read from the run.
 
     Raises:
         InvalidValue: fewer than two scans, not of one place, or a scan without the channel.

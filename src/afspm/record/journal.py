@@ -62,7 +62,7 @@ def open_to_write(folder: Path) -> sqlite3.Connection:
     """Open the journal in a run folder; create it if it is missing.
 
     Raises:
-        FileError: it is damaged, or another kind of file.
+        FileError: the file is damaged, or of another kind.
         sqlite3.OperationalError: the disk is full …
     """
     path = folder / JOURNAL_FILE
@@ -87,7 +87,7 @@ def open_to_read(folder: Path) -> sqlite3.Connection:
     """Open the journal in a run folder for reading; another process may write it, and the disk may be read-only.
 
     Raises:
-        FileError: it is missing, damaged, or another kind of file.
+        FileError: the file is missing, damaged, or of another kind.
     """
     path = folder / JOURNAL_FILE
     if not path.is_file():
@@ -108,7 +108,7 @@ def measured_file(folder: Path, file: str) -> Path:
     """Return the file of a scan or spectrum, which the journal names relative to its folder.
 
     Raises:
-        FileError: it is outside the run folder. A run may come from another person; its files are read and exported.
+        FileError: the path leads out of the run folder; a run from another person is not trusted.
     """
     path = folder / file
     if not path.resolve().is_relative_to(folder.resolve()):
@@ -124,7 +124,7 @@ def read_only(path: PurePath) -> str:
 
 
 def not_a_table(connection: sqlite3.Connection) -> str:
-    """Return the name of a view, trigger or virtual table of a database; empty: it has none.
+    """Return the name of a view, trigger or virtual table of a database; empty if there is none.
 
     A view in the place of a table would run its author's SQL, perhaps without end.
     """
@@ -145,7 +145,7 @@ def damaged(path: Path, error: Exception) -> FileError:
 
 
 def check_format(connection: sqlite3.Connection, path: Path) -> None:
-    """Raise FileError if the file is not a journal, or of a later version."""
+    """Raise FileError if the file is not a journal, or of another version."""
     found = connection.execute("SELECT value FROM about WHERE name = 'format'").fetchone()
     if found is None or found[0] != FORMAT:
         name = found[0] if found else "unknown format"

@@ -27,11 +27,11 @@ PART = ".part"
 
 
 class MeasuredFiles:
-    """A writer of measurements, in the open transaction.
+    """The writer of measurement files and their journal rows, within the open transaction.
 
     Args:
-        folder: of the run.
-        facts: of the run, written into every file.
+        folder: the folder of the run.
+        facts: facts of the run, written into every file.
     """
 
     def __init__(

@@ -194,7 +194,7 @@ def _positions(query: Query) -> dict[int, tuple[RegistrationOutcome, float | Non
 
 
 def _with_settings(query: Query, table: str, rows: list[R]) -> list[R]:
-    """Return the rows with the settings that the same component published last before their end."""
+    # the settings that the same component published last before the end of each measurement
     published = query(
         "SELECT time_ns, payload FROM packets WHERE message = 'MeasurementSettings' ORDER BY time_ns DESC"
     )

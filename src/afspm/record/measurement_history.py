@@ -35,8 +35,8 @@ class ScanSummary:
         shape: (rows, columns).
         holder: the component in control; None if the microscope was free, or the holder is unknown.
         interrupted: the scan is incomplete.
-        setpoint: of the feedback at the start, in the unit of the operating mode; None if it was not published.
-        number: of the scan in the run, from 1; all channels of a scan share it.
+        setpoint: the feedback setpoint at the start, in the unit of the operating mode; None if it was not published.
+        number: the number of the scan in the run, from 1, the same for all its channels.
     """
 
     time_ns: int
@@ -92,11 +92,11 @@ class DriftPoint:
         matched: whether the scan was registered; otherwise the point is a prediction.
         lost: the position of the sample is no longer known.
         correcting: whether components received sample coordinates.
-        reason: why the scan was not registered, or only coarsely.
+        reason: the reason why the scan was not registered, or only coarsely.
         outcome: how the position of the scan is known.
         sd_m: standard deviation of the position along its most uncertain axis; None if unknown.
         failures: the number of errors of the estimator over the scan.
-        filename: of the scan.
+        filename: the file of the scan.
     """
 
     time_ns: int
@@ -144,7 +144,7 @@ class MeasurementHistory:
 
     @property
     def places(self) -> Sequence[FoundPlace]:
-        """The newest list of places of each channel, joined."""
+        """The places in the newest list of each channel."""
         return tuple(place for found in self._places.values() for place in found)
 
     def scan_progress(self, now_ns: int) -> tuple[float, int] | None:
@@ -200,7 +200,7 @@ class MeasurementHistory:
         _keep(self._spectra, (measured_ns, spectrum.kind, spectrum.position_m), summary)
 
     def add_drift(self, message: Any) -> None:
-        """Add a `DriftMapping` message; one without a mapping is ignored."""
+        """Add a `DriftMapping` message; a message without a mapping is ignored."""
         if len(message.matrix) != 6 or len(message.center) != 2:
             return
         drift_x, drift_y = drift_at(np.array(message.matrix).reshape(2, 3), message.center)
@@ -213,7 +213,7 @@ class MeasurementHistory:
         _keep(self._drift, at_ns, point)
 
     def set_places(self, message: Any) -> None:
-        """Replace the places of a channel by those of a `SpatialPointWithScoreList` message that are lengths."""
+        """Replace a channel's places by the places with length units in a `SpatialPointWithScoreList` message."""
         found = ((one.spatial.point, one.spatial.units or "m", one) for one in message.spatials[-MOST_TARGETS:])
         self._places[message.channel] = tuple(
             FoundPlace(

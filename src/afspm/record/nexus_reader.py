@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 DEFINITION = "NXspm"
 BIAS_SPECTRUM = "NXsts"
-"""The definition that a spectrum over the bias of a tunnelling microscope follows."""
+"""The NeXus definition of a bias spectrum of a tunnelling microscope."""
 ABOUT = "afspm"
 """The group for facts without a name in NeXus."""
 GRID = "grid"

@@ -49,7 +49,7 @@ class FileProvenance:
     Attributes:
         time_ns: the end of the measurement; began_ns: its start.
         facts: all else, in JSON's types: holder, mode, problems, feedback, drift, the run, its seed …
-        header: of the controller's own file.
+        header: the header of the controller's own file.
     """
 
     time_ns: int
@@ -122,7 +122,7 @@ def encode_spectrum(spectrum: Spectrum, circumstances: FileProvenance) -> bytes:
 
 
 def facts_of(path: Path) -> Plain:
-    """Return the facts stored in a file beside its values. Raises FileError: it is damaged."""
+    """Return the facts stored in a file beside its values. Raises FileError if the file is damaged."""
     with hdf5.opened(path) as file:
         return about_of(file)
 
@@ -166,7 +166,7 @@ def _about(content: str, filename: str, circumstances: FileProvenance) -> dict[s
 
 
 def field_names(names: Iterable[str], taken: Iterable[str] = ()) -> list[str]:
-    """Return unique names that NeXus allows; the original ones are stored as `long_name`."""
+    """Return unique names that NeXus allows; the original names are stored as `long_name`."""
     found, used = [], set(taken)
     for name in names:
         plain = re.sub(r"[^a-z0-9_]+", "_", name.lower()).strip("_") or "value"

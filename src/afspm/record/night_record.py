@@ -29,7 +29,7 @@ class Thumbnail:
     Attributes:
         levels: [y, x], y upwards: indices into a colour map.
         span: the values of the first and the last colour, in `unit`.
-        width_m: of the scan.
+        width_m: the width of the scan.
     """
 
     levels: NDArray[np.uint8]
@@ -39,12 +39,12 @@ class Thumbnail:
 
     @property
     def kind(self) -> tuple[str, float]:
-        """Return unit and width: thumbnails with equal unit and width share a range, since they are compared."""
+        """The unit and the width in m; thumbnails of one kind share a range of values, since they are compared."""
         return self.unit, float(f"{self.width_m:.3g}")
 
     @property
     def values(self) -> NDArray[np.float64]:
-        """Return the levelled values in the steps of the colour scale; NaN at unmeasured pixels."""
+        """The levelled values in the steps of the colour scale; NaN at unmeasured pixels."""
         step = (self.span.high - self.span.low) / (LEVELS - 1)
         return np.where(self.levels == UNMEASURED, np.nan, self.span.low + step * self.levels)
 
@@ -101,7 +101,7 @@ class NightRecord:
         return record
 
     def add(self, entry: Plain) -> bool:
-        """Add an entry; return False for a known one (packets are replayed after a restart)."""
+        """Add an entry; return False for a known entry (packets are replayed after a restart)."""
         kind, time_ns = entry["kind"], int(entry["time_ns"])
         identity = f"{kind} {time_ns} {entry.get('by', '')}"
         if identity in self._known:
@@ -143,7 +143,7 @@ class NightRecord:
 
     @property
     def problems(self) -> list[int]:
-        """All problems except routine ones, in the order of their first flag."""
+        """All non-routine problems, in the order of their first flag."""
         found = dict.fromkeys(p for _, state in sorted_by_time(self.control) for p in state.problems)
         return [problem for problem in found if self.problem_spans(problem)]
 
@@ -158,7 +158,7 @@ class NightRecord:
         return self._spans(lambda state: state.holder == holder, holder)
 
     def problem_spans(self, problem: int) -> list[Span]:
-        """Return the spans in which a problem was flagged, except routine ones."""
+        """Return the spans in which a problem was flagged, except routine spans."""
         spans = self._spans(lambda state: problem in state.problems)
         if problem != Problem.THERMAL_DRIFT:
             return spans

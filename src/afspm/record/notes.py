@@ -25,7 +25,7 @@ def append_note(
     """Append a note to the record of an ended run, in the form in which the scheduler publishes notes.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
         who: the author.
         written_ns: real time.
         scan_ns: time of the scan that the note is about.

@@ -25,7 +25,7 @@ _TECHNIQUE, _BIAS_TECHNIQUE = "STM", "STS"
 
 
 def definition_of(spectrum: Spectrum, metadata: Mapping[str, str]) -> str:
-    """Return the NeXus definition of a spectrum: NXsts for one over the bias of a tunnelling microscope."""
+    """Return the NeXus definition of a spectrum: NXsts for a bias spectrum of a tunnelling microscope, else NXspm."""
     is_over_bias = spectrum.units[:1] == ("V",) and len(spectrum.values) > 0
     is_tunnelling = metadata.get("technique") in (_TECHNIQUE, _BIAS_TECHNIQUE)
     return BIAS_SPECTRUM if is_over_bias and is_tunnelling else DEFINITION
@@ -63,7 +63,7 @@ def describe(entry: h5py.Group, definition: str, about: PlainMapping, version: s
 
 
 def write_frame(instrument: h5py.Group, scan: Scan) -> None:
-    """Write region and pixels of a scan; start and end are those of the unrotated frame."""
+    """Write region and pixels of a scan; start and end refer to the unrotated frame."""
     rows, columns = scan.shape
     _write_pattern(instrument, scan.region.center_m, scan.region, (columns, rows))
 

@@ -62,7 +62,7 @@ class ReadingCurve:
     """Values over time; NaN where the value was unknown.
 
     Attributes:
-        step_ns: a point nearer to the last one replaces it; it grows with the length of the run.
+        step_ns: the least time between two points; a nearer point replaces the last. It grows with the run.
     """
 
     unit: str = ""
@@ -71,7 +71,7 @@ class ReadingCurve:
     step_ns: int = 0
 
     def add(self, time_ns: int, value: float) -> None:
-        """Add a value; of a long run every second point is kept, again and again, and each gap."""
+        """Add a value; thin a long curve to every second point, but keep its gaps."""
         is_near = len(self.times_ns) > 1 and time_ns - self.times_ns[-2] < self.step_ns
         if is_near and (value != value) == (self.values[-1] != self.values[-1]):
             self.times_ns[-1], self.values[-1] = time_ns, value
@@ -136,7 +136,7 @@ class ProcessHistory:
     """The past conditions and restarts of the processes.
 
     Attributes:
-        timelines: of the conditions of each process, by name; a busy process counts as alive.
+        timelines: the timeline of each process's conditions, by name; a busy process counts as alive.
         reported_ns: the time of the last report on each process, by name.
         restarts: newest last, bounded.
     """
@@ -161,14 +161,14 @@ class Overview:
     A packet older than the newest of its envelope is ignored, so replayed packets may be given as they arrive.
 
     Args:
-        problems: their names; the journal is searched by them for the component that flagged a problem.
+        problems: the names of problems, for the search in the journal for the component that flagged one.
 
     Attributes:
         newest_ns: the time of the newest packet; 0 before the first.
-        status, control: the newest; None before the first.
+        status, control: the newest state of the microscope and of control; None before the first.
         processes, progress_reports: the newest of each, by name.
-        proposals: of agents, by id, newest last, bounded.
-        approvals: of persons, in force.
+        proposals: the proposals of agents by id, newest last, bounded.
+        approvals: the approvals in force.
         log, notes, entries, refusals: newest last, bounded.
     """
 
@@ -229,7 +229,7 @@ class Overview:
 
     @property
     def problem_spans(self) -> list[Span]:
-        """The spans of all problems except routine ones, in the order of time."""
+        """The spans of all non-routine problems, in the order of time."""
         spans = (span for lane in self.timelines.problems.values() for span in lane.spans)
         return sorted((span for span in spans if not self.is_routine(span)), key=lambda span: span.start_ns)
 
@@ -240,7 +240,7 @@ class Overview:
 
     @property
     def in_control(self) -> str:
-        """The holder of control; in MANUAL the person who set that mode, or "a person"; empty if the scope is free."""
+        """The holder of control; in MANUAL the person who set that mode, or "a person"; empty without a holder."""
         if self.control is None:
             return ""
         if self.control.mode is not ControlMode.MANUAL:
@@ -273,7 +273,7 @@ class Overview:
         return self._measured.scan_progress(now_ns)
 
     def silent_ns(self, name: str, speed: float) -> int | None:
-        """Return the time since the last report on a process; None while reports on it come.
+        """Return the time since the last report on a process; None while reports arrive.
 
         If other packets arrive meanwhile, the computer of the process is unreachable.
 
@@ -288,9 +288,9 @@ class Overview:
 
         Args:
             message: its name, e.g. "Scan2d".
-            thing: as `wire.decode` returns it.
-            time_ns: of the packet.
-            envelope: of the packet; by default the name of the message.
+            thing: the decoded message from `wire.decode`.
+            time_ns: the time of the packet.
+            envelope: the envelope of the packet; by default the name of the message.
         """
         key = envelope or message
         # a scheduler gives each packet a new time: within one envelope, a packet that is not newer is a repetition

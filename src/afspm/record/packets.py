@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from afspm.storage.formats.content import FileContent
 
 Query = Callable[[str, Sequence[object]], list[Row]]
-"""Runs a query on the journal; raises FileError where it is damaged."""
+"""A function that runs a query on the journal; it raises FileError if the journal is damaged."""
 
 _AT_ONCE = 500
 _FILES_KEPT = 4
@@ -85,7 +85,7 @@ def packets(
 def without_reading_files(
     query: Query, frame: Frame, messages: Sequence[str] | None
 ) -> Iterator[tuple[Packet, str, Any]]:
-    """Yield packet, name of its message and decoded content; scans and spectra have the right shape and NaN for values.
+    """Yield packet, message name and decoded content; scans and spectra have the right shape and NaN for values.
 
     Lines of running scans and unreadable packets are left out.
     """

@@ -107,7 +107,7 @@ def draw_scale_bar(
 
 
 def gold() -> Any:
-    """Return the colours of heights as a colour map of matplotlib."""
+    """Return the colour map of heights as a matplotlib colour map."""
     from matplotlib.colors import ListedColormap
 
     return ListedColormap(colour_map(PALETTES[0]) / 255.0)

@@ -24,7 +24,7 @@ from afspm.record.drift_mapping import drift_knowledge
 _BACK = 20
 """The number of earlier states that are searched for the start of a measurement."""
 _READINGS_NS = 60 * 10**9
-"""Readings of instruments are published every 10 s at least; older ones belong to an instrument that is gone."""
+"""Readings of instruments are published every 10 s at least; older readings come from a lost instrument."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def drift(journal: sqlite3.Connection, time_ns: int, since_ns: int | None, filen
     """Return the drift mapping published just before a scan; None if there was none.
 
     Args:
-        filenames: of the channels of the scan.
+        filenames: the controller's files of the scan's channels.
     """
     row = journal.execute(
         "SELECT payload FROM packets WHERE message = 'DriftMapping' AND time_ns <= ? AND time_ns > ?"

@@ -64,10 +64,10 @@ def open_run(path: str | Path = "runs") -> Run:
         [entry.reason for entry in run.refusals]
 
     Args:
-        path: the folder of the run, or of all runs: then the newest run. A replay opens the replayed run.
+        path: the folder of the run, or of all runs: then the newest run. For a replay, the replayed run is opened.
 
     Raises:
-        FileError: there is no record, or it is damaged.
+        FileError: the record is missing or damaged.
     """
     return Run(_folder(Path(path)))
 
@@ -87,7 +87,7 @@ class Run:
 
     @property
     def scans(self) -> KeyedTable[ScanRow]:
-        """One row for each scan, also interrupted ones, in the order of recording."""
+        """One row for each scan, also if interrupted, in the order of recording."""
         return read_scans(self._query)
 
     @property
@@ -99,7 +99,7 @@ class Run:
         """Return all channels of a scan: by its index in `scans` (-1: the last), its key, or its row.
 
         Raises:
-            FileError: its file is missing or damaged, or it was interrupted before its first line.
+            FileError: the file is missing or damaged, or the scan was interrupted before its first line.
             NoSuchItem: there is no such scan.
         """
         row = self.scans[which] if isinstance(which, str) else which
@@ -125,11 +125,11 @@ class Run:
         )
 
     def film(self, scans: Sequence[ScanRow] | None = None, channel: str | None = None) -> Film:
-        """Return scans of one place as a film that stands still: `run.film().save("night.gif")`.
+        """Return scans of one place as a film aligned on the sample: `run.film().save("night.gif")`.
 
         Args:
-            scans: rows of `scans`; None: all of the place that was scanned most often.
-            channel: None: the first.
+            scans: rows of `scans`; None: all scans of the place that was scanned most often.
+            channel: the shown channel; None: the first.
 
         Raises:
             InvalidValue: fewer than two scans, not of one place, or a scan without the channel.
@@ -208,7 +208,7 @@ class Run:
 
     @property
     def problems(self) -> Table[ProblemRow]:
-        """Each flag of a problem, except routine ones.
+        """Each flag of a non-routine problem.
 
         Routine is thermal-drift while the first scan of a run with drift correction is taken in both directions.
         """
@@ -255,7 +255,7 @@ class Run:
         return Table(self.overview(messages=("DriftMapping",)).drift, DriftPoint)
 
     def ledger(self, keep_away_m: float = KEEP_AWAY_M) -> TreatmentLedger:
-        """Return what was done to tip and sample, as far as the record shows it.
+        """Return the totals of the recorded treatments of tip and sample.
 
         Args:
             keep_away_m: distance from scanned regions within which a treatment counts as near.
@@ -277,7 +277,7 @@ class Run:
         return [verdict for verdict in verdicts if verdict is not None]
 
     def changed_rows(self) -> dict[int, int]:
-        """Return the first row with a changed tip, as seen in the lines of a running scan, by the time of the scan."""
+        """Return the first row with a changed tip, found while the scan ran, by the time of the scan."""
         sql = "SELECT payload FROM packets WHERE message = ? ORDER BY time_ns, rowid"
         found: dict[int, int] = {}
         for (payload,) in self._query(sql, (LINE_VERDICT_MESSAGE,)):
@@ -377,7 +377,7 @@ class Run:
         return Frame(self._note("frame") or Frame.TIP.value)
 
     def numbered(self, number: int) -> ScanRow:
-        """Return the scan with a number, as in reports and exports. Raises InvalidValue: there is none."""
+        """Return the scan with a number, as in reports and exports. Raises InvalidValue without such a scan."""
         rows = {row.number: row for row in self.scans}
         if number not in rows:
             hint = f"the last is {max(rows)}" if rows else "there is none yet"

@@ -13,9 +13,9 @@ RUN_FILE: Final = "run.json"
 STATE_DIR: Final = "state"
 """Folder beside run.json: saved memory of the processes."""
 ENDED: Final = "ended"
-"""Key in run.json, after the end of a run: how it ended, in words."""
+"""Key in run.json, after the end of a run: its end as text."""
 REAL_S: Final = "real_s"
-"""Key in run.json, after the end of a run: its real duration, summed over its parts, without work after the end."""
+"""Key in run.json, after the end of a run: its real duration, summed over its parts."""
 REPLAY_OF: Final = "replay_of"
 """Key in run.json of a replay: the folder of the replayed run."""
 EXPERIMENT_FILE: Final = "experiment.toml"
@@ -36,7 +36,7 @@ def read_run_json(folder: Path) -> Plain:
     """Return the content of run.json in the folder of a run.
 
     Raises:
-        FileError: it is missing, unreadable, or another kind of file.
+        FileError: the file is missing, unreadable, or of another kind.
     """
     file = folder / RUN_FILE
     try:

@@ -1,4 +1,4 @@
-"""The lock that the supervisor of a run holds: it shows whether the run goes on, has ended, or was cut off."""
+"""The lock held by the supervisor of a run: it shows whether the run continues, has ended, or was cut off."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 def cut_off_message(folder: Path) -> str:
     """Return a message about a run that was cut off; empty if it goes on, or has ended.
 
-    Only the computer that ran it can know.
+    Only the computer that ran the run can know.
     """
     facts = run_json_or_empty(folder)
     if not facts or facts.get(ENDED) or other_computer(folder) or not _is_left(folder):
@@ -45,18 +45,18 @@ def cut_off_message(folder: Path) -> str:
 
 
 def other_computer(folder: Path) -> str:
-    """Return the name of the computer that started a run; empty if that is this one, or unknown."""
+    """Return the name of the computer that started a run; empty for this computer, or if unknown."""
     name = str(run_json_or_empty(folder).get(COMPUTER) or "")
     return "" if name == platform.node() else name
 
 
 def goes_on(folder: Path) -> bool:
-    """Return whether a run is still going on, as far as this computer can know: not ended, and not cut off."""
+    """Return whether a run has neither ended nor been cut off, as far as this computer can know."""
     return not run_json_or_empty(folder).get(ENDED) and not cut_off_message(folder)
 
 
 def describe_state(folder: Path) -> str:
-    """Describe how a run ended, or that it goes on or was cut off."""
+    """Return the state of a run as text: its end, running, or cut off."""
     if ended := run_json_or_empty(folder).get(ENDED):
         return str(ended)
     if name := other_computer(folder):

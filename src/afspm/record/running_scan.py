@@ -37,8 +37,8 @@ class RunningScan:
     Attributes:
         began_ns: None if the start was not observed.
         holder: the component in control at the start.
-        parameters: in force at the start; None if unknown.
-        setpoint: of the feedback at the start; None if it was not published.
+        parameters: the scan parameters in force at the start; None if unknown.
+        setpoint: the feedback setpoint at the start; None if it was not published.
         channels: received lines of each channel, where the microscope delivers lines.
     """
 
@@ -68,7 +68,7 @@ class RunningScan:
         """Return (fraction done, ns remaining); None if it can't be estimated.
 
         Args:
-            expected_ns: the duration of such a scan; None: extrapolate from the received lines.
+            expected_ns: the expected duration of the whole scan; None: extrapolate from the received lines.
         """
         if self.began_ns is None:
             return None

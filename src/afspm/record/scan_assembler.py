@@ -1,4 +1,4 @@
-"""`ScanAssembler`: assembles packets into measurements: the channels of a scan, its lines, its end."""
+"""`ScanAssembler`: the assembly of packets into measurements: the channels of a scan, its lines, its end."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class AssembledScan:
     """An ended scan.
 
     Attributes:
-        channels: its packets with their content; none if it was interrupted.
-        lines: earlier packets with its lines.
-        interrupted_ns: the time of the interruption; None if it is complete.
+        channels: the packets of the channels with their content; empty if the scan was interrupted.
+        lines: the earlier packets with the scan's lines.
+        interrupted_ns: the time of the interruption; None if the scan is complete.
     """
 
     channels: list[tuple[Packet, Scan]] = field(default_factory=list)

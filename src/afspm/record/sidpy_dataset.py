@@ -42,7 +42,7 @@ def to_sidpy(scan: Scan) -> sidpy.Dataset:
 
 
 def from_sidpy(dataset: sidpy.Dataset) -> Scan:
-    """Return an image of sidpy's as a scan; see `Scan.from_sidpy`."""
+    """Return a sidpy image as a scan; see `Scan.from_sidpy`."""
     from afspm.basics import units
     from afspm.model.scan import Scan
 

@@ -22,7 +22,7 @@ _FORWARD = re.compile(r"\s*(?:\[fwd\]|\btrace\b|\bforward\b|\bfwd\b)", re.IGNORE
 _TOLERANCE: Final = 0.1
 """Largest distance of a position from its grid point, as a part of the spacing."""
 _LEAST_FILLED: Final = 0.5
-"""Least part of the grid points that is measured: below it the positions are a list of places, not a grid."""
+"""Least share of measured grid points: below it the positions are a list of places, not a grid."""
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,9 @@ class SpectrumStack:
         points: the grid.
         swept: the values of the swept variable, shape (z,), with its name and unit.
         directions: "forward", and "backward" if the sweep went both ways.
-        curves: by variable, shape (y, x, repeat, direction, z); NaN where nothing was measured.
-        units: by variable.
-        names: the measured columns of each spectrum, without the swept one.
+        curves: the curves by variable, shape (y, x, repeat, direction, z); NaN where nothing was measured.
+        units: the units by variable.
+        names: the measured columns of each spectrum, without the swept column.
         columns: columns of each variable by direction; one direction if a single sweep goes forth and back.
         times: times of measurement, shape (y, x, repeat); NaT if unknown.
     """

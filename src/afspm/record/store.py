@@ -1,4 +1,4 @@
-"""`RecordStore`: writes the record of a run: the journal, and a file for each scan and spectrum.
+"""`RecordStore`: the writer of a run's record: the journal, and a file for each scan and spectrum.
 
 Each call is recorded completely or not at all, and a repeated packet is recorded once: files are written under
 temporary names and renamed before the journal names them, in one transaction.
@@ -56,7 +56,7 @@ class RecordSettings:
 
     Attributes:
         facts: written into every file: the name of the experiment, seeds …
-        frame: of published positions.
+        frame: the coordinate frame of published positions.
         measured: write scans and spectra; otherwise only the journal.
     """
 
@@ -70,7 +70,7 @@ class RecordStore:
     """The record of one run.
 
     Args:
-        folder: of the run.
+        folder: the folder of the run.
 
     Raises:
         FileError: the journal is damaged.
@@ -98,14 +98,14 @@ class RecordStore:
             self.note(name, value)
 
     def waiting(self) -> list[Packet]:
-        """Return the packets that wait for others of their scan."""
+        """Return the packets that wait for other packets of their scan."""
         return list(self._gathering.waiting())
 
     def take(self, packets: Iterable[tuple[Packet, str]]) -> None:
         """Record packets, each with its source, in the order of publication.
 
         Raises:
-            OSError, sqlite3.OperationalError: the disk is full …; then none of them is recorded.
+            OSError, sqlite3.OperationalError: the disk is full …; then no packet is recorded.
         """
         with self._all_or_nothing():
             for packet, source in packets:
@@ -119,12 +119,12 @@ class RecordStore:
             self._write(self._gathering.flush())
 
     def finish(self) -> None:
-        """End every scan, also one with lines only. Raises as `take`."""
+        """End every scan, also a scan with lines only. Raises as `take`."""
         with self._all_or_nothing():
             self._write(self._gathering.finish(self._newest_ns))
 
     def has(self, packet: Packet) -> bool:
-        """Return whether a packet is recorded, or waits for others of its scan."""
+        """Return whether a packet is recorded, or waits for other packets of its scan."""
         row = self._journal.execute(
             "SELECT 1 FROM packets WHERE time_ns = ? AND envelope = ?", (packet.time_ns, packet.envelope)
         )

@@ -28,7 +28,7 @@ Values = tuple[object, ...]
 
 
 def draw(run: Run, title: str) -> None:
-    """Draw `sweep.png` into the folder of a run with scans of a sweep; a second sweep has a number in its name."""
+    """Draw `sweep.png` into the folder of a run with sweep scans; further sweeps have a number in the file name."""
     swept: dict[tuple[str, ...], list[ScanRow]] = {}
     for row in run.scans:
         if row.settings and row.file and not row.interrupted:
@@ -54,7 +54,7 @@ def _scan(run: Run, row: ScanRow) -> Scan | None:
 def draw_sheet(scans: Sequence[tuple[tuple[SweptSetting, ...], Scan]], path: Path, title: str) -> None:
     """Draw scans in rows and columns by their settings: the last parameter along a row, all others down the rows.
 
-    All have one range of colours. Of two scans with the same settings the later one is drawn.
+    All scans share one range of colours. Of two scans with the same settings the later scan is drawn.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -120,7 +120,7 @@ def _picture(scan: Scan) -> NDArray[np.float64]:
 
 
 def _sorted(settings: Iterable[tuple[SweptSetting, ...]]) -> list[tuple[SweptSetting, ...]]:
-    """Return distinct settings: numbers ascending, other values in the order of occurrence."""
+    # numbers ascending, other values in the order of occurrence
     found = list(dict.fromkeys(settings))
     seen: list[Any] = [one.value for each in found for one in each]
 

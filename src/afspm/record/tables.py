@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 class SweptSetting(NamedTuple):
-    """A parameter that a sweep had set: a number in SI or in the microscope's own unit, a switch, or a text."""
+    """A parameter that a sweep had set: a number in SI or in the microscope's own unit, a switch, or text."""
 
     name: str
     value: float | str | bool
@@ -34,7 +34,7 @@ class SweptSetting(NamedTuple):
 
     @property
     def column(self) -> str:
-        """The name of its column: "scan-speed [m/s]"."""
+        """The column name of the setting: "scan-speed [m/s]"."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
@@ -50,17 +50,17 @@ class ScanRow:
     """A scan, without its values.
 
     Attributes:
-        number: from 1, in the order of recording.
+        number: the number of the scan, from 1, in the order of recording.
         time_ns: the end of the scan, or its interruption; began_ns: None if the start was not observed.
         channels: (name, unit) of each.
         region, shape: None of a scan interrupted before its first line; shape is (rows, columns).
         interrupted: the scan is incomplete.
-        holder, mode, problems: at the start; None if unknown.
-        filename: of the controller; file: of the record, from the run folder, empty if there is none.
-        key: of the request, `scope.scan(…, key="tile-1")`; empty if it had none.
+        holder, mode, problems: the state of control at the start; None if unknown.
+        filename: the controller's file; file: the record's file, relative to the run folder, empty if there is none.
+        key: the key of the request, `scope.scan(…, key="tile-1")`; empty without a key.
         registration: how its position on the sample is known; None without drift correction.
         position_sd_m: standard deviation of that position along its most uncertain axis; None if unknown.
-        settings: parameters that a sweep had set for it, as the microscope reported them; a column for each.
+        settings: parameters that a sweep had set for the scan, as the microscope reported them; a column for each.
     """
 
     number: int
@@ -105,7 +105,7 @@ class SpectrumRow:
 
 @dataclass(frozen=True, slots=True)
 class ControlRow:
-    """Control from `time_ns` on."""
+    """The control state from `time_ns` on."""
 
     time_ns: int
     state: ControlState
@@ -286,7 +286,7 @@ _CELL: Final = 'style="text-align:left;white-space:nowrap;max-width:18em;overflo
 
 
 def table_html(columns: Mapping[str, Sequence[object]], count: int) -> str:
-    """Return columns of `count` rows each, without empty columns."""
+    """Return an HTML table of columns of `count` rows each, without empty columns."""
     shown = range(count) if count <= MOST_ROWS else [*range(_ENDS), None, *range(count - _ENDS, count)]
     columns = {name: columns[name] for name in sorted(columns, key=lambda name: name not in _FIRST)}
     filled = [_column(name, values) for name, values in columns.items() if any(map(_has_content, values))]

@@ -81,7 +81,7 @@ class Timelines:
     Attributes:
         control: the holders.
         mode, scope_state: labels in lower case.
-        problems: of each problem, by number.
+        problems: the timeline of each problem, by number.
     """
 
     control: Timeline = field(default_factory=Timeline)

@@ -1,4 +1,4 @@
-"""The ledger of a run: what was done to tip and sample, as far as the record shows it."""
+"""The ledger of a run: the recorded treatments of tip and sample."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from afspm.basics.units import convert, si_unit
 from afspm.model import ControlRequest, ControlResponse, JournalEntry, Region, names
 
 _COUNTS = frozenset({ControlResponse.SUCCESS, ControlResponse.NO_RESPONSE})
-"""Responses to an action that may have been carried out: one without an answer counts as done."""
+"""Responses to an action that was carried out, or may have been."""
 KEEP_AWAY_M = 500e-9
 """The distance that the `TipCorrector` keeps from scanned regions by default."""
 XY = tuple[float, float]
@@ -20,7 +20,7 @@ XY = tuple[float, float]
 
 @dataclass(frozen=True)
 class TreatmentLedger:
-    """Totals of a run.
+    """Totals of the treatments in a run.
 
     Attributes:
         pulses, pulse_v_s: number of bias pulses, and the sum of |voltage| times duration.
@@ -53,14 +53,14 @@ def treatment_ledger(
     end_ns: int,
     keep_away_m: float,
 ) -> TreatmentLedger:
-    """Return the ledger.
+    """Return the ledger of a run, from its journal and published states.
 
     Args:
-        journal: in the order of time.
+        journal: the journal entries in the order of time.
         positions: times and positions of the probe.
         scanned: beginnings and regions of scans.
-        feedback: times at which its state was published, and whether it was on.
-        end_ns: of the run.
+        feedback: times at which the feedback's state was published, and whether it was on.
+        end_ns: the end of the run.
         keep_away_m: distance from scanned regions within which a treatment counts as near.
     """
     ledger, values, retracted = TreatmentLedger(), dict[str, float](), list[tuple[int, bool]]()

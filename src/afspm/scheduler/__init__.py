@@ -1,4 +1,4 @@
-"""The Microscope Scheduler: decides who controls the microscope, and which requests reach it.
+"""The Microscope Scheduler: decides which component controls the microscope, and which requests reach it.
 
 **Theory of operation.** One pure function decides everything: `step(state, event, now) -> (state, effects)`
 (`scheduler_core`). The shell around it (`shell`) turns messages into events. It writes the effects to disk
@@ -13,9 +13,9 @@
                   limits hold at the moment of sending; a packet is in the log before any subscriber receives it
 
     folder         decides
-    `control/`     who is in control: the arbitration table, leases, problems, the start and the end of an experiment
+    `control/`     control: the arbitration table, leases, problems, the start and the end of an experiment
     `requests/`    a request from its arrival to its answer, in five stages
-    `safety/`      limits, and what the scheduler itself does for the tip when a holder dies
+    `safety/`      limits, and the scheduler's own actions for the tip when a holder dies
     `publishing/`  envelopes, times, the cache for late joiners, the event log
 
 A coordinate frame may translate between the coordinates of components and those of the microscope

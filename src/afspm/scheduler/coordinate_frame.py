@@ -11,8 +11,8 @@ knows this protocol, and no frame by name; by default it has `TipFrame`, which c
 | publishes a packet | `incoming` |
 | saves, and restarts | `saved`; `restored`, then `recalled` |
 
-What must hold: the same request id always gives the same bytes, a packet published twice has the same place twice, and
-each input that is kept comes back (`Reconsider`) after a bounded time, since everything behind it waits.
+Invariants: the same request id always gives the same bytes; a packet published twice has the same place twice;
+each kept input comes back (`Reconsider`) after a bounded time, since all later inputs wait for it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class MappedRequest:
     Attributes:
         request: is sent in place of the original, with the same id.
         names: the parameters that the client sets; the others change by the mapping alone.
-        places_text: the place in both coordinates, for the reason of a refusal.
+        places_text: the place in both coordinate systems, for the text of a refusal.
     """
 
     request: Request
@@ -46,14 +46,14 @@ class MappedRequest:
 
 @dataclass(frozen=True, slots=True)
 class Reconsider:
-    """The output that steps again with a kept input, through the frame first."""
+    """The output that returns a kept input to the scheduler; the frame processes the input first."""
 
     event: Input
 
 
 @dataclass(frozen=True, slots=True)
 class AskMicroscope:
-    """The output that sends a request in the scheduler's own name; `FrameAnswered` has the answer and `purpose`."""
+    """The output that sends a request in the scheduler's own name; the answer is the input `FrameAnswered`."""
 
     request: Request
     purpose: object
@@ -72,7 +72,7 @@ class HoldControl:
 
 
 FrameOutput = Input | Reconsider | AskMicroscope | SaveNow | HoldControl | Delegate | Log
-"""An input among them goes to the scheduler without passing the frame again."""
+"""Outputs of `CoordinateFrame.step`; an `Input` goes to the scheduler without passing the frame again."""
 
 
 class CoordinateFrame(Protocol):
@@ -94,10 +94,10 @@ class CoordinateFrame(Protocol):
         """Process an input before the scheduler does.
 
         Args:
-            control: as it is before the input.
+            control: the state of control before the input.
 
         Returns:
-            The frame after the input, and its outputs in order; an input that passes is among them.
+            The frame after the input, and its outputs in order, including the input if it is passed on.
         """
         ...
 
@@ -110,7 +110,7 @@ class CoordinateFrame(Protocol):
         ...
 
     def in_force(self, place: Region | ProbePosition, now_ns: int) -> CoordinateFrame:
-        """Store a place that was read from the microscope: a change of one coordinate is applied to it."""
+        """Store a place read from the microscope; a later change of one coordinate is applied to it."""
         ...
 
     def outgoing(
@@ -124,11 +124,11 @@ class CoordinateFrame(Protocol):
         ...
 
     def move_before(self, action: str, now_ns: int) -> tuple[CoordinateFrame, MappedRequest | None]:
-        """Return the move that an action needs before it, to happen at its place; None: no move."""
+        """Return the move to the action's place that must precede the action; None: no move."""
         ...
 
     def carried_out(self, sent: Request, reported: Parameter | None, now_ns: int) -> CoordinateFrame:
-        """Store a success of the microscope, and the parameter value in its answer."""
+        """Update the frame after a successful request, with the parameter value in the microscope's answer."""
         ...
 
     def answer(self, asked: Request, reported: Parameter | None, now_ns: int) -> Parameter | None:
@@ -140,7 +140,7 @@ class CoordinateFrame(Protocol):
         ...
 
     def saved(self) -> object:
-        """Return the part that must survive a kill: a dataclass for `model.snapshot`, or None."""
+        """Return the part of the frame that must survive a kill: a dataclass for `model.snapshot`, or None."""
         ...
 
     def restored(self, plain: object) -> CoordinateFrame:
@@ -150,7 +150,7 @@ class CoordinateFrame(Protocol):
             plain: `saved()` as a snapshot returns it: plain data.
 
         Raises:
-            TypeError, ValueError, KeyError: it belongs to another frame, or is damaged.
+            TypeError, ValueError, KeyError: `plain` belongs to another frame, or is damaged.
         """
         ...
 

@@ -42,7 +42,7 @@ class Greeted:
 
 @dataclass(frozen=True, slots=True)
 class RequestIn:
-    """A request from the peer `name` arrived by `connection`.
+    """A request from the peer `name`, received over `connection`.
 
     Attributes:
         user: the owner of the peer's key; None where connections are not authenticated.
@@ -74,7 +74,7 @@ class PacketIn:
 
 @dataclass(frozen=True, slots=True)
 class ReplayRequested:
-    """A subscriber asks for the cached packets under `prefixes` that are newer than `since_ns`.
+    """A subscriber's request for the cached packets under `prefixes` that are newer than `since_ns`.
 
     Attributes:
         subscriber: the caller's own handle; returned in `Replay`.
@@ -110,10 +110,10 @@ class TranslatorReply:
 
 @dataclass(frozen=True, slots=True)
 class ProblemSeen:
-    """The event that the scheduler's process found a problem, or its disappearance.
+    """The appearance or disappearance of a problem, found by the scheduler's own process.
 
     Attributes:
-        name: the component in whose name it is flagged.
+        name: the component in whose name the problem is flagged.
     """
 
     problem: int
@@ -126,8 +126,7 @@ class Announced:
     """A packet that the coordinate frame publishes itself.
 
     Attributes:
-        before_ns: the translator's time of a packet that must come after this one; None: published with the current
-            time.
+        before_ns: the translator's time of a packet that must follow this packet; None: current time.
     """
 
     envelope: str
@@ -204,7 +203,7 @@ Input = (
 
 @dataclass(slots=True)
 class Reply:
-    """The effect that answers the peer `name` over `connection`, the newest open one of that name.
+    """The effect that answers the peer `name` over `connection`, its newest open connection.
 
     Attributes:
         asked: the kind of the answered request.
@@ -270,7 +269,7 @@ class Kill:
     """The effect that ends the experiment: the signal KILL is published, and the sockets are closed.
 
     Attributes:
-        tip_is_safe: the translator may leave; if False, it retracts the tip itself when it is stopped.
+        tip_is_safe: whether the translator may exit; if False, the translator retracts the tip when it is stopped.
     """
 
     tip_is_safe: bool = True

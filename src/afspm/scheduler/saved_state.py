@@ -62,5 +62,5 @@ class SavedState:
     grants: GrantBook = field(default_factory=GrantBook)
 
     def without_holder(self) -> SavedState:
-        """Return the state with no holder: an older state does not know the present one."""
+        """Return the state without a holder: an older state does not know the present holder."""
         return replace(self, control=replace(self.control, holder=None, solving=0), granted_to=None, lease_s=None)

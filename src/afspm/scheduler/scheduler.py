@@ -131,7 +131,7 @@ class Scheduler:
         )
 
     def coordinates(self, context: ProcessContext, *, in_process: bool = False) -> Coordinates:
-        """Return the coordinates of components: those of the tip, unless a subclass has others.
+        """Return the coordinate frame of components: the tip's, unless a subclass defines another.
 
         Args:
             in_process: whether the worker works in this process and at once, as a test needs it.

@@ -1,4 +1,4 @@
-"""`SchedulerCore`: all decisions of a scheduler, composed of the parts beside this module."""
+"""`SchedulerCore`: all decisions of a scheduler, composed of the modules in this folder."""
 
 from __future__ import annotations
 
@@ -130,7 +130,7 @@ class SchedulerCore:
         self._restored: SavedState | None = None
 
     def start(self, now_s: float, now_ns: int) -> list[Effect]:
-        """Begin. The control state is published once the translator's missed packets have come."""
+        """Start the scheduler; the control state is published after the translator's missed packets."""
         draft, is_restart = StateDraft(self.state, self._env, now_s, now_ns), self._restored is not None
         draft.peers = replace(draft.peers, timeout=replace(draft.peers.timeout, started_s=now_s))
         draft.watchdog = draft.watchdog.begun(now_s)

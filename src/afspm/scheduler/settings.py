@@ -30,7 +30,7 @@ from afspm.scheduler.safety.watchdog import WatchdogSettings
 
 DangerousState = Literal["MOVING", "SCANNING", "COARSE_MOTOR", "BUSY_PARAM", "SPEC", "feedback-off"]
 AdjustableParameter = Literal["zctrl-setpoint", "zctrl-pgain", "zctrl-igain", "tip-bias-voltage"]
-"""None of these moves the tip elsewhere, so a person may set it while a component measures."""
+"""Parameters that a person may set while a component measures, since none of them moves the tip elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class ControlSettings:
     __pydantic_config__: ClassVar[object] = SECTION
 
     def rules(self, problems: ProblemNames) -> Rules:
-        """Return the part that the arbitration table needs.
+        """Return the settings that the arbitration table needs.
 
         Raises:
             InvalidValue: an unknown problem in `end_on`.
@@ -115,11 +115,12 @@ class Waits:
     """The scheduler's waits, in real time.
 
     Attributes:
-        restart_grace_s: how long a holder stays in control that has not connected since a restart of the scheduler.
-        answer_s: how much longer the line to the translator is kept for an overdue answer.
+        restart_grace_s: the time for which a holder stays in control without connecting after a restart of the
+            scheduler.
+        answer_s: the further time for which the line to the translator is kept for an overdue answer.
         takeover_s: see `model.sessions.SessionTable`.
-        catch_up_s: how long a starting scheduler waits for packets that the translator published before.
-        longest_queue: how many requests may wait for the translator.
+        catch_up_s: the time that a starting scheduler waits for packets that the translator published before.
+        longest_queue: the largest number of requests that wait for the translator.
     """
 
     restart_grace_s: float = 30.0
@@ -135,9 +136,9 @@ class RunFacts:
 
     Attributes:
         clock: `ExperimentClock.as_dict()`; empty: real time.
-        name: the identity of the run; empty: it has none.
+        name: the identity of the run; empty if unknown.
         simulated: whether the microscope is simulated.
-        versions: of the programs on this computer.
+        versions: the versions of the programs on this computer.
     """
 
     clock: Mapping[str, float] = field(default_factory=dict)

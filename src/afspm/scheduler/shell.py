@@ -35,8 +35,10 @@ if TYPE_CHECKING:
 
 _LEVELS = logging.getLevelNamesMapping()
 _LATE_S = 0.005
-"""How late a deadline may be noticed while messages come: computing the next deadline after each message would cost as
-much as processing some of them."""
+"""Tolerated lateness of a deadline while messages arrive.
+
+Computing the next deadline after each message would cost as much as processing some messages.
+"""
 _TOGETHER_BYTES = 1 << 20
 """Packets are written together up to this size: the first one must not wait long for the others."""
 _WRITTEN_DOWN_LATE = (bytes([RELAY_REQUEST]), bytes([ControlRequest.ADD_EXP_PRBLM]))
@@ -104,7 +106,7 @@ class SchedulerShell:
 
     @property
     def over(self) -> bool:
-        """The experiment has ended, and the grace period after it."""
+        """Whether the experiment and the grace period after it have ended."""
         return self.ended and self._clock.monotonic_s() >= self._core.leave_at_s
 
     def handle(self, ready: list[Source]) -> None:

@@ -98,7 +98,7 @@ class SchedulerState:
         )
 
     def saved_parts(self) -> tuple[object, ...]:
-        """The parts whose changes are saved before they are published."""
+        """Return the parts whose changes are saved before they are published."""
         saved = self.control, self.lease.token, self.lease.asked_s, self.watchdog.tip, self.microscope.risk
         return (
             *saved,
@@ -125,7 +125,7 @@ class SchedulerState:
 
 @dataclass(frozen=True)
 class Environment:
-    """Everything that a step needs beside the state.
+    """The settings, the codec and the packet cache that a step needs beside the state.
 
     Attributes:
         cache: the packets published last; the one part that changes in place, since it may hold hundreds of megabytes.
@@ -165,8 +165,8 @@ class StateDraft(StateParts):
     """One step in progress: the parts of the state so far, the effects so far, and the time.
 
     Attributes:
-        now_s: real and monotonic, for timeouts.
-        now_ns: of the experiment, for everything that has a meaning in it.
+        now_s: real monotonic time, for timeouts.
+        now_ns: experiment time, for everything that has a meaning in the experiment.
         raised: inputs raised by this step; the frame processes them within it.
         before: the state before this step.
     """

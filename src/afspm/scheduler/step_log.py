@@ -67,7 +67,7 @@ class Restored:
 
 @dataclass(frozen=True)
 class Step:
-    """One step: its input (None: the start), its times, the facts of its effects, and sums of the changed state."""
+    """One step: its input (None: the start), times, facts of its effects, and checksums of the changed state."""
 
     event: events.Input | None
     now_s: float
@@ -80,7 +80,7 @@ Keep = Callable[[Restored | Step], None]
 
 
 class StateSums:
-    """Checksums of the parts of a scheduler's state, those only that a step has changed."""
+    """Checksums of the parts of a scheduler's state that a step has changed."""
 
     def __init__(self) -> None:
         self._parts: dict[str, object] = {}
@@ -97,11 +97,11 @@ class StateSums:
 
 
 class RecordedCore(SchedulerCore):
-    """A scheduler's decisions that keep every step.
+    """A `SchedulerCore` that records every step.
 
     Args:
         keep: called with the beginning of a life, then after every step.
-        given: as to `SchedulerCore`.
+        given: the arguments of `SchedulerCore`.
     """
 
     def __init__(self, *given: Any, keep: Keep) -> None:
@@ -131,7 +131,7 @@ class RecordedCore(SchedulerCore):
 
 
 class StepLog:
-    """Writes the step log of a scheduler."""
+    """The writer of a scheduler's step log."""
 
     def __init__(self, log: LineLog, launch: Launch) -> None:
         self._log = log
@@ -171,7 +171,7 @@ def read_event(plain: Sequence[Any] | None, reports: Iterable[type] = ()) -> eve
         reports: the classes that the scheduler's coordinate frame declares.
 
     Raises:
-        KeyError: it is unknown, or a report of another coordinate frame.
+        KeyError: the input is unknown, or a report of another coordinate frame.
         WireError: its bytes are damaged.
     """
     if plain is None:

@@ -21,10 +21,10 @@ from afspm.storage.packet_log import PacketLog
 
 
 class StateFile:
-    """The file of mode, holder, problems …, saved each time before they are published.
+    """The file of the scheduler's state (mode, holder, problems …), saved before each publication.
 
     Args:
-        path: of the file; None: nothing is stored.
+        path: the path of the file; None: nothing is stored.
     """
 
     def __init__(self, path: Path | None, log: logging.Logger) -> None:
@@ -79,13 +79,13 @@ _CLOSED_WITHIN_S = 5.0  # real; a hanging disk must not keep the process from en
 
 
 class WriteAhead:
-    """A thread that writes, with a short wait for the disk: a slow disk must not delay control.
+    """The writer of state and packets, with a bounded wait: a slow disk must not delay control.
 
     A full or hanging disk is logged, and the experiment goes on. Entries that could not be written are written later,
     as far as they are still cached.
 
     Args:
-        log: None: no packets are stored.
+        log: the packet log; None: no packets are stored.
         cached: returns the packets in the scheduler's cache.
     """
 
@@ -128,7 +128,7 @@ class WriteAhead:
             self._clean()
 
     def close(self) -> None:
-        """Flush and close the files, if that does not take too long."""
+        """Flush and close the files; give up if that takes too long."""
         with contextlib.suppress(OSError):
             if self._log is not None:
                 self._disk.run(self._log.close)

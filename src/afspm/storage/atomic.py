@@ -42,7 +42,7 @@ def replace_file(
     """Replace a file completely or not at all, even if the process is killed.
 
     Args:
-        synced: guarantee it over a power cut too, which waits for the disk.
+        synced: guarantee this over a power cut, too, and wait for the disk.
         soon: with `synced` False, sync the file a moment later. A power cut before that may leave a damaged file.
         aside: temporary path of the file; None: a hidden name of this process beside it.
         mode: mode of the file, before the umask; 0o600 for secrets, from its creation on.
@@ -99,7 +99,7 @@ def write_atomic(path: Path, parts: Iterable[bytes | memoryview], *, synced: boo
 
 
 class FileBatch:
-    """New files that get their names together; each is synced in a thread during the write of the next.
+    """New files that get their final names together; each is synced in a thread during the write of the next.
 
     Args:
         suffix: suffix of a file until it gets its name.

@@ -240,7 +240,7 @@ def is_full(folder: Path) -> bool:
 
 
 SYNCER = Syncer()
-"""The one syncer of this process."""
+"""The syncer that the whole process shares."""
 
 
 _CAN_NOT_SYNC = (errno.EINVAL, errno.ENOTSUP)

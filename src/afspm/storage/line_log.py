@@ -1,4 +1,4 @@
-"""A log of JSON lines; each goes to the operating system at once, so that a kill of the process loses no line."""
+"""A log of JSON lines; each line goes to the operating system at once, so that a kill loses no line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REQUESTS_FOLDER = "requests"
 
 
 class LineLog:
-    """Appends lines to a file.
+    """A writer that appends lines to a file.
 
     A write error must not end the experiment: it is logged once, and the log ends there until a restart.
     """

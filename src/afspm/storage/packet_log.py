@@ -30,7 +30,7 @@ CAPACITY_BYTES = 64 << 20
 """Smallest size of the log; it is also never smaller than twice the cached packets."""
 MOST_UNRECORDED_BYTES = 1 << 30
 SPARE_BYTES = 256 << 20
-"""Bytes kept in spare files: what a flood of packets needs until it is recorded."""
+"""Bytes kept in spare files, enough for a flood of packets until it is recorded."""
 SYNCED_WITHIN_S = 5.0
 _SPARE_SUFFIX = ".spare"
 
@@ -50,7 +50,7 @@ class PacketLog:
 
     Args:
         folder: created with the first packet.
-        most_unrecorded_bytes: most bytes that wait for the recorder; beyond them the oldest packets are given up.
+        most_unrecorded_bytes: most bytes that wait for the recorder; beyond that the oldest packets are dropped.
 
     Attributes:
         has_grown: a segment was filled since the last `clean`.
@@ -225,7 +225,7 @@ def expect_recorder(folder: Path) -> None:
 
 
 def commit(folder: Path, position: Position) -> None:
-    """Commit a position: everything before it is recorded and on the disk.
+    """Commit a position: all packets before it are recorded and on the disk.
 
     Raises:
         OSError: the disk refuses.

@@ -1,4 +1,4 @@
-"""Surveys, for components and scripts: a wide scan, the targets found in it, and the measurements at each."""
+"""Surveys, for components and scripts: a wide scan, the targets found in it, and the measurements at each target."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Picture of a survey: the wide scan with its numbered targets, their zooms, and the curves under each."""
+"""Picture of a survey: the wide scan with its numbered targets, their zooms, and the curves under each zoom."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def draw_survey(record: SurveyRecord, path: str | Path, *, title: str = "", simu
     """Draw a survey with its numbered targets, the zooms of the first fifteen and their curves.
 
     Args:
-        path: of the picture; its suffix gives the format.
+        path: the path of the picture; its suffix gives the format.
         simulated: whether to mark the picture, so that it is not taken for a measurement.
     """
     _Picture(record).save(Path(path), title, simulated=simulated)

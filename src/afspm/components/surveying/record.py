@@ -1,4 +1,4 @@
-"""Record of a survey: its targets and the measurements at each, as a table and a picture."""
+"""Record of a survey: its targets and the measurements at each target, as a table and a picture."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class Outcome(Enum):
 
 @dataclass(eq=False)
 class Visit:
-    """A target and the measurements at it.
+    """A target with its measurements.
 
     Attributes:
         number: counts from 1, in the order of the targets.
         center_m: (x, y) from which offsets of curves are counted: the target's position in the survey, or in its zoom.
-        zoom: None: not taken, or not yet.
-        curves: by their names.
+        zoom: the scan of the target; None: not taken, or not yet.
+        curves: the measured curves, by name.
         refusals: reasons of refusals.
-        registration: source of the zoom's position on the sample, if drift is corrected; None: it is not.
+        registration: how the zoom's position on the sample is known; None without drift correction.
         position_sd_m: standard deviation of that position; None: unknown.
     """
 
@@ -55,11 +55,11 @@ class SurveyRecord:
 
     Args:
         survey: the wide scan.
-        targets: in the order of their visits.
+        targets: the targets in the order of their visits.
         curves: names of the curves of each target.
 
     Attributes:
-        visits: one for each target; fill them in as they are measured.
+        visits: a visit for each target; to be filled in as the targets are measured.
     """
 
     def __init__(self, survey: Scan, targets: Sequence[Target], curves: Sequence[str] = ()) -> None:

@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 _MAD: Final = 1.4826
 """Factor from the median of absolute deviations to a standard deviation."""
 _SIGMAS: Final = 6.0
-"""Default least height in units of the noise: in 128 x 128 pixels of noise none is that high."""
+"""Default least height in units of the noise: no height in 128 x 128 pixels of noise is that large."""
 _WIDEST: Final = 0.2
 """Default width above which features count as ground, as a share of the scan's shorter side."""
 # least standard deviation of the blur
@@ -39,8 +39,8 @@ class Target:
     """A place for a zoom.
 
     Attributes:
-        position_m: (x, y), in the frame of the scan that it was found in.
-        height: above the ground around it, in the unit of the scan; None: unknown.
+        position_m: (x, y) in the coordinate frame of the scan.
+        height: the height above the ground around the target, in the unit of the scan; None: unknown.
     """
 
     position_m: XY
@@ -61,8 +61,8 @@ def find_particles(
 
     Args:
         count: largest number of particles; None: all.
-        min_height: above the ground, in the unit of the scan; None: six times the noise.
-        separation_m: of two particles that are nearer to each other only the higher counts.
+        min_height: the least height above the ground, in the unit of the scan; None: six times the noise.
+        separation_m: the least distance of two particles; of a nearer pair only the higher counts.
         widest_m: wider features count as ground; None: a fifth of the scan's shorter side.
 
     Raises:
@@ -95,7 +95,7 @@ def nearest(targets: Iterable[Target], to_m: XY, within_m: float) -> Target | No
 def lowest_beside(scan: Scan, center_m: XY, distance_m: float) -> XY:
     """Return the lowest place at a distance from a centre, e.g. the bare ground beside a particle.
 
-    Directions that leave the scan don't count; if all do, the place is the one with larger x.
+    Directions that leave the scan don't count; if all do, the place is in the direction of larger x.
     """
     angles = np.linspace(0.0, math.tau, _DIRECTIONS, endpoint=False)
     x_m = center_m[0] + distance_m * np.cos(angles)

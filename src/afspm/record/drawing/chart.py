@@ -23,7 +23,7 @@ class Axis:
     """A variable with its name, unit and range.
 
     Attributes:
-        largest: the number that gives the prefix of the unit, where two axes share one; 0: this range's.
+        largest: the value that sets the unit's prefix where two axes share a prefix; 0: the axis's own range.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class Curve:
-    """One curve. `opacity` below 1 marks one of many, drawn thin; an empty colour is the text's."""
+    """A curve; an `opacity` below 1 draws it thin, and an empty colour uses the text colour."""
 
     x: Array
     y: Array
@@ -80,7 +80,7 @@ class Band:
 
 
 def chart(x: Axis, y: Axis, curves: Sequence[Curve], band: Band | None = None, size: Size = (320, 210)) -> str:
-    """Return curves in a frame, as SVG."""
+    """Return an SVG of curves in a frame."""
     width, height = size
     drawn = [] if band is None else [_band(x, y, band, size)]
     drawn += [_line(x, y, curve, size) for curve in curves]

@@ -15,7 +15,7 @@ Pixel = tuple[float, float]
 
 
 def thinned(x: Array, y: Array, most: int = MOST_POINTS) -> tuple[Array, Array]:
-    """Return about `most` points at most: minimum and maximum of each interval, so that peaks survive."""
+    """Thin a curve to about `most` points: the minimum and maximum of each interval, so that peaks survive."""
     if len(x) <= most:
         return x, y
     edges = np.linspace(0, len(x), most // 2 + 1).astype(int)
@@ -50,11 +50,11 @@ def _multiples(step: float, low: float, high: float) -> list[float]:
 
 
 def profile(values: Array, size_m: tuple[float, float], begin: Pixel, end: Pixel) -> tuple[Array, Array]:
-    """Return (distances in m, values) along a line in the scan, linear between pixels, about one point a pixel.
+    """Return the profile along a line in a scan: (distances in m, interpolated values), about one point per pixel.
 
     Args:
         values: [y, x], y ascending; NaN where nothing was measured.
-        size_m: of the scan.
+        size_m: (width, height) of the scan in m.
         begin, end: (column, row), fractions of pixels allowed; positions outside are moved to the border.
     """
     ny, nx = values.shape

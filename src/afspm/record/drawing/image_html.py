@@ -19,7 +19,7 @@ _PILL = "background:rgba(0,0,0,.55);padding:0 3px;border-radius:2px"
 
 @dataclass(frozen=True)
 class Shown:
-    """Values as an image.
+    """An image of values, with their range.
 
     Attributes:
         image: a PNG or WebP, y upwards.
@@ -67,7 +67,7 @@ def round_length_m(length_m: float) -> float:
 
 
 def scale_bar(size_m: tuple[float, float]) -> str:
-    """Return a bar of round length, positioned in the lower left corner of an image of this size."""
+    """Return a scale bar of round length as HTML, for the lower left corner of an image of this size."""
     length_m = round_length_m(size_m[0] / 3.0)
     return (
         f'<div style="position:absolute;left:4%;bottom:4%;width:{100.0 * length_m / size_m[0]:.3g}%">'

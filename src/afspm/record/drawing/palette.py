@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEVELS: Final = 255
-"""Colours of a map; the last index of a byte is reserved for unmeasured pixels."""
+"""The number of colours of a map; the last index of a byte is reserved for unmeasured pixels."""
 UNMEASURED: Final = 255
 
 # (position, red, green, blue), linear in between; from dark to light, so that they work without colour too
@@ -19,7 +19,7 @@ _STOPS: Final[dict[str, tuple[tuple[float, int, int, int], ...]]] = {
     "ice": ((0.0, 4, 8, 26), (0.3, 16, 56, 120), (0.6, 48, 132, 186), (0.85, 158, 214, 226), (1.0, 244, 252, 250)),
 }
 DIVERGING: Final = "change"
-"""For differences: its middle means zero."""
+"""The colour map for differences: its middle means zero."""
 PALETTES: Final = tuple(name for name in _STOPS if name != DIVERGING)
 
 CATEGORICAL: Final = ("#4477AA", "#228833", "#AA3377", "#66CCEE", "#CCBB44")

@@ -102,7 +102,7 @@ def webp(levels: NDArray[np.uint8], palette: str = PALETTES[0]) -> bytes:
 
 
 def reduced(values: Array, largest_px: int, *, each_side: bool = False) -> Array:
-    """Return the means of blocks of pixels, so that at most `largest_px` a side remain; NaN is ignored.
+    """Return an image reduced to at most `largest_px` a side, by means over blocks of pixels; NaN is ignored.
 
     Args:
         each_side: reduce each side separately, for images drawn in the proportions of their region; otherwise blocks

@@ -64,7 +64,7 @@ class Interval(Protocol):
 
 @dataclass(frozen=True)
 class TimelineRow:
-    """One row of a timeline; `style` gives the CSS class of a label."""
+    """A row of a timeline; `style` returns the CSS class of a label."""
 
     name: str
     spans: Iterable[Interval]
@@ -73,7 +73,7 @@ class TimelineRow:
 
 @dataclass(frozen=True)
 class DrawnBand:
-    """The values that a condition allows; an infinite bound is none."""
+    """The values that a condition allows; infinite: no bound."""
 
     condition: str
     low: float
@@ -131,10 +131,10 @@ def timeline_html(
     pictures: Iterable[tuple[int, str]] = (),
     curves: Iterable[TimelineCurve] = (),
 ) -> str:
-    """Return rows from `begin_ns` (None: from the first interval on) to `end_ns`, with an axis of times of day.
+    """Return the HTML of a timeline from `begin_ns` (None: the first interval) to `end_ns`, with a time axis.
 
     Args:
-        zone: of the axis; None: this computer's.
+        zone: the time zone of the axis; None: this computer's zone.
         local_too: add a second axis in this computer's zone.
         pictures: (time, HTML) of each, shown above the rows; of overlapping pictures only the last is shown.
         curves: shown below the rows, on the same axis of time.
@@ -182,7 +182,7 @@ def time_ticks(begin_s: float, end_s: float, about: int = 7) -> list[float]:
 
 
 def stretches(spans: Sequence[Interval], begin_ns: int, end_ns: int) -> list[Stretch]:
-    """Return intervals in columns of the image; of several in one column the longest is shown, with their number."""
+    """Return intervals as columns of the image; intervals in one column become the longest, with their number."""
     width_ns = (end_ns - begin_ns) / COLUMNS
     found: list[Stretch] = []
     for span in spans:

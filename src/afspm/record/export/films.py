@@ -1,4 +1,4 @@
-"""Films (.gif, .mp4): one for each place that was scanned at least twice, of the first channel."""
+"""Films (.gif, .mp4): a film of the first channel for each place that was scanned at least twice."""
 
 from __future__ import annotations
 

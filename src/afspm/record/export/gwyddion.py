@@ -52,7 +52,7 @@ def scan_file(scans: Sequence[Scan], meta: Mapping[str, str]) -> bytes:
 
 
 def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
-    """Return one spectrum with a graph for each variable over the first."""
+    """Return the file of one spectrum: a graph of each variable over the first."""
     items: list[Item] = []
     swept, units = spectrum.values[:, 0] if spectrum.names else np.empty(0), spectrum.units
     for number, name in enumerate(spectrum.names[1:], 1):
@@ -77,7 +77,7 @@ def spectrum_file(spectrum: Spectrum, meta: Mapping[str, str]) -> bytes:
 
 
 def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
-    """Return the spectra of a grid as volume data: a brick for each variable and direction, the mean over repeats.
+    """Return a grid of spectra as volume data: a brick for each variable and direction, averaged over repeats.
 
     Unmeasured points get the median of the brick, since Gwyddion's bricks have no NaN.
     """

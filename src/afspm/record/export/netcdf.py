@@ -27,7 +27,7 @@ def write(run: Run, row: ScanRow | SpectrumRow) -> Iterator[tuple[str, bytes]]:
 
 
 def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
-    """Return all channels over (y, x), the axes of the unrotated frame."""
+    """Return the file of a scan: all channels over (y, x), the axes of the unrotated frame."""
     (left, low), (width, height), (rows, columns) = scans.region.top_left_m, scans.region.size_m, scans.first.shape
     variables = {
         "y": Variable(("y",), np.linspace(low, low + height, rows), {"units": "m"}),
@@ -40,7 +40,7 @@ def scan_file(scans: ScanSet, about: Mapping[str, object]) -> bytes:
 
 
 def spectrum_file(spectrum: Spectrum, about: Mapping[str, object]) -> bytes:
-    """Return every variable over (point)."""
+    """Return the file of a spectrum: every variable over (point)."""
     variables = {
         name: Variable(("point",), spectrum.values[:, number], {"long_name": long_name, "units": unit})
         for number, (name, long_name, unit) in enumerate(

@@ -20,7 +20,7 @@ from afspm.record.tables import ScanRow, SpectrumRow
 
 
 def grid_file(stack: SpectrumStack, metadata: Mapping[str, str]) -> bytes:
-    """Return the spectra of a grid: an NXdata over (y, x, swept variable) a direction, the mean over repeats."""
+    """Return the file of a grid: an NXdata over (y, x, swept variable) for each direction, averaged over repeats."""
     import h5py
 
     content = io.BytesIO()

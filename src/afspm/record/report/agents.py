@@ -1,4 +1,4 @@
-"""What agents did in a run, from proposals, approvals, the journal and measurements of its record."""
+"""The work of agents in a run, from proposals, approvals, the journal and measurements of its record."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from afspm.record.run import Run
 
 @dataclass(frozen=True)
 class RecordedGrant:
-    """A grant, as published last.
+    """A grant in its last published form.
 
     Attributes:
-        gone_ns: time at which it was no longer published; None: in force until the end of the record, or run out.
+        gone_ns: the time from which it was no longer published; None: in force until it expired or the record ended.
     """
 
     approval: Approval
@@ -57,7 +57,7 @@ class AgentWork:
 
 
 def read(run: Run) -> list[AgentWork]:
-    """Return the work of each agent that proposed a plan, was approved, or stopped the run."""
+    """Return the work of each agent that proposed a plan, had an approval, or stopped the run."""
     proposals: dict[str, set[str]] = {}
     plans: dict[str, set[tuple[str, int]]] = {}
     grants: dict[tuple[str, str, int], RecordedGrant] = {}
@@ -92,7 +92,7 @@ def read(run: Run) -> list[AgentWork]:
 
 
 def html(works: Iterable[AgentWork], clock: PageTimes) -> str:
-    """Return a row for each agent; empty without agents."""
+    """Return a table with a row for each agent; empty without agents."""
     rows = [
         [
             escape(one.name),

@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class SpectrumCurves:
-    """A spectrum with its row."""
+    """A spectrum with its row in the record."""
 
     row: SpectrumRow
     spectrum: Spectrum
@@ -58,7 +58,7 @@ class SpectrumCurves:
 
 @dataclass(frozen=True)
 class SpectrumGroup:
-    """Spectra of one kind with the same variables; `count` includes unread ones."""
+    """Spectra of one kind with the same variables; `count` includes unread spectra."""
 
     measured: Sequence[SpectrumCurves]
     count: int
@@ -73,7 +73,7 @@ class SpectrumGroup:
 
     @property
     def axes(self) -> tuple[Axis, dict[str, Axis]]:
-        """Return the axis of the sweep and an axis for each variable, in range of all curves."""
+        """The axis of the sweep and an axis for each variable, over the range of all curves."""
         first = self.first
         units = dict(zip(first.names, first.units, strict=True))
         swept = np.concatenate([one.swept for one in self.measured])
@@ -85,7 +85,7 @@ class SpectrumGroup:
 
 
 def read(run: Run) -> list[SpectrumGroup]:
-    """Read the spectra of a run; beyond the limit, an even selection."""
+    """Read the spectra of a run: of each kind, an even selection of at most `MOST_READ`."""
     rows: dict[tuple[object, ...], list[SpectrumRow]] = {}
     for row in run.spectra:
         if len(row.names) > 1:
@@ -99,7 +99,7 @@ def read(run: Run) -> list[SpectrumGroup]:
 
 
 def html(groups: Sequence[SpectrumGroup], clock: PageTimes) -> str:
-    """Return all spectra; empty if there are none."""
+    """Return the HTML of all spectra; empty without spectra."""
     return "".join(_group(group, number, clock) for number, group in enumerate(groups, 1))
 
 

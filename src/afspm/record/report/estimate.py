@@ -11,7 +11,7 @@ from afspm.record.report.story import RunStory
 
 
 def html(story: RunStory) -> str:
-    """Return two rows for each component with a plan; empty without plans."""
+    """Return a table of planned and measured work, two rows for each component with a plan; empty without plans."""
     rows = []
     for one in story.comparisons:
         planned = "planned at most" if one.planned.at_most else "planned"

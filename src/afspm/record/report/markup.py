@@ -1,4 +1,4 @@
-"""Building blocks of the page: sections, tables, enlarging pictures, and times in UTC with local ones beside."""
+"""Building blocks of the page: sections, tables, enlarging pictures, and times in UTC and local time."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class PageTimes:
     """A formatter of times of a run: in UTC, and in this computer's zone where that differs.
 
     Args:
-        start_ns, end_ns: of the run.
+        start_ns, end_ns: start and end of the run.
     """
 
     def __init__(self, start_ns: int, end_ns: int) -> None:
@@ -84,10 +84,10 @@ def figure(
     ratio: float = 1.0,
     place: str = "",
 ) -> str:
-    """Return a figure that fills the page while its name is the anchor in the address.
+    """Return the HTML of a figure that fills the page while its name is the anchor in the address.
 
     Args:
-        name: of the figure on the page.
+        name: the anchor of the figure on the page.
         shown, caption: HTML of the picture, and of the line below it.
         facts: shown beside the enlarged picture: names, and HTML.
         beside: names of the previous and next figure; empty if there is none.

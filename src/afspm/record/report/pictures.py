@@ -38,10 +38,10 @@ class TopographyPicture:
     """A scan with images of its topography; None if its values can't be read.
 
     Attributes:
-        image: in colour, levelled.
-        thumbnail: for the figure of the night.
-        is_bad: drawn with a frame.
-        changed_row: the first one with a changed tip, by the lines of the running scan; None if none was seen.
+        image: the levelled image in colour.
+        thumbnail: the image for the figure of the night.
+        is_bad: whether the image is drawn with a frame.
+        changed_row: the first row with a changed tip, found in the lines of the running scan; None: no change found.
     """
 
     row: ScanRow
@@ -90,7 +90,7 @@ def bad_ns(run: Run, story: RunStory) -> frozenset[int]:
 
 
 def chosen(rows: Sequence[ScanRow], most: int = MOST, kept_ns: Collection[int] = ()) -> list[ScanRow]:
-    """Return at most `most` rows in order: the scans of `kept_ns`, and an even selection of the rest."""
+    """Return at most `most` rows in order: the scans at the times `kept_ns`, and an even selection of the rest."""
     if len(rows) <= most:
         return list(rows)
     odd = [k for k, row in enumerate(rows) if row.time_ns in kept_ns][: most // 2]
@@ -114,12 +114,12 @@ def _read(run: Run, row: ScanRow) -> tuple[TopographyPicture, Array | None]:
 
 
 def topography(scans: ScanSet) -> str:
-    """Return the displayed channel of a scan: one named like a height, else the first."""
+    """Return the displayed channel of a scan: the first with a name like a height, else the first of all."""
     return next((c for name in _TOPOGRAPHY for c in scans if c.lower().startswith(name)), scans.first.channel)
 
 
 def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> None:
-    """Draw the night unless a component has, and the figures that packages declare."""
+    """Draw the picture of the night unless a component has drawn it, and the figures that packages declare."""
     if is_ours(run.folder, OWN_NIGHT, NIGHT) and any(one.thumbnail is not None for one in pictures):
         from afspm.record import night_figure
 
@@ -135,7 +135,7 @@ def draw(run: Run, story: RunStory, pictures: Sequence[TopographyPicture]) -> No
 
 
 def is_ours(folder: Path, own: str, components: str) -> bool:
-    """Return whether the report draws this figure; remove the report's own figure if a component has drawn it since."""
+    """Return whether the report draws a figure itself; remove its own figure if a component has drawn one since."""
     if (folder / components).exists():
         (folder / own).unlink(missing_ok=True)
         return False

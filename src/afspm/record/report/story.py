@@ -50,20 +50,20 @@ class Refusals:
 
 @dataclass(frozen=True)
 class RunStory:
-    """A run, summed up. Times in ns of experiment time since the Unix epoch.
+    """The summary of a run. Times in ns of experiment time since the Unix epoch.
 
     Attributes:
         start_ns: the first known time of the run.
         real_s: the duration in real time; None if it is unknown, or the clock ran at real speed.
-        ended: how the run ended, in words; or that it goes on, or was cut off.
-        frame: of all positions.
-        problems: spans of all problems except routine ones, in the order of time.
+        ended: the state of the run as text: its end, running, or cut off.
+        frame: the coordinate frame of all positions.
+        problems: spans of all non-routine problems, in the order of time.
         actions: treatments of the tip, e.g. pulses.
         seen_late: the first request to flag each problem that was only noticed after the end.
-        ledger: totals of what was done to tip and sample.
+        ledger: totals of the treatments of tip and sample.
         comparisons: planned and measured work of each component with a plan.
         agents: the work of each agent.
-        bands: the values of other instruments that measuring needed.
+        bands: the values of other instruments that the conditions allowed.
     """
 
     name: str
@@ -128,7 +128,7 @@ class RunStory:
         return [scan for scan in self.scans if scan.registration not in well]
 
     def why_unregistered(self, scan: ScanRow) -> str:
-        """Return why the position of a scan is uncertain."""
+        """Return the reason why the position of a scan is uncertain."""
         began_ns = scan.time_ns if scan.began_ns is None else scan.began_ns
         points = (point for point in self.overview.drift if began_ns <= point.time_ns <= scan.time_ns)
         return next((point.reason for point in points), "")
@@ -195,7 +195,7 @@ def _late_flags(journal: Iterable[JournalEntry]) -> list[JournalEntry]:
 
 
 def gathered(refusals: Sequence[JournalEntry]) -> list[Refusals]:
-    """Return equal refusals grouped, in the order of their first occurrence."""
+    """Group equal refusals, in the order of their first occurrence."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for entry in refusals:
         groups.setdefault((entry.who, entry.what, entry.reason), []).append(entry.time_ns)

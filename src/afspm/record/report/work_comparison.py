@@ -1,4 +1,4 @@
-"""The planned work of a run beside the measured work."""
+"""The comparison of a run's planned and measured work."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def compare(
     """Return the comparison of each component with a plan.
 
     Args:
-        planned: by component; None: no estimate.
-        scans, spectra: all of the run; each counts if it began while the component was in control.
+        planned: the planned work by component; None: no estimate.
+        scans, spectra: all scans and spectra of the run; each counts for the component in control at its start.
     """
     all_scans, all_spectra = list(scans), list(spectra)
     return [

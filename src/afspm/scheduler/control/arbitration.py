@@ -1,4 +1,4 @@
-"""The arbitration table: who may control the microscope, as data, and the one function that applies it.
+"""The arbitration table: the rules for control of the microscope, as data, and the functions that apply them.
 
 Each event has rows. The first row whose condition holds applies; the last row of an event always applies. Only a row
 changes the holder of control, the mode or the flagged problems.
@@ -28,7 +28,7 @@ _NO_PROBLEMS: Mapping[int, str] = MappingProxyType({})
 
 
 class ArbitrationEvent(Enum):
-    """An event that control depends on: a kind of request, or one of two events that come with time."""
+    """An event that may change control: a request, or the death, idleness or revoked approval of a component."""
 
     REQUEST_CONTROL = "asks for control"
     RELEASE_CONTROL = "gives control back"
@@ -45,10 +45,10 @@ class ArbitrationEvent(Enum):
 
 
 class ControlChange(Enum):
-    """A change that a row makes."""
+    """A change of the control state, made by a row of the table."""
 
     GRANT = auto()
-    """The client gets control, to solve the problem it named (or none)."""
+    """Control goes to the client, to solve the problem in its request (or none)."""
     TAKE = auto()
     """The holder loses control."""
     FLAG = auto()
@@ -56,7 +56,7 @@ class ControlChange(Enum):
     SET_MODE = auto()
     END = auto()
     FORWARD = auto()
-    """The translator answers."""
+    """The request is forwarded to the translator, which answers it."""
 
 
 class Cause(Enum):
@@ -193,7 +193,7 @@ class ControlInput:
 
 @dataclass(frozen=True)
 class Condition:
-    """A condition on a state and an input, with its words for the documentation."""
+    """A condition on a state and an input, with its text for the documentation."""
 
     text: str
     holds: Callable[[ArbitrationState, ControlInput, Rules], bool]
@@ -207,7 +207,7 @@ class Transition:
         response: the answer to a request; None where the translator answers, or the event is not a request.
         why: the reason of the row. With a refusal it is sent to the client, with {who}, {holder}, {number}, {problem}
             and {problems} filled in.
-        cause: why the holder loses control, if it does.
+        cause: the reason why the holder loses control; None if it stays in control.
     """
 
     when: Condition
@@ -218,7 +218,10 @@ class Transition:
 
 
 def may(role: Collection[str] | None, who: str) -> bool:
-    """Return whether a component, or a person who acts through one, has a role; None: everyone has it."""
+    """Return whether a component, or a person who acts through a component, has a role.
+
+    A role of None belongs to everyone.
+    """
     return role is None or who in role or component_of(who) in role
 
 
@@ -435,7 +438,7 @@ def apply(row: Transition, control: ArbitrationState, ask: ControlInput) -> Arbi
 
 
 def reason(row: Transition, control: ArbitrationState, ask: ControlInput, rules: Rules) -> str:
-    """Return the reason given with a refusal; empty for a success."""
+    """Return the text of a refusal; empty for a success."""
     if row.response in (None, ControlResponse.SUCCESS):
         return ""
     return row.why.format(

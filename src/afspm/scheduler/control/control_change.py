@@ -1,4 +1,4 @@
-"""Applies the arbitration table, and carries out the consequences of a change of control."""
+"""Changes of control: the arbitration table is applied, and the consequences are carried out."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _Change:
     """A change of control, with the input and the row of the table that caused it.
 
     Attributes:
-        had_died: the request comes from a later process of the holder than the one that got control.
+        had_died: whether the request comes from a later process of the holder than the process that got control.
     """
 
     before: ArbitrationState
@@ -56,7 +56,7 @@ class _Change:
 
 
 def decide(draft: StateDraft, ask: ControlInput, event: RequestIn | None = None) -> bool:
-    """Apply the table. Return whether the translator answers the request.
+    """Apply the arbitration table; return whether the translator must answer the request.
 
     Args:
         event: the request; None: the event is not a request.
@@ -94,7 +94,7 @@ def answer_unless_ending(
     why: str,
     detail: ResponseDetail = ResponseDetail.NONE,
 ) -> None:
-    """Answer a request: now, or during the end of the experiment only once the tip is out of danger."""
+    """Answer a request; while the experiment ends, delay the answer until the tip is out of danger."""
     if (kept := draft.end.keep((event, code, why, detail))) is not None:
         draft.end = kept
         # a retry meanwhile waits for this answer, and gets no second one

@@ -1,4 +1,4 @@
-"""Requests, changes of control, and settings made in MANUAL mode, in words for people."""
+"""Texts for people about requests, changes of control, and settings changed in MANUAL mode."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def is_routine(before: ArbitrationState, after: ArbitrationState, ask: ControlIn
 def change_text(
     before: ArbitrationState, after: ArbitrationState, ask: ControlInput, row: Transition, rules: Rules
 ) -> str:
-    """Return a change of control in words, for the log."""
+    """Return the log text of a change of control."""
     parts = []
     if after.holder != before.holder and after.holder is not None:
         parts.append(f"{after.holder} is in control")
@@ -102,7 +102,7 @@ class HandSettings:
     now: Feedback | None = None
 
     def requested(self, request: Request) -> HandSettings:
-        """Add a request that was carried out in MANUAL mode."""
+        """Add the parameter set by a request in MANUAL mode."""
         parameter = request.subject
         if not isinstance(parameter, Parameter) or parameter.value is None:
             return self
@@ -113,7 +113,7 @@ class HandSettings:
         return replace(self, now=feedback, before=self.before if is_manual and self.before else feedback)
 
     def handed_back(self) -> tuple[HandSettings, tuple[str, ...]]:
-        """Return the settings that stay in force after MANUAL, in words, and start over."""
+        """Return emptied settings, and the text of each setting that stays in force after MANUAL."""
         told = [f"{name} = {value}" for name, value in self.parameters.items()]
         for name, word in _FEEDBACK_WORDS.items():
             value = getattr(self.now, name, None)
@@ -123,7 +123,7 @@ class HandSettings:
 
 
 def request_text(request: Request, problems: ProblemNames) -> str:
-    """Return a request in words, with units."""
+    """Return a request as text for people, with units."""
     words = _WORDS.get(request.kind)
     return request_name(request.kind) if words is None else words(request.subject, problems)
 

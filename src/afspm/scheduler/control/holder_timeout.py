@@ -1,4 +1,4 @@
-"""When the holder loses control: after its lease if it is idle, after its grace period if disconnected."""
+"""Timeouts of the holder of control: a lease while it is idle, a grace period while it is disconnected."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Lease:
     Attributes:
         lease_ns: longest idle time by the experiment file; None: no limit.
         asked_s: longest idle time that the holder requested; None: no such request.
-        token: of the process that was granted control.
-        announced: the last holder in the log.
+        token: the session token of the process that was granted control.
+        announced: the holder named last in the log.
     """
 
     lease_ns: int | None = None
@@ -49,11 +49,11 @@ class Lease:
         return replace(self, asked_s=lease_s, idle_since_s=now_s)
 
     def asked_until_s(self) -> float | None:
-        """Return when (real) the lease that the holder requested runs out; None: no such lease."""
+        """Return the real time at which the lease requested by the holder expires; None: no such lease."""
         return None if self.asked_s is None or self.holder is None else self.idle_since_s + self.asked_s
 
     def deadline_ns(self, *, is_free: bool) -> int | None:
-        """Return when the lease of the experiment file runs out; None: not while the microscope is busy."""
+        """Return when the lease of the experiment file expires; None while the microscope is busy."""
         if self.lease_ns is None or self.holder is None or not is_free:
             return None
         return self.idle_since_ns + self.lease_ns
@@ -78,7 +78,7 @@ class HolderTimeout:
         """Return when control is revoked unless the holder comes back; None while it is connected.
 
         Args:
-            over_since_s: since when its process has ended without a restart; None: it has not ended, as far as known.
+            over_since_s: real time since which its process has ended without a restart; None: no known end.
         """
         if holder is None or sessions.connection_of(holder) is not None:
             return None

@@ -12,11 +12,11 @@ from afspm.scheduler.control.supervisor_registry import OVER
 from afspm.scheduler.events import RequestIn
 
 SHUTDOWN_GRACE_S = 3.0
-"""How long (real) the scheduler stays after the end: late and restarting components still get the last scans and the
-end itself. Counted again from each report of a component that still runs."""
+"""Real time that the scheduler stays after the end, so that late components still get the last scans and the end. The
+time starts again with each report of a component that still runs.
+"""
 LONGEST_GRACE_S = 20.0
-"""How long (real) the scheduler stays at most: a supervisor takes this time at the end to find a silent component, kill
-it and restart it."""
+"""Longest real time that the scheduler stays after the end: a supervisor needs it to restart a silent component."""
 # bounded, since requests come from peers
 _MOST_KEPT = 1000
 _OTHERS = ("scheduler", "translator")
@@ -26,14 +26,14 @@ _OTHERS = ("scheduler", "translator")
 class StartupBarrier:
     """A delay of the first control state, and of requests that may change it, until missed packets are published.
 
-    Without it, a packet that the translator repeats would get a time after the change, and pass for a new one.
+    Without this delay, a repeated packet of the translator would get a time after the change, and look new.
 
     Attributes:
         patience_s: the longest wait, real.
-        until_s: when the barrier opens at the latest, in real monotonic time; None: it is open.
-        is_restart: this scheduler continues a run.
-        opened_s: when the barrier opened, in real monotonic time.
-        kept: requests that came too early.
+        until_s: the latest opening of the barrier, in real monotonic time; None: the barrier is open.
+        is_restart: whether this scheduler continues a run.
+        opened_s: the opening of the barrier, in real monotonic time.
+        kept: requests that arrived before the barrier opened.
     """
 
     patience_s: float
@@ -59,7 +59,7 @@ class StartupBarrier:
         return replace(self, kept=(*self.kept, event))
 
     def let_in(self) -> tuple[StartupBarrier, RequestIn | None]:
-        """Return the first kept request, once the barrier is open."""
+        """Remove and return the first kept request; None while the barrier is closed or no request is kept."""
         if not self.kept or self.until_s is not None:
             return self, None
         return replace(self, kept=self.kept[1:]), self.kept[0]
@@ -78,14 +78,14 @@ KeptAnswer = tuple[RequestIn, ControlResponse, str, ResponseDetail]
 class ExperimentEnd:
     """The end of the experiment, which waits until the tip is out of danger.
 
-    Answers that report the end are kept back until then: such an answer makes components leave, and the supervisor too.
+    Answers that report the end are delayed until then, since components and supervisors exit on such an answer.
     The scheduler itself stays for a grace period.
 
     Attributes:
-        by_s: when the experiment ends at the latest, in real monotonic time; None: it does not end, or has ended.
-        kept: answers that are kept back.
-        leave_at_s: when the scheduler leaves; inf: the experiment has not ended.
-        latest_s: when the scheduler leaves at the latest.
+        by_s: the latest end of the experiment, in real monotonic time; None: no end in progress.
+        kept: the delayed answers.
+        leave_at_s: the time at which the scheduler exits; inf: the experiment has not ended.
+        latest_s: the latest time at which the scheduler exits.
     """
 
     by_s: float | None = None

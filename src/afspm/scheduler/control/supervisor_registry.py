@@ -1,4 +1,4 @@
-"""The registry of supervisors: their processes, and the restarts still to be ordered from each."""
+"""The registry of supervisors: their processes, and the open restart orders of each supervisor."""
 
 from __future__ import annotations
 
@@ -34,13 +34,14 @@ OVER = (ProcessCondition.ENDED, ProcessCondition.GIVEN_UP)
 
 @dataclass(frozen=True)
 class KnownSupervisor:
-    """A supervisor.
+    """A supervisor with its last report and its open orders.
 
     Attributes:
         reported_s: time of its last report, real; None: known from before a restart of the scheduler.
         orders: processes that it has to restart.
-        over: its processes that have ended for good: the number of starts before, and since when (real) that is known.
-        states: of its processes, by its last report.
+        over: for each process that has ended for good, its number of starts and the real time at which its end was
+            first reported.
+        states: the states of its processes in its last report.
     """
 
     processes: tuple[str, ...] = ()
@@ -52,7 +53,7 @@ class KnownSupervisor:
 
 @dataclass(frozen=True)
 class SupervisorRegistry:
-    """The supervisors by name; the one with the newest report is last."""
+    """The supervisors by name, in the order of their last reports."""
 
     supervisors: Mapping[str, KnownSupervisor] = field(default_factory=dict)
 
@@ -80,16 +81,16 @@ class SupervisorRegistry:
         )
 
     def states_of(self, supervisor: str) -> tuple[ProcessState, ...]:
-        """Return the states of a supervisor's processes by its last report."""
+        """Return the states of a supervisor's processes in its last report."""
         known = self.supervisors.get(supervisor)
         return known.states if known is not None else ()
 
     def over_since_s(self, process: str) -> float | None:
-        """Return since when, in real time, a process has ended for good.
+        """Return the real time since which a process has ended for good.
 
         Returns:
-            -inf if it ended before a restart of the scheduler. None if it has not ended, or if another supervisor with
-            a recent report has a process of this name that has not.
+            -inf if it ended before a restart of the scheduler. None if it has not ended, or if another supervisor
+            recently reported a process of this name that has not ended.
         """
         having = [one for one in self.supervisors.values() if process in one.processes]
         since_s = max((one.over[process][1] for one in having if process in one.over), default=None)
@@ -100,7 +101,7 @@ class SupervisorRegistry:
         return None if goes_on else since_s
 
     def orders_for(self, supervisor: str) -> tuple[SupervisorRegistry, tuple[str, ...]]:
-        """Return the processes that a supervisor has to restart, and remove the order, which is delivered now."""
+        """Remove and return a supervisor's open orders: the processes that it has to restart."""
         known = self.supervisors.get(supervisor)
         if known is None or not known.orders:
             return self, ()
@@ -144,7 +145,7 @@ class Announcement:
     Attributes:
         envelope: empty: the message is refused.
         why: the reason of the refusal.
-        states: of a supervisor's processes, if the message reports them.
+        states: the states of a supervisor's processes, if the message reports them.
     """
 
     envelope: str
@@ -153,7 +154,7 @@ class Announcement:
 
 
 def announcement(event: RequestIn, codec: Codec) -> Announcement:
-    """Check a message that a process asks the scheduler to publish: each sender may only publish about itself."""
+    """Check a message of a process for publication: a sender may publish only about itself."""
     subject = event.request.subject
     if not isinstance(subject, RelayedMessage):
         return Announcement("", "an empty announcement")

@@ -8,6 +8,6 @@ waits for the next one, whose answer carries it as an order. The report after th
     state         `Instruments`: the last reading of each parameter, its first unit, open orders, since when each
                   condition holds
     goes out      orders; a refusal of the actions that a condition guards; the problems to flag and to clear
-    always holds  a reading older than `OLDEST_S` is none; a reading in another unit than the first is none; only the
+    always holds  a reading older than `OLDEST_S`, or in another unit than the first, does not count; only the
                   scheduler's own clock determines an age
 """

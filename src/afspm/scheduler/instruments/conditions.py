@@ -1,4 +1,4 @@
-"""Conditions for measuring: bands that values of instruments must keep, and for how long."""
+"""Conditions for measuring: bands in which instrument values must stay for a given time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from afspm.model.names import START_SCAN, START_SPEC
 from afspm.scheduler.safety.limits import ExperimentLimits
 
 OLDEST_S = 4.0
-"""A reading older than this, real, counts as none: a lost instrument is noticed within 5 s."""
+"""A reading older than this, real, does not count: a lost instrument is noticed within 5 s."""
 CONDITIONS = "conditions"
 """The name under which the scheduler flags the problem of a condition."""
 
@@ -35,7 +35,7 @@ class AllowedBand:
     unit: str = ""
 
     def reason_outside(self, reading: InstrumentReading) -> str:
-        """Return why a reading is outside; empty: it is inside."""
+        """Return the reason why a reading is outside the band; empty if it is inside."""
         if not reading.is_number or reading.value is None:
             return f"{reading.name} is not known: {reading.reason or 'not a number'}"
         try:
@@ -63,10 +63,10 @@ class MeasuringCondition:
     """A condition of the experiment file.
 
     Attributes:
-        bands: by parameter; all must hold.
-        actions: the actions that are refused while it does not hold.
-        problem: flagged while it does not hold; empty: none is.
-        source: where it was set, e.g. "experiment.toml:42".
+        bands: the bands by parameter; all must hold.
+        actions: the actions refused while the condition does not hold.
+        problem: the problem flagged while the condition does not hold; empty: no problem.
+        source: the place in the experiment file, e.g. "experiment.toml:42".
     """
 
     bands: Mapping[str, AllowedBand] = field(default_factory=dict)
@@ -77,11 +77,11 @@ class MeasuringCondition:
 
 @dataclass(frozen=True)
 class InstrumentSettings:
-    """The instruments of an experiment, and its conditions.
+    """The instruments and the conditions of an experiment.
 
     Attributes:
         instruments: the components that report values.
-        conditions: by name.
+        conditions: the conditions by name.
         problems: the number of each problem that a condition flags.
     """
 
@@ -90,7 +90,7 @@ class InstrumentSettings:
     problems: Mapping[str, int] = field(default_factory=dict)
 
     def unrated(self, limits: ExperimentLimits) -> ExperimentLimits:
-        """Return the limits without the rates of instruments' parameters: each instrument keeps its rate itself."""
+        """Return the limits without rates of instrument parameters: each instrument limits its rate itself."""
         parameters = {
             name: replace(limit, rate_per_s=None) if instrument_of(name) in self.instruments else limit
             for name, limit in limits.parameters.items()
@@ -103,8 +103,8 @@ class ConditionState:
     """The state of one condition.
 
     Attributes:
-        inside_since_ns: by parameter, since when the value is inside its band, experiment time.
-        reason: why the condition does not hold; empty: it holds.
+        inside_since_ns: by parameter, the experiment time since which the value is inside its band.
+        reason: the reason why the condition does not hold; empty if it holds.
     """
 
     inside_since_ns: Mapping[str, int] = field(default_factory=dict)
@@ -113,7 +113,7 @@ class ConditionState:
     def updated(
         self, condition: MeasuringCondition, readings: Mapping[str, InstrumentReading], now_ns: int
     ) -> ConditionState:
-        """Return the state for these readings, which are all recent; a missing one is unknown."""
+        """Return the state of the condition for recent readings; a parameter without a reading is outside its band."""
         since, reasons = dict[str, int](), list[str]()
         for name, band in condition.bands.items():
             reason = band.reason_outside(readings.get(name) or InstrumentReading(name, reason="no recent reading"))

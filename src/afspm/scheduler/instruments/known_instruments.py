@@ -1,4 +1,4 @@
-"""`Instruments`: all that the scheduler knows of other instruments, and the orders that are open."""
+"""`Instruments`: the last readings of other instruments, and their open orders."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from afspm.scheduler.instruments.conditions import OLDEST_S, ConditionState, Ins
 from afspm.scheduler.requests.forwarder import ForwardedRequest
 
 PUBLISH_S = 10.0
-"""Unchanged readings are published at this interval, real."""
+"""Interval of publications of unchanged readings, real."""
 PUBLISH_CHANGED_S = 1.0
-"""Changed numbers are published at this interval, real, at least."""
+"""Least interval of publications of changed numbers, real."""
 _MOST_PARAMETERS = 100  # of one instrument: memory must stay bounded
 _NEVER_S = float("-inf")
 _JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age is still one
@@ -21,7 +21,7 @@ _JUST_AFTER_S = 1e-3  # a reading of exactly the oldest age is still one
 
 @dataclass(frozen=True)
 class KnownReading:
-    """A reading, and when it was measured at the latest, real; -inf: unknown."""
+    """A reading, and the earliest real time at which it can have been measured; -inf: unknown."""
 
     reading: InstrumentReading
     measured_s: float = _NEVER_S
@@ -32,7 +32,7 @@ class OpenOrder:
     """A set request for an instrument.
 
     Attributes:
-        order: as it was handed out; None: it waits.
+        order: the order given to the instrument; None: the request still waits.
     """
 
     job: ForwardedRequest
@@ -41,10 +41,10 @@ class OpenOrder:
 
 @dataclass(frozen=True)
 class KnownInstrument:
-    """One instrument.
+    """The last readings and open orders of one instrument.
 
     Attributes:
-        token: of the last answer; given_s: its time, real.
+        token: the token of the last answer to a report; given_s: the real time of that answer.
         published: the readings published last; published_s: their time, real.
     """
 
@@ -61,9 +61,9 @@ class Instruments:
     """The instruments of an experiment.
 
     Attributes:
-        units: the first unit of each parameter, kept over a restart: a reading in another unit is not believed.
-        number: of the newest order or token.
-        states: of the conditions, by name.
+        units: the first unit of each parameter, kept over a restart: a reading in another unit is rejected.
+        number: the number of the newest order or token.
+        states: the states of the conditions, by name.
     """
 
     settings: InstrumentSettings = field(default_factory=InstrumentSettings)
@@ -79,7 +79,7 @@ class Instruments:
         return instrument_of(parameter) in self.settings.instruments
 
     def reading(self, parameter: str, now_s: float) -> InstrumentReading:
-        """Return the reading of a parameter; without a value where none is recent."""
+        """Return the last reading of a parameter, without a value if there is no recent reading."""
         known = self._of(instrument_of(parameter)).readings.get(parameter)
         if known is None:
             return InstrumentReading(parameter, reason=f"{instrument_of(parameter)} has not reported it")
@@ -89,7 +89,7 @@ class Instruments:
         return replace(known.reading, value=None, reason=why)
 
     def reported(self, report: InstrumentReadings, now_s: float, now_ns: int) -> Instruments:
-        """Store a report; the outcomes in it are settled by the caller."""
+        """Store a report; the caller settles the outcomes in it."""
         before = self._of(report.instrument)
         # a report waits in queues for an unknown time, and clocks of other computers may lie: it is certain only that
         # it was made after the answer whose token it repeats
@@ -107,7 +107,7 @@ class Instruments:
         return replace(changed, units=units).evaluated(now_s, now_ns)
 
     def to_publish(self, report: InstrumentReadings, now_s: float) -> Instruments | None:
-        """Return the instruments after a publication of this report; None: it is not due."""
+        """Return the instruments after publishing a report; None if its publication is not due."""
         known = self._of(report.instrument)
         passed_s = now_s - known.published_s
         new = tuple(self.reading(name, now_s) for name in known.readings)
@@ -124,7 +124,7 @@ class Instruments:
     # --- conditions ---
 
     def evaluated(self, now_s: float, now_ns: int) -> Instruments:
-        """Return the instruments with the conditions decided for this moment."""
+        """Return the instruments with their conditions evaluated at this time."""
         states = {}
         for name, condition in self.settings.conditions.items():
             readings = {parameter: self.reading(parameter, now_s) for parameter in condition.bands}
@@ -132,7 +132,7 @@ class Instruments:
         return self if states == self.states else replace(self, states=states)
 
     def refusal(self, action: str, now_s: float, now_ns: int) -> str:
-        """Return why an action may not start now; empty: it may."""
+        """Return the reason why an action may not start now; empty if it may."""
         if not self.settings.conditions:
             return ""
         states = self.evaluated(now_s, now_ns).states
@@ -163,11 +163,11 @@ class Instruments:
         return replace(self._with(owner, waiting), number=number)
 
     def first(self, instrument: str) -> OpenOrder | None:
-        """Return the order of an instrument that is served now: one at a time."""
+        """Return the first open order of an instrument: orders are served one at a time."""
         return next(iter(self._of(instrument).open), None)
 
     def handed_out(self, instrument: str, order: OpenOrder) -> Instruments:
-        """Store that the first order was handed out."""
+        """Store that the instrument was given its first order."""
         known = self._of(instrument)
         return self._with(instrument, replace(known, open=(order, *known.open[1:])))
 
@@ -178,7 +178,7 @@ class Instruments:
         return self._with(instrument, replace(known, open=rest))
 
     def found(self, instrument: str, outcome: OrderOutcome) -> OpenOrder | None:
-        """Return the order of an outcome; None: it was settled before."""
+        """Return the open order that an outcome belongs to; None if it was settled before."""
         for one in self._of(instrument).open:
             if one.order is not None and one.order.number == outcome.number:
                 return one
@@ -189,7 +189,7 @@ class Instruments:
         return [(name, one) for name, known in self.known.items() for one in known.open if now_s >= one.job.deadline_s]
 
     def answered(self, instrument: str, now_s: float) -> Instruments:
-        """Store that a report is answered now, under a new token."""
+        """Store that a report is being answered, under a new token."""
         token = self.number + 1
         known = replace(self._of(instrument), token=token, given_s=now_s)
         return replace(self._with(instrument, known), number=token)
@@ -201,7 +201,7 @@ class Instruments:
     # --- time ---
 
     def due_s(self) -> float | None:
-        """Return when the conditions or an order must be looked at again, real; None: no deadline."""
+        """Return the next real time at which a condition or an order must be checked; None: no deadline."""
         dues = [one.job.deadline_s for known in self.known.values() for one in known.open]
         for name, condition in self.settings.conditions.items():
             if self.states.get(name, ConditionState()).reason:

@@ -1,4 +1,4 @@
-"""The packets published last, for late joiners: ordered, bounded, without duplicates."""
+"""Cache of the latest packets for late joiners: ordered, bounded in size, without duplicates."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _OVERHEAD_BYTES = 300  # of a cached packet beside its payload: a flood of empty
 _TIMES_REMEMBERED = 4096
 _RECENT = 64  # part of each saved state, so few
 _NEVER_NS = 0
-"""Stands for the published time of a packet that was passed over: it is not published after a restart either."""
+"""Placeholder for the time of a packet that is deliberately not published, even after a restart."""
 _NEWEST = 16
 _FUTURE_NS = 3600 * 10**9  # a translator's clock further ahead is wrong: its times would put off all later packets
 
@@ -35,10 +35,10 @@ class Kept:
 
 
 class PacketCache:
-    """The latest packets of each envelope, oldest first over all of them.
+    """The latest packets of each envelope, oldest first over all envelopes.
 
     Args:
-        envelopes: how packets are named and how many of each name are kept.
+        envelopes: the envelope of each packet, and the number of packets kept for each envelope.
         max_bytes: total size. Beyond it, the oldest packets are dropped whose envelope has a newer packet.
     """
 
@@ -61,7 +61,7 @@ class PacketCache:
 
     @property
     def newest_source_ns(self) -> int:
-        """The translator's time of its newest packet in the cache; -1: none yet."""
+        """The translator's time of its newest packet in the cache; -1 if there is none."""
         return self._newest_source_ns
 
     @property
@@ -70,10 +70,10 @@ class PacketCache:
         return self._bytes
 
     def take(self, packet: Packet, header: PacketHeader, now_ns: int) -> tuple[Packet, int] | None:
-        """Return the packet to publish, and how many packets of its envelope are kept (0: this one is not).
+        """Return the packet to publish, and how many packets of its envelope are kept (0: not this packet).
 
-        Its time is the translator's. It is later if that would not come after the newest published time: a clock was
-        set back or is far ahead, or the peer sent no time.
+        The packet keeps the translator's time. It gets a later time if that would not follow the newest published
+        time: a clock was set back or is far ahead, or the peer sent no time.
 
         Returns:
             None if the packet is a duplicate.
@@ -114,13 +114,13 @@ class PacketCache:
     def remember(self, recent: Iterable[tuple[int, int]]) -> None:
         """Store the times of packets that were published before a restart.
 
-        A packet that comes again, because it was not in the log yet, keeps its first time. Subscribers recognise a
+        A packet that arrives again, because it was not in the log yet, keeps its first time. Subscribers recognise a
         duplicate by this time.
         """
         self._first_times = {source_ns: first_ns for source_ns, first_ns in recent if source_ns not in self._sources}
 
     def stamp(self, envelope: str, payload: bytes, now_ns: int) -> tuple[Packet, int]:
-        """Return a packet of the scheduler itself with its time, kept under its envelope."""
+        """Stamp and cache a packet of the scheduler itself; return it with its number of kept packets."""
         out = Packet(envelope, payload, self._next_ns(now_ns))
         message = envelope.partition("_")[0]  # no message of the scheduler has an underscore in its name
         return out, self._keep(out, None, self._envelopes.history(message))

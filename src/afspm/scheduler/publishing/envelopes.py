@@ -28,12 +28,12 @@ def default_envelope(header: PacketHeader) -> str:
 
 
 def tells(envelope: str, message: str) -> bool:
-    """Return whether an envelope begins with the name of its message: subscribers find its type by it."""
+    """Return whether an envelope begins with the name of its message, from which subscribers know its type."""
     return envelope == message or envelope.startswith(f"{message}_")
 
 
 def size_text(size_m: float) -> str:
-    """Return a length in nm as a decimal number: rounded, but with its digits below 1 nm.
+    """Return a length as decimal text in nm, rounded to 1 nm unless it is shorter.
 
     >>> size_text(2e-6), size_text(2.5e-10)
     ('2000.0', '0.25')
@@ -103,7 +103,7 @@ class CacheRule:
         )
 
     def name(self, header: PacketHeader) -> str:
-        """Return the envelope of a packet that fits.
+        """Return the envelope of a packet that matches this rule.
 
         Raises:
             InvalidValue: the text has another field than {message}, {channel}, {kind} and {size}.
@@ -147,12 +147,12 @@ class CacheSettings:
 
 
 class Envelopes:
-    """The envelopes of the experiment file.
+    """The mapping from packets to envelopes, by the rules of the experiment file.
 
     Args:
-        rules: tried in their order; then the defaults.
+        rules: the rules, tried in order before the defaults.
         mapping: a function of the user that names the envelope instead of rules and defaults.
-        history: how many packets to keep, by message, instead of the number in the declaration.
+        history: the number of packets to keep, by message, instead of the number in the declaration.
     """
 
     def __init__(

@@ -31,21 +31,21 @@ from afspm.scheduler.control.arbitration import ArbitrationState, ControlInput, 
 from afspm.scheduler.control.descriptions import request_text
 
 PERIOD_S = 0.1
-"""Real time between two publications, at least."""
+"""Least real time between two publications."""
 MOST = 1000
-"""Requests logged within that time; further ones are only counted."""
+"""The largest number of requests logged within `PERIOD_S`; further requests are only counted."""
 LONGEST = 1000
-"""Characters of a request in words, and of a reason."""
+"""The longest text of a request or a reason, in characters."""
 
 REQUEST, CONTROL, ORDER = "request", "control", "order"
 LATE = "late: the client had got no answer in time"
-"""The reason of an answer that came after the client had given up."""
+"""The reason logged with an answer that came after the client had given up."""
 SCHEDULER = "scheduler"
 """The author of requests of the scheduler itself."""
 _UNWRITTEN = frozenset({CLOCK_REQUEST, RELAY_REQUEST})  # sent all the time by supervisors and starting processes
 _STARTS = frozenset({names.START_SCAN, names.START_SPEC})
 _STARTS_KEPT = 16
-"""Starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
+"""Number of starts kept over a restart: many more than can be forwarded while one entry waits to be published."""
 _CUT_OFF = "the scheduler was restarted before the answer was written down"
 
 
@@ -55,7 +55,7 @@ class AnsweredRequest(NamedTuple):
     Attributes:
         took_s: real time from the request to its answer.
         late: the answer came after the client had got "no response".
-        sent_ns: when it was forwarded to the translator; None: it was not.
+        sent_ns: the time of forwarding to the translator; None if not forwarded.
     """
 
     time_ns: int
@@ -103,7 +103,7 @@ def _subject_of(request: Request) -> tuple[str, str, str]:
 
 @dataclass(frozen=True)
 class SentStart:
-    """The start of a measurement, saved before it is forwarded: its entry gives the measurement its key.
+    """The start of a measurement, saved before it is forwarded; its log entry holds the measurement's key.
 
     Attributes:
         sent_ns: time of its first forwarding.
@@ -115,7 +115,7 @@ class SentStart:
     sent_ns: int
 
     def entry(self, now_ns: int) -> JournalEntry:
-        """Return the journal entry of a start whose answer a kill of the scheduler lost."""
+        """Return the journal entry of a start whose answer was lost when the scheduler was killed."""
         return JournalEntry(
             now_ns,
             REQUEST,
@@ -134,9 +134,9 @@ class EventLog:
     """The entries that are not published yet.
 
     Attributes:
-        due_s: when they are due, in real monotonic time; None: there are none.
+        due_s: the due time of their publication, in real monotonic time; None without entries.
         left_out: the number of requests beyond `most`.
-        starts: the last starts, each saved before it was forwarded: a kill loses the gathered entries.
+        starts: the last starts of measurements, each saved before forwarding, since a kill loses the gathered entries.
     """
 
     most: int = MOST
@@ -152,7 +152,7 @@ class EventLog:
         return replace(self, due_s=due_s, gathered=(*self.gathered, *entries))
 
     def add_request(self, now_s: float, entry: AnsweredRequest | JournalEntry) -> EventLog:
-        """Add an entry of a kind without a bound on its number: beyond `most` it is only counted."""
+        """Add the entry of a request; beyond `most` entries the request is only counted."""
         if isinstance(entry, AnsweredRequest) and entry.request.kind in _UNWRITTEN:
             return self
         if len(self.gathered) >= self.most:
@@ -174,7 +174,7 @@ class EventLog:
     def restored(
         self, starts: Sequence[SentStart], published: Iterable[JournalEntry], now_s: float, now_ns: int
     ) -> EventLog:
-        """Restore the starts of before a restart; a start without a published entry gets one.
+        """Restore the starts saved before a restart; add an entry for each start without a published one.
 
         Args:
             published: the entries in the restored cache.
@@ -184,7 +184,7 @@ class EventLog:
         return replace(self, starts=tuple(starts)).add(now_s, *lost)
 
     def take(self, problems: ProblemNames, now_ns: int) -> tuple[EventLog, JournalEntries]:
-        """Return the log without its entries, and the entries in words, oldest first, to be published."""
+        """Return the log without its entries, and these entries as text, oldest first."""
         entries = [one if isinstance(one, JournalEntry) else one.entry(problems) for one in self.gathered]
         if self.left_out:
             entries.append(JournalEntry(now_ns, REQUEST, SCHEDULER, f"{self.left_out} more requests are left out"))
@@ -210,7 +210,7 @@ def control_entries(
     row: Transition,
     problems: ProblemNames,
 ) -> list[JournalEntry]:
-    """Return an entry for each change of the holder, the mode and the problems: its author, and its reason."""
+    """Return a log entry, with author and reason, for each change of holder, mode and problems."""
     name, entry = problems.name, partial(JournalEntry, now_ns, CONTROL)
     entries = []
     if before.holder is not None and after.holder != before.holder:

@@ -14,7 +14,7 @@ from afspm.wire.messages import CONTROL_STATE, JOURNAL, NOTE
 
 
 def publish(draft: StateDraft, envelope: str, payload: bytes, time_ns: int | None = None) -> None:
-    """Publish a packet of the scheduler itself. Its time is saved before, so that no later packet gets the same."""
+    """Publish a packet of the scheduler itself. Its time is saved first, so that no later packet gets the same time."""
     packet, history = draft.env.cache.stamp(envelope, payload, draft.now_ns if time_ns is None else time_ns)
     draft.effects.append(Publish(packet, None, history))
     draft.save()

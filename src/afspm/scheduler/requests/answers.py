@@ -1,4 +1,4 @@
-"""The answers to requests: each request gets one, which is remembered under its id and written to the event log."""
+"""The answers to requests: each request gets one answer, remembered under its id and written to the event log."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def reply(draft: StateDraft, event: RequestIn, response: Response) -> None:
 
 
 def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = ControlResponse.FAILURE) -> None:
-    """Refuse a peer that may not use its name; logged once for each connection."""
+    """Refuse a peer that may not use its name; log the refusal once for each connection."""
     draft.pending, was_refused = refused_again(draft.pending, event.connection)
     if not was_refused:
         draft.log("WARNING", f"refused a request of {event.name or 'a nameless peer'}: {why}")
@@ -42,7 +42,10 @@ def refuse_peer(draft: StateDraft, event: RequestIn, why: str, code: int = Contr
 
 
 def answer_unsent(draft: StateDraft, job: ForwardedRequest, response: Response) -> None:
-    """Answer a request that is not sent; of a repeated one it stays unknown whether it was carried out before."""
+    """Answer a request that is not sent.
+
+    The outcome of a repeated request stays unknown: it may have been carried out before.
+    """
     unknown = ResponseDetail.OUTCOME_UNKNOWN
     if job.is_repeated:
         reason = f"outcome unknown: it was sent once, and is not sent again ({response.reason})"
@@ -64,7 +67,7 @@ def finish(draft: StateDraft, job: ForwardedRequest, response: Response, status:
 
 
 def take_back(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Return what a request has used of its limits and of its approval."""
+    """Undo the uses that a request counted against its limits and its approval."""
     draft.grants = draft.grants.not_done(job.client, job.request)
     mapped = job.mapped
     draft.limits = draft.limits.not_done(job.client, job.outgoing, None if mapped is None else mapped.names)

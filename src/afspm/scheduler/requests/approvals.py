@@ -21,7 +21,7 @@ _ORIGIN = Request(int(ControlRequest.SET_PROBE_POS), ProbePosition((0.0, 0.0)))
 
 
 def decide(draft: StateDraft, event: RequestIn) -> None:
-    """Answer a person's approval, or the end of one; an agent without an approval loses control."""
+    """Process a person's approval or revocation; an agent left without an approval loses control."""
     grant = event.request.subject
     draft.grants, why = draft.grants.given(event.name, grant, draft.now_ns, offset_m(draft))
     if why:
@@ -41,7 +41,7 @@ def publish_changes(draft: StateDraft) -> None:
 
 
 def facts(draft: StateDraft) -> dict[str, object]:
-    """Return the facts that a preflight is made for; none where the experiment has no agent."""
+    """Return the limits and the coordinate offset that a preflight is valid for; empty without agents."""
     if not draft.env.settings.rules.agents:
         return {}
     offset = offset_m(draft)
@@ -49,7 +49,7 @@ def facts(draft: StateDraft) -> dict[str, object]:
 
 
 def offset_m(draft: StateDraft) -> XY | None:
-    """Return the microscope's coordinates of the components' origin; None where both have the same coordinates."""
+    """Return the origin of component coordinates in microscope coordinates, in m; None if both are the same."""
     if not draft.frame.maps(draft.now_ns):
         return None
     _, mapped = draft.frame.outgoing("", _ORIGIN, draft.now_ns)
@@ -59,7 +59,7 @@ def offset_m(draft: StateDraft) -> XY | None:
 
 
 def refused(draft: StateDraft, job: ForwardedRequest) -> str:
-    """Return the reason why a command lacks an approval or breaks the limits of its role; "" if it may be sent."""
+    """Return why a command lacks an approval or breaks the limits of its role; empty if it may be sent."""
     until_s = draft.lease.asked_until_s()
     # a frozen scheduler finds the request and the end of the lease at the same time
     if draft.env.settings.rules.is_agent(job.client) and until_s is not None and draft.now_s > until_s:
@@ -69,7 +69,7 @@ def refused(draft: StateDraft, job: ForwardedRequest) -> str:
 
 
 def sending(draft: StateDraft, job: ForwardedRequest) -> None:
-    """Spend a command that is about to be sent."""
+    """Count a command that is about to be sent against its approval."""
     draft.grants = draft.grants.sending(job.client, job.request, draft.now_ns, offset_m(draft))
 
 

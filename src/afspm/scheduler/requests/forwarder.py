@@ -1,8 +1,9 @@
-"""The line to the translator: one request is in flight, the others wait, and each has a deadline.
+"""The queue of requests to the translator: one request is in flight, the others wait, and each has a deadline.
 
-A translator serves one request after the other and is silent meanwhile. So one is in flight. The others wait here,
-where they can still be removed; a request that has waited too long is answered unsent. The line keeps the order and
-the times. Whether a request is sent, and in which form, is decided when its turn comes (`request_pipeline.send_next`).
+A translator serves one request after the other and is silent meanwhile. So one request is in flight. The others wait
+here, where they can still be removed; a request that has waited too long is answered unsent. The queue keeps the order
+and the times. Whether a request is sent, and in which form, is decided when its turn comes
+(`request_pipeline.send_next`).
 """
 
 from __future__ import annotations
@@ -55,17 +56,17 @@ class ForwardedRequest(NamedTuple):
 
     Attributes:
         client: the name of the client; empty for a request of the scheduler itself.
-        command: whether only the holder of control may give it.
-        deadline_s: when it must be answered at the latest, real; 0: none yet.
-        sent_s: when it was sent, real; None while it waits.
-        answered: the client has got "no response in time".
-        connection: the connection that it arrived by.
-        states_seen: how many states the microscope had reported when it was sent.
+        command: whether only the holder of control may send the request.
+        deadline_s: the deadline of the answer, real; 0: no deadline yet.
+        sent_s: the real time of sending; None while the request waits.
+        answered: whether the client has got "no response in time".
+        connection: the connection over which the request arrived.
+        states_seen: the number of states that the microscope had reported at sending.
         mapped: the request in the coordinates of the microscope, if they differ.
-        heard_s: when it arrived, real.
-        sent_ns: when it was sent, experiment time; None: it was not.
-        is_repeated: it was sent before under its id, with an unknown outcome.
-        purpose: of a request of the scheduler itself; None: it is for the tip's safety.
+        heard_s: the real time of arrival.
+        sent_ns: the experiment time of sending; None if not sent.
+        is_repeated: whether the request was sent before under its id, with an unknown outcome.
+        purpose: the purpose of a request of the scheduler itself; None: the tip's safety.
     """
 
     client: str
@@ -97,13 +98,11 @@ class ForwardedRequest(NamedTuple):
 
 
 class ForwardOutcome(Enum):
-    """The outcome of a forwarded request."""
-
     ANSWERED = auto()
     NOT_SENT = auto()
     UNKNOWN = auto()
     LATE = auto()
-    """The true answer, after the client had got "no response"."""
+    """The translator's answer came after the client had got "no response"."""
 
 
 class SettledRequest(NamedTuple):
@@ -117,13 +116,13 @@ Settled = tuple[SettledRequest, ...]
 
 @dataclass(frozen=True)
 class Forwarder:
-    """The line to the translator.
+    """The queue of requests to the translator.
 
     Attributes:
-        timeout_s: how long (real) a client waits for an answer.
-        patience_s: how much longer the line waits for an overdue answer before it sends the next request.
-        longest_queue: how many requests may wait.
-        up: the translator is connected.
+        timeout_s: the real time that a client waits for an answer.
+        patience_s: the further time to wait for an overdue answer before the next request is sent.
+        longest_queue: the largest number of waiting requests.
+        up: whether the translator is connected.
         flight: the request that the translator is serving.
         own: waiting requests of the scheduler itself, in order; they go first.
         queue: waiting requests of clients, in order.
@@ -143,12 +142,12 @@ class Forwarder:
     outbox: tuple[Forward, ...] = ()
 
     def connected(self) -> tuple[Forwarder, Settled]:
-        """Open the line. A reconnection settles the requests of the lost connection first."""
+        """Register that the translator is connected; settle the requests of a lost connection first."""
         forwarder, settled = self.lost() if self.up else (self, ())
         return replace(forwarder, up=True), settled
 
     def lost(self) -> tuple[Forwarder, Settled]:
-        """Close the line, and settle all requests: the translator is disconnected."""
+        """Register that the translator is disconnected; settle all requests."""
         waiting = tuple(_not_sent(job, "the translator is not connected") for job in (*self.own, *self.queue))
         if self.flight is not None and not self.flight.answered:
             why = "the connection to the translator was lost before it answered"
@@ -161,7 +160,7 @@ class Forwarder:
         return self.up and self.flight is None
 
     def ask(self, job: ForwardedRequest, now_s: float) -> tuple[Forwarder, SettledRequest | None]:
-        """Queue a client's request. Return also its refusal, or None."""
+        """Queue a client's request; return its refusal if it can't be queued."""
         if not self.up:
             return self, _not_sent(job, "the translator is not connected")
         if len(self.queue) >= self.longest_queue:
@@ -172,7 +171,7 @@ class Forwarder:
     def ask_own(
         self, request: Request, now_s: float, purpose: OwnPurpose | None = None, mapped: MappedRequest | None = None
     ) -> tuple[Forwarder, ForwardedRequest | None]:
-        """Queue a request of the scheduler before those of clients. Return None if no translator is connected."""
+        """Queue a request of the scheduler before clients' requests; return None if no translator is connected."""
         if not self.up:
             return self, None
         number, deadline_s = self.number + 1, now_s + self.timeout_s
@@ -200,7 +199,7 @@ class Forwarder:
         return next((job for job in self.queue if job.number == number), None)
 
     def answered(self, number: int, response: Response) -> tuple[Forwarder, SettledRequest | None]:
-        """Take an answer of the translator. Return None if its request is not open any more."""
+        """Match the translator's answer to its request; return None if that request is no longer open."""
         job = self.flight
         if job is not None and job.number == number:
             outcome = ForwardOutcome.LATE if job.answered else ForwardOutcome.ANSWERED
@@ -228,14 +227,14 @@ class Forwarder:
         return forwarder, tuple(settled)
 
     def asked_again(self, client: str, request_id: str, now_s: float) -> Forwarder | None:
-        """Extend the deadline of an overdue request that its client repeats; None: it is not with the translator."""
+        """Extend the deadline of an overdue request that its client repeats; None if it is not in flight."""
         job = self.flight
         if job is None or job.client != client or job.request.id != request_id:
             return None
         return replace(self, flight=job._replace(answered=False, deadline_s=now_s + self.timeout_s))
 
     def called_back(self, which: Callable[[ForwardedRequest], bool]) -> tuple[Forwarder, list[ForwardedRequest]]:
-        """Remove clients' requests that were not sent; the caller answers them."""
+        """Remove clients' unsent requests selected by `which`, for the caller to answer."""
         called = [job for job in self.queue if which(job)]
         return replace(self, queue=tuple(job for job in self.queue if job not in called)), called
 

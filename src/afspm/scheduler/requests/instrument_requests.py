@@ -1,9 +1,9 @@
 """Requests for parameters of other instruments, their reports, and the problems of conditions.
 
-A request to set a parameter waits for the next report of its instrument, and is decided then: authorised again, and
-within its limits. The answer to the report carries it as an order. An order is repeated in each answer until a report
-contains its outcome; the instrument carries out an id once. A limited rate is not checked here: the order carries it,
-and the instrument keeps it on its way to the target.
+A request to set a parameter waits for the next report of its instrument, and is authorised and checked against its
+limits again when the report arrives. The answer to the report carries it as an order. An order is repeated in each
+answer until a report contains its outcome; the instrument carries out an id once. A limited rate is not checked here:
+the order carries it, and the instrument keeps it on its way to the target.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from afspm.scheduler.state import SchedulerState, StateDraft
 from afspm.wire.messages import INSTRUMENT_READINGS
 
 MaySend = Callable[[StateDraft, ForwardedRequest], Response | None]
-"""Returns the refusal of a request that its client may not send any more."""
+"""A function that returns the refusal of a request whose client may no longer send it, else None."""
 
 
 def is_for_instrument(draft: StateDraft, event: RequestIn) -> bool:
@@ -50,7 +50,7 @@ def is_for_instrument(draft: StateDraft, event: RequestIn) -> bool:
 
 
 def ask(draft: StateDraft, event: RequestIn, job: ForwardedRequest) -> None:
-    """Answer a request from the last report, or queue it for the next."""
+    """Answer a read request from the last report, or queue a set request for the next report."""
     if is_get(event.request):
         _answer_get(draft, event)
         return
@@ -87,7 +87,7 @@ def _part(reading: InstrumentReading, part: str) -> str | None:
 
 
 def report_in(draft: StateDraft, event: RequestIn) -> InstrumentReadings | None:
-    """Return the report in a request; None: it is none, or not about its sender."""
+    """Return the instrument report in a request; None without a report about the sender."""
     subject = event.request.subject
     if event.request.kind != RELAY_REQUEST or not isinstance(subject, RelayedMessage):
         return None
@@ -102,7 +102,7 @@ def report_in(draft: StateDraft, event: RequestIn) -> InstrumentReadings | None:
 
 
 def take_report(draft: StateDraft, event: RequestIn, report: InstrumentReadings, may_send: MaySend) -> None:
-    """Store a report, settle its orders, and answer with the next orders."""
+    """Store a report, settle its orders, and answer with the next order."""
     name = report.instrument
     draft.instruments = draft.instruments.reported(report, draft.now_s, draft.now_ns)
     for outcome in report.outcomes:
@@ -193,7 +193,7 @@ def _settle(draft: StateDraft, instrument: str, found: OpenOrder, outcome: Order
 
 
 def expire(draft: StateDraft) -> None:
-    """Answer the requests that no report came for in time, and look at the conditions again."""
+    """Answer the instrument requests whose deadline has passed, and evaluate the conditions."""
     timeout_s = draft.env.settings.control.request_timeout_s
     for name, one in draft.instruments.overdue(draft.now_s):
         draft.instruments = draft.instruments.settled(name, one.job.number)
@@ -211,7 +211,7 @@ def expire(draft: StateDraft) -> None:
 
 
 def flag_is_due(state: SchedulerState | StateDraft) -> bool:
-    """Return whether a problem must be flagged, or cleared, since a condition changed."""
+    """Return whether a condition changed so that its problem must be flagged or cleared."""
     return _next_flag(state) is not None
 
 

@@ -1,4 +1,4 @@
-"""The request whose turn it is, during its reads and moves; and requests of an unclear sender."""
+"""Waiting requests: the next request during its reads and moves, and requests whose sender is not clear yet."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class PrePositioner:
     settled_at_s: float | None = None
 
     def hides(self, published: object) -> bool:
-        """Return whether a state belongs to the move only, and is not published.
+        """Return whether a state reported during the move must not be published.
 
-        To the client the action is under way, and would seem to be over before it began.
+        The client has started the action: FREE after the move would look like the end of the action.
         """
         return isinstance(published, ScopeStatus) and published.state in (ScopeState.MOVING, ScopeState.FREE)
 
     def moved(self, now_s: float) -> PrePositioner:
-        """Wait until the microscope is free: the move has succeeded."""
+        """Start to wait for a free microscope after the move has succeeded."""
         return replace(self, settled_at_s=min(now_s + SETTLED_WITHIN_S, self.move.deadline_s))
 
     def is_ready(self, microscope: MicroscopeStatus, now_s: float) -> bool:
@@ -51,12 +51,12 @@ class PrePositioner:
 
 @dataclass(frozen=True)
 class Turn:
-    """The turn of one request: values are read, and the microscope is moved, before it is sent.
+    """The reads and the move before one request is sent.
 
     Attributes:
-        number: of the request, in the forwarder's queue.
+        number: the number of the request in the forwarder's queue.
         awaited: parameters being read; None: reading has not begun.
-        values: by parameter; None where the microscope answered without a value.
+        values: the read values, by parameter; None where the microscope answered without a value.
         move: the move before an action; None: there was none.
     """
 
@@ -90,9 +90,9 @@ class PendingRequests:
     """The requests that wait for a read, a move, or the closing of another connection.
 
     Attributes:
-        turn: of the request that waits for reads or a move.
+        turn: the reads and the move of the next request.
         unclear: requests of a second connection under a name, by name, with the end (real) of the wait for the first.
-        refused: connections that were refused: logged once for each.
+        refused: connections whose refusal was logged, once for each.
     """
 
     turn: Turn | None = None
@@ -107,18 +107,21 @@ class PendingRequests:
         return replace(self, unclear={**self.unclear, event.name: (event, now_s + _UNCLEAR_S)})
 
     def clear_up(self, name: str) -> tuple[PendingRequests, RequestIn | None]:
-        """Return the request of a second connection with this name, which waited for the first to close."""
+        """Remove and return the request of a second connection that waited for the first of this name to close."""
         if name not in self.unclear:
             return self, None
         rest = {other: one for other, one in self.unclear.items() if other != name}
         return replace(self, unclear=rest), self.unclear[name][0]
 
     def still_unclear(self, now_s: float) -> list[str]:
-        """Return the names for which both connections stay open: they belong to two processes."""
+        """Return the names with two open connections after the wait: they belong to two processes."""
         return [name for name, (_, until_s) in self.unclear.items() if now_s >= until_s]
 
     def due_s(self, *, line_is_free: bool) -> float | None:
-        """Return when the next wait ends, in real time. While the move is in flight, the forwarder has its deadline."""
+        """Return the real time at which the next wait ends.
+
+        The forwarder has the deadline of a move in flight.
+        """
         dues = [until_s for _, until_s in self.unclear.values()]
         if line_is_free and self.move is not None and self.move.settled_at_s is not None:
             dues.append(self.move.settled_at_s)

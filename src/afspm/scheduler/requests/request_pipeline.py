@@ -86,7 +86,7 @@ _CONTROL_EVENTS = {
 
 
 def handle(draft: StateDraft, event: RequestIn) -> None:
-    """Take a request through the stages that are decided at its arrival."""
+    """Run the stages of a request that are decided at its arrival."""
     if event.heard_s < 0.0:
         event = replace(event, heard_s=draft.now_s)
     if admit(draft, event) and authorise(draft, event):
@@ -97,7 +97,7 @@ def handle(draft: StateDraft, event: RequestIn) -> None:
 
 
 def admit(draft: StateDraft, event: RequestIn) -> bool:
-    """Return whether a request is new; if not, it was answered, or waits."""
+    """Return whether a request is new; a request that is not new was answered, or waits."""
     if event.request.kind in _CONTROL_EVENTS and (barrier := draft.barrier.keep(event)) is not None:
         draft.barrier = barrier
         return False
@@ -456,7 +456,7 @@ def _failed_before(response: Response) -> Response:
 
 
 def read_ahead(draft: StateDraft) -> None:
-    """Read the parameters with a limited rate: a rate is checked from the time since which a value is known."""
+    """Read the parameters with a limited rate, so that their rates can be checked later."""
     for name in draft.limits.to_be_known():
         _read(draft, name, ReadAhead(name))
 

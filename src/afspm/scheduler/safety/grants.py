@@ -1,4 +1,4 @@
-"""Approvals of agents: which requests of an agent a person has approved, and which of them are left.
+"""Approvals of agents: the requests that a person has approved, and the number of requests left.
 
 An agent is a component whose commands need the approval of a person (`Rules.agents`). An approval is either of one
 plan, whose requests the agent sends in order and exactly as approved, or a grant: a region, ranges and counts within
@@ -6,8 +6,8 @@ which the agent measures by itself. Both are one more set of limits for that nam
 
     comes in      approvals, and ends of approvals; requests of agents, at arrival and right before they are sent
     state         `GrantBook`: approvals in force, and the uses of the last hour; saved before a request is sent
-    always holds  a request is spent at most once under its id, and only a request that was certainly not carried out is
-                  returned; without an approval no command of an agent is sent
+    always holds  a request counts at most once under its id, and only the use of a request that was certainly not
+                  carried out is undone; without an approval no command of an agent is sent
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ from afspm.scheduler.safety.limits import ExperimentLimits, Limit, RoleLimits
 from afspm.wire.messages import LOG, PROCESSES
 
 AGENT_LEASE_S = 60.0
-"""Lease of an agent that requests none, real."""
+"""Lease of an agent without a lease request, in s of real time."""
 LONGEST_AGENT_LEASE_S = 600.0
 STALE_S = 3600.0
 """Experiment time after which a preflight is too old to be approved, and an approved plan to be begun."""
 _HOUR_NS = 3600 * 10**9
 _PROBE_M = 5e-9
-"""Controllers round: a probe within this square is where it was set."""
+"""Side of the square, in m, within which a probe counts as where it was set: controllers round."""
 _STOPS = frozenset({names.STOP_SCAN, names.STOP_SPEC})
-"""These end what the agent began, and need no approval."""
+"""Actions that stop a measurement, and need no approval."""
 _PLACES = frozenset((*REGION_CHANGES, *SHAPE_CHANGES, *PROBE_CHANGES))
 _OF_SUPERVISORS = frozenset({PROCESSES.name, LOG.name})
 _SET_REGION, _SET_PROBE = int(ControlRequest.SET_SCAN_PARAMS), int(ControlRequest.SET_PROBE_POS)
@@ -99,8 +99,8 @@ class HeldGrant:
 
     Attributes:
         by: the person who approved.
-        step: of a plan: the number of requests sent.
-        used: of a grant: uses by action.
+        step: the number of requests of a plan that were sent.
+        used: the uses of a grant, by action.
     """
 
     grant: Grant
@@ -157,13 +157,13 @@ class AgentPlace:
 
 @dataclass(frozen=True)
 class GrantBook:
-    """Approvals and their uses; survives a restart.
+    """The approvals and their uses, which survive a restart.
 
     Attributes:
-        plans, grants: by agent.
+        plans, grants: the approved plans and the grants, by agent.
         spent: by agent, the requests of the last hour, oldest first.
-        placed: see `AgentPlace`.
-        disturbed_ns: when a problem was flagged, or MANUAL set, last.
+        placed: the places set by the agent in control.
+        disturbed_ns: the last time at which a problem was flagged or MANUAL was set.
     """
 
     plans: Mapping[str, HeldGrant] = field(default_factory=dict)
@@ -173,21 +173,21 @@ class GrantBook:
     disturbed_ns: int = 0
 
     def approvals(self) -> Approvals:
-        """Return the part that is published."""
+        """Return the approvals in their published form."""
         return Approvals(
             tuple(one.published() for held in (self.plans, self.grants) for _, one in sorted(held.items()))
         )
 
 
 def limits_digest(limits: ExperimentLimits) -> str:
-    """Return a short text that changes with any limit."""
+    """Return a short hash of all limits."""
     plain = json.dumps(to_plain(limits, lists=True), sort_keys=True)
     return hashlib.sha256(plain.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
 class GrantChecker:
-    """Decides about requests of agents, and about approvals."""
+    """The check of agents' requests against their approvals, and of the approvals themselves."""
 
     rules: Rules = field(default_factory=Rules)
     limits: ExperimentLimits = field(default_factory=ExperimentLimits)
@@ -197,7 +197,7 @@ class GrantChecker:
     # --- approvals ---
 
     def given(self, by: str, grant: Grant, now_ns: int, offset_m: XY | None) -> tuple[GrantChecker, str]:
-        """Take a person's decision. Return also the reason why it is refused, or ""."""
+        """Apply a person's approval or revocation; return also the reason of a refusal, else an empty text."""
         if not self.rules.may_approve(by):
             return self, f"{by} does not have the role approve ([control.roles])"
         if not self.rules.is_agent(grant.agent):
@@ -266,7 +266,7 @@ class GrantChecker:
     # --- requests of an agent: at arrival ---
 
     def refused_at_arrival(self, who: str, request: Request, now_ns: int) -> str:
-        """Return the reason why an agent may not send a request; "" if it may be decided further."""
+        """Return the reason why an agent may not send a request; empty if it may be decided further."""
         if not self.rules.is_agent(who):
             return ""
         kind, subject = request.kind, request.subject
@@ -300,10 +300,10 @@ class GrantChecker:
         return list(needed)
 
     def refused(self, who: str, request: Request, now_ns: int, offset_m: XY | None, position: KnownPosition) -> str:
-        """Return the reason why a command may not be sent now; "" if it may.
+        """Return the reason why a command may not be sent now; empty if it may.
 
         Args:
-            position: where the microscope stands, in its own coordinates.
+            position: the position of the tip, in the microscope's coordinates.
         """
         if why := self._refused_by_role(who, request, now_ns, offset_m, position):
             return why
@@ -327,7 +327,7 @@ class GrantChecker:
         return f"{refused}; {why_not}" if refused and plan is not None else refused
 
     def sending(self, who: str, request: Request, now_ns: int, offset_m: XY | None) -> GrantChecker:
-        """Spend a checked request that is about to be sent."""
+        """Count a checked request, about to be sent, against its approval."""
         is_agent = self.rules.is_agent(who)
         if not is_agent and self._role(who) is None:
             return self
@@ -347,7 +347,7 @@ class GrantChecker:
         return replace(self, book=replace(book, spent={**book.spent, who: (*kept, spent)}))
 
     def not_done(self, who: str, request: Request) -> GrantChecker:
-        """Return a request that was certainly not carried out."""
+        """Undo the use of a request that was certainly not carried out."""
         if not request.id or (spent := self._spent(who, request.id)) is None:
             return self
         book = self.book
@@ -362,7 +362,7 @@ class GrantChecker:
         return replace(self, book=replace(book, spent={**book.spent, who: rest}))
 
     def done(self, who: str, request: Request) -> GrantChecker:
-        """Store a success: a place that the agent has set, and the end of a plan."""
+        """Update the book after a success: the place that the agent has set, and a completed plan."""
         book = self.book
         if request.kind in (_SET_REGION, _SET_PROBE) and self.rules.is_agent(who):
             book = replace(book, placed=book.placed.after(who, request))

@@ -1,4 +1,4 @@
-"""Checks requests against the limits of an experiment.
+"""The check of requests against the limits of an experiment.
 
 Nothing is clamped. A refusal names the parameter, the value, the limit and the place in the file where it was set.
 
@@ -89,7 +89,7 @@ class LimitChecker:
 
         Args:
             used: the parameters that `who` sets; the others of the request only change with them. None: all.
-            is_repeated: this request was sent before with an unknown outcome: it is not a second use.
+            is_repeated: whether this request was sent before with an unknown outcome, and is no second use.
         """
         try:
             self._check(_Use(who, request.id, now_ns, is_repeated), request, used)
@@ -100,7 +100,7 @@ class LimitChecker:
         return None
 
     def check_place(self, request: Request) -> Response | None:
-        """Return the refusal of an action at its present place, which a person may have changed."""
+        """Return the refusal of an action at the present place, which a person may have changed; None: it may start."""
         try:
             self._check_place(str(request.subject))
         except _Breach as breach:
@@ -172,7 +172,7 @@ class LimitChecker:
         return self._with_usage(usage)
 
     def counts(self, request: Request) -> bool:
-        """Return whether the interval between two such requests is limited."""
+        """Return whether the interval between two requests of this kind is limited."""
         return bool(self._counted_uses(request, None))
 
     def not_done(self, who: str, request: Request, used: Collection[str] | None = None) -> LimitChecker:
@@ -216,7 +216,7 @@ class LimitChecker:
         return checker
 
     def published(self, subject: object, now_ns: int) -> LimitChecker:
-        """Store positions and changes of values with a limited rate from a published message."""
+        """Store the position, and changes of values with a limited rate, from a published message."""
         usage = self.state.usage
         for name, value in numbers(self._valid_values(subject)):
             if name in self.limits.rated:

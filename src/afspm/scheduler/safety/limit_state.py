@@ -17,7 +17,7 @@ class KnownValue:
     """A value in force.
 
     Attributes:
-        since_ns: when it was last set, or first known, in experiment time.
+        since_ns: the experiment time at which the value was last set, or first known.
         origin: the value at that time. A value only read since then may differ: controllers round, and a person may
             turn a knob.
     """
@@ -58,7 +58,7 @@ class Usage:
         """Store a value in force.
 
         Args:
-            was_read: it was read, and may have been in force for long.
+            was_read: whether the value was read, and may have been in force for long.
         """
         known = self.known.get(name)
         if known is not None and known.value == value:
@@ -67,13 +67,13 @@ class Usage:
         return replace(self, known={**self.known, name: new}, before=_without(self.before, name))
 
     def forget(self, name: str) -> Usage:
-        """Remove a value that is not known any more."""
+        """Remove a value that is no longer known."""
         if name not in self.known and name not in self.before:
             return self
         return replace(self, known=_without(self.known, name), before=_without(self.before, name))
 
     def changing(self, name: str) -> Usage:
-        """Set a value aside until the outcome of its change, and the time of it, are known."""
+        """Set a value aside until the outcome and the time of its change are known."""
         if name not in self.known:
             return self
         return replace(self, known=_without(self.known, name), before={**self.before, name: self.known[name]})

@@ -46,25 +46,25 @@ class Limit:
 
     @property
     def bounds_changes(self) -> bool:
-        """True where a check needs the value in force."""
+        """Whether a check needs the value in force."""
         return self.step is not None or self.rate_per_s is not None
 
     @property
     def is_of_a_number(self) -> bool:
-        """True where the parameter must be a number."""
+        """Whether the parameter must be a number."""
         return self.bounds_changes or self.low is not None or self.high is not None
 
 
 @dataclass(frozen=True)
 class RoleLimits:
-    """Further limits of one component, of persons and agents that act through it, or of one of these.
+    """Further limits of a component, of a person, or of an agent that acts through a component.
 
     Attributes:
         limits: ranges, and the region, which is in the coordinates of components.
         parameters_only: whether all other parameters are refused.
-        actions: all others are refused; None: no action is.
+        actions: the allowed actions; None: all.
         per_hour: the largest number of uses within an hour of experiment time, by action.
-        source: where it was set.
+        source: the place in the experiment file.
     """
 
     limits: ExperimentLimits
@@ -79,13 +79,13 @@ class ExperimentLimits:
     """All limits of an experiment.
 
     Attributes:
-        parameters: by name of the parameter.
-        actions: by name of the action.
+        parameters: the limits of parameters, by name.
+        actions: the limits of actions, by name.
         region: the area allowed for scans (all corners) and the probe, in m, in tip coordinates. An action at a place
             outside is refused even if the place was set at the panel.
-        region_source: where the region was set.
-        most_pixels: of a scan.
-        sets: by name of an action, the parameters that the microscope sets at once as that action.
+        region_source: the place in the experiment file where the region was set.
+        most_pixels: the largest number of pixels of a scan.
+        sets: for each action by name, the parameters that the microscope sets as that action.
         roles: further limits by name of a component, or of a person or agent: "agent", "agent:claude".
     """
 

@@ -15,18 +15,18 @@ from afspm.scheduler.safety.limits import Limit
 
 
 class ParameterValue(NamedTuple):
-    """A number to set, in SI or in the unit of its limit; None: a text or a switch."""
+    """A parameter with its number, in SI units or in the unit of its limit; None for a text or a switch."""
 
     name: str
     number: float | None
 
 
 class ParameterValueError(Exception):
-    """A value that its parameter can't have, and why. Does not leave this package."""
+    """An error: a value that its parameter can't have. It does not leave this package."""
 
 
 def values_of(subject: object, limits: Mapping[str, Limit]) -> list[ParameterValue]:
-    """Return all parameters that a subject sets, by name.
+    """Return the parameters set by the subject of a request.
 
     Raises:
         ParameterValueError: a text where there must be a number, a number that is not finite, a unit of another

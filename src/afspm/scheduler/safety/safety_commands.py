@@ -1,4 +1,4 @@
-"""The scheduler's own requests, which go first: the watchdog's actions, and whether the translator has them."""
+"""The scheduler's own requests for the safety of the tip, which are sent before all others."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def begin(draft: StateDraft) -> None:
 
 
 def send(draft: StateDraft) -> None:
-    """Send the actions that the watchdog wants."""
+    """Send the actions that the watchdog requires."""
     while True:
         draft.watchdog, action = draft.watchdog.next_action(draft.microscope)
         if action is None:

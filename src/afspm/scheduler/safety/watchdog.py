@@ -1,7 +1,7 @@
 """The watchdog: actions that the scheduler itself sends to the microscope when a holder loses control.
 
 It stops the running scan or spectrum. It retracts the tip if the holder lost control, rather than gave it back, and
-left the tip in a dangerous state: the holder can't mend that any more, and no other component knows of it.
+left the tip in a dangerous state: the holder can no longer mend that, and no other component knows of it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class TipEvent(Enum):
     ENDANGERED = "endangered"
     """The holder lost control and left the tip in danger."""
     SEEN_TO = "seen-to"
-    """A person or a solver attends to the tip, or it is out of danger."""
+    """A person or a solver attends to the tip, or the tip is out of danger."""
     SENT = "sent"
     """The microscope is asked to retract the tip."""
     NOT_YET = "not-yet"
@@ -46,11 +46,11 @@ class TipEvent(Enum):
     RETRACTED_LATE = "retracted-late"
     """The microscope has retracted the tip after the deadline."""
     IMPOSSIBLE = "impossible"
-    """The microscope has no such action."""
+    """The microscope has no action to retract the tip."""
     FAILED = "failed"
     """The microscope refuses, or does not end the retract in time."""
     DUE = "due"
-    """It is time to try again."""
+    """A postponed retract is due again."""
     LEFT = "left"
     """The run is stopped with the tip in danger."""
 
@@ -75,16 +75,16 @@ _TABLE: dict[TipEvent, tuple[TipDuty, TipDuty, TipDuty, TipDuty, bool]] = {
 
 @dataclass(frozen=True)
 class WatchdogSettings:
-    """When the scheduler acts by itself.
+    """The conditions under which the scheduler itself stops a measurement or retracts the tip.
 
     Attributes:
         stop_when: the causes of losing control after which the running measurement is stopped.
         dangerous: the states in which the tip is retracted when its holder loses control: names of ScopeState, and
             "feedback-off".
         retract: the action that retracts the tip; None: never.
-        attempts: how often an action without a response is tried.
-        again_s: how long (real) to wait for the microscope to be free, to have stopped, or to be connected. A tip that
-            could not be retracted is tried again after this time, then after twice as long each time.
+        attempts: the number of attempts at an action without a response.
+        again_s: the real time to wait for the microscope to be free, to have stopped, or to be connected. A failed
+            retract is repeated after this time, then after twice as long each time.
         longest_s: the longest time (real) between two such attempts.
     """
 
@@ -97,7 +97,7 @@ class WatchdogSettings:
 
 
 class SafetyResult(Enum):
-    """The result of an action of the watchdog's."""
+    """The result of an action sent by the watchdog."""
 
     DONE = "done"
     AGAIN = "to be tried again"
@@ -109,12 +109,11 @@ class RetractState:
     """The part of the watchdog that survives a restart.
 
     Attributes:
-        calls_people: the tip was retracted, or could not be, and no person was called yet: a person decides how to go
-            on.
+        calls_people: whether a person must still be called: the tip was retracted, or could not be.
         stops: actions to send before the tip is retracted.
-        for_feedback: the tip is in danger because the feedback is off.
-        may_come: the scheduler was killed after it sent a retract: the translator may still have it in its queue, and
-            its answer goes to the killed process.
+        for_feedback: whether the tip is in danger because the feedback is off.
+        may_come: whether a retract sent before a kill of the scheduler may still be in the translator's queue; its
+            answer goes to the killed process.
     """
 
     duty: TipDuty = TipDuty.NONE
@@ -126,21 +125,20 @@ class RetractState:
 
 @dataclass(frozen=True)
 class Watchdog:
-    """The actions that the scheduler itself wants of the microscope.
+    """The scheduler's own duties towards the running measurement and the tip.
 
     The caller sends `next_action()` before anything else, reports by `answered` or `unsent`, and calls `look_again` at
-    `due_s`. While the watchdog `owes_retract`, no component commands the microscope. When the retract is `put_off`,
-    since the microscope does not do it, a person or a solver of device-malfunction may. The duty towards the tip
-    follows from a table.
+    `due_s`. While the watchdog `owes_retract`, no component commands the microscope. While a failed retract is
+    `put_off`, a person or a solver of device-malfunction may. The duty towards the tip follows from a table.
 
     Attributes:
         starting: the action that stops the measurement just started.
         sent: the action that was sent and is not answered.
-        can_retract: the microscope has the action, as far as known.
+        can_retract: whether the microscope has the action to retract, as far as known.
         refused_at: number of states seen at the last answer NOT_FREE.
-        told_to_stop: a stop was sent for the running measurement.
-        unstoppable: the running measurement did not stop.
-        due_s: when `look_again` is due, real.
+        told_to_stop: whether a stop was sent for the running measurement.
+        unstoppable: whether the running measurement failed to stop.
+        due_s: the real time at which `look_again` is due.
     """
 
     settings: WatchdogSettings = field(default_factory=WatchdogSettings)
@@ -157,13 +155,13 @@ class Watchdog:
     in_haste: bool = False
 
     def restored(self, tip: RetractState) -> Watchdog:
-        """Restore the duty of before a restart: an unanswered retract is owed again."""
+        """Restore the duty from before a restart: an unanswered retract is owed again."""
         was_asked = tip.duty is TipDuty.ASKED
         duty = TipDuty.OWED if was_asked else tip.duty
         return replace(self, tip=replace(tip, duty=duty, may_come=was_asked or tip.may_come))
 
     def translator_answered(self) -> Watchdog:
-        """Note the first answer since the restart: everything that the killed scheduler sent is done, or lost.
+        """Process the first answer since the restart: all requests of the killed scheduler are now done or lost.
 
         A tip that is still owed a retract is retracted again, which does no harm. If a person has attended to it
         meanwhile, it may have been withdrawn after that: the person is called again.
@@ -189,12 +187,12 @@ class Watchdog:
 
     @property
     def left_to_people(self) -> bool:
-        """True until a person is called, who decides how to go on."""
+        """Whether a person must still be called to decide how to go on."""
         return self.tip.calls_people
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """The actions wanted, in order."""
+        """The actions still to be sent, in order."""
         retract = self.settings.retract
         return (*self.tip.stops, retract) if self.owes_retract and retract is not None else self.tip.stops
 
@@ -211,7 +209,7 @@ class Watchdog:
         return replace(self, tip=replace(self.tip, calls_people=False))
 
     def leave_to_people(self, microscope: MicroscopeStatus) -> Watchdog:
-        """Keep the duty towards a tip in danger: the run is stopped, and the leaving translator retracts the tip."""
+        """Keep the duty towards a tip in danger when the run is stopped; the exiting translator retracts the tip."""
         return (
             self._after(TipEvent.LEFT) if self.settings.retract is not None and microscope.danger is not None else self
         )
@@ -227,7 +225,7 @@ class Watchdog:
         return dog._with_stops(()) if microscope.state is ScopeState.FREE and self.sent is None else dog
 
     def started(self, action: str, states_seen: int, microscope: MicroscopeStatus) -> Watchdog:
-        """Note an action that succeeded, or may have. `states_seen` states were known when it was sent.
+        """Register an action that succeeded, or may have; `states_seen` states were known when it was sent.
 
         The answer may arrive before or after the state that the action leads to.
         """
@@ -250,9 +248,9 @@ class Watchdog:
         """Process the loss of control for `cause` while the action `in_flight` was with the translator.
 
         Args:
-            had_died: the process that got control has died; its restarted successor gives control back.
-            by_holder: the holder itself caused it.
-            was_seen_to: the holder was attending to a tip that was not retracted.
+            had_died: whether the process that got control has died; its restarted successor gives control back.
+            by_holder: whether the holder itself caused the loss.
+            was_seen_to: whether the holder was attending to a tip that was not retracted.
         """
         # a holder that gives control back knows the state it leaves, and so does a person who takes control
         knows = cause in (Cause.RELEASED, Cause.MANUAL) or (cause is Cause.SOLVED and by_holder)
@@ -285,7 +283,7 @@ class Watchdog:
         return self._after(TipEvent.SEEN_TO)
 
     def hurry(self, now_s: float) -> Watchdog:
-        """End all waits now: the experiment ends."""
+        """Shorten all waits: the experiment ends."""
         due_s = None if self.due_s is None else min(self.due_s, now_s + _SOON_S)
         return replace(self, in_haste=True, due_s=due_s)
 
@@ -333,7 +331,7 @@ class Watchdog:
         return dog._retract_later(now_s), SafetyResult.FAILED
 
     def done_late(self, action: str) -> Watchdog:
-        """Process a success after its deadline: a tip withdrawn late is left to a person, too."""
+        """Process a success after its deadline: a person is called after a late retract, too."""
         return self._after(TipEvent.RETRACTED_LATE) if action == self.settings.retract else self
 
     def unsent(self, now_s: float) -> Watchdog:
@@ -342,7 +340,7 @@ class Watchdog:
         return replace(dog, due_s=now_s + dog._wait_s) if dog.owes_retract and dog.due_s is None else dog
 
     def translator_is_there(self, now_s: float) -> Watchdog:
-        """Retry a retract that was put off, soon after a translator connects: its first packets come before."""
+        """Schedule a retract that was put off, soon after a translator connects and sends its first packets."""
         return replace(self, due_s=now_s + _SOON_S) if self.put_off else self
 
     # --- what does not come about ---
@@ -350,7 +348,7 @@ class Watchdog:
     def look_again(
         self, microscope: MicroscopeStatus, now_s: float, *, is_seen_to: bool
     ) -> tuple[Watchdog, str | None]:
-        """Go on after a wait in vain, or when a put off retract is due.
+        """Continue after an expired wait, or when a postponed retract is due.
 
         Args:
             is_seen_to: a person or a solver attends to the tip.

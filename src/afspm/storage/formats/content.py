@@ -58,7 +58,7 @@ class FileContent:
 
 
 def name_and_unit(column: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit, which is the last text in parentheses; "" without a unit.
+    """Return a column's name without its unit, and the unit: the last text in parentheses, or empty.
 
     "Current (A) [filt]" is ("Current [filt]", "A"), and "Current PSD (A/sqrt(Hz))" is ("Current PSD", "A/sqrt(Hz)").
     """

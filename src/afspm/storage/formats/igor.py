@@ -23,7 +23,7 @@ class Wave:
         name: name of the wave.
         values: with up to four dimensions.
         unit: unit of the values.
-        steps, dimension_units: for each of four dimensions.
+        steps, dimension_units: step and unit of each of four dimensions.
         labels: names of the elements of each dimension; empty without names.
         note: text of the wave's note.
     """
