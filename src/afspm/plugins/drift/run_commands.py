@@ -1,6 +1,6 @@
-"""`afspm compare` and `afspm find`: runs beside each other, and a sample that was mounted again.
+"""`afspm compare`: compare runs side by side. `afspm find`: find a remounted sample.
 
-Both register scans of different nights, so they are commands of the package with the estimators.
+Both register scans of different nights, so they are in the package with the estimators.
 """
 
 from __future__ import annotations
