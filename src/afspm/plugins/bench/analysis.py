@@ -174,7 +174,7 @@ def _first_high(power: Floats) -> int:
 
 
 def conductance_in_gap(curve: Spectrum) -> float:
-    """Return the conductance within ±0.2 V relative to the mean of the curve: near 1 in a metal, near 0 in a gap."""
+    """Return the conductance within ±0.2 V over the curve's mean conductance: about 1 in a metal, 0 in a gap."""
     bias, current = curve.values[:, 0], curve.values[:, 1]
     inside = np.abs(bias) < 0.2
     slope = float(np.polyfit(bias[inside], current[inside], 1)[0])

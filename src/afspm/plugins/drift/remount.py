@@ -75,7 +75,7 @@ class Remount:
 
 
 def overview_of(run: Run, number: int | None = None) -> tuple[ScanRow, Scan]:
-    """Return a scan by number, with its topography; without a number, the first of the largest whole scans of the run.
+    """Return a scan by number, with its topography; without a number, the largest complete scan.
 
     Raises:
         InvalidValue: there is no such scan. FileError: the scan's file is missing or damaged.

@@ -182,7 +182,7 @@ def likely_shifts(
     reach: tuple[int, int],
     flat_m: float,
 ) -> list[Shift]:
-    """Return the shifts in whole pixels that fit some lines best, best first.
+    """Return the shifts in whole pixels with the best fit of some lines, best first.
 
     Unlike `RowRegistration`, this search compares heights: the flat ground beside a step shows shifts that its edge
     does not.

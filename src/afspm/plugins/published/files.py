@@ -433,7 +433,7 @@ class _Conversion:
             given.update({key: value for key, value in (("history", history), ("rules", rules)) if value})
 
     def note_intermediary(self, name: str, table: Table) -> None:
-        """Note the result of an intermediary table."""
+        """Note the result of converting an intermediary table."""
         kind = wire_of(table)
         if kind in ENVELOPES:
             self.parts.became[(name,)] = f"the envelope {toml(envelope(with_channels(table, self.channels)))}"

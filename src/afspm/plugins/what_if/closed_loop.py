@@ -55,8 +55,8 @@ def rerun(
     """Run a simulated night again with a change and the same seeds, and compare the outcomes.
 
     Args:
-        changes: settings by the name of a component, or an experiment file that is laid over the run's.
-        runs: the folder for the new run.
+        changes: settings by the name of a component, or an experiment file that overrides the run's.
+        runs: parent folder of the new run.
 
     Raises:
         InvalidValue: the run was not simulated, has not ended, or a change is not a table of settings.

@@ -86,7 +86,7 @@ def replay(
         packet_of: returns a recorded packet with its values.
         run_dir: folder of the run.
         make: creates the component; by default from the class in the launch line.
-        settings: replace those of the launch line.
+        settings: settings that replace the ones in the launch line.
         watch: also detect uses of clocks and random numbers, at half the speed.
 
     Raises:

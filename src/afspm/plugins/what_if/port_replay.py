@@ -142,12 +142,12 @@ class ReplayClock:
 
     @property
     def shown_s(self) -> float:
-        """The monotonic time shown last."""
+        """The last shown monotonic time."""
         return float(self._shown["m"])
 
     @property
     def shown_ns(self) -> int:
-        """The experiment time shown last."""
+        """The last shown experiment time."""
         return int(self._shown["n"])
 
     def expect(self, readings: Sequence[Any]) -> None:
@@ -223,7 +223,7 @@ class ReplayPort:
         return -1
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing: there is nothing to close."""
 
     # --- what the component sends ---
 

@@ -83,7 +83,7 @@ def replay_file(path: Path, settings: Mapping[str, Any] | None = None) -> Schedu
     """Replay the scheduler of a run.
 
     Args:
-        settings: replace those of the launch line.
+        settings: settings that replace the ones in the launch line.
 
     Raises:
         FileError: the file can't be read, or is not a step log.

@@ -43,7 +43,7 @@ class FineFilter:
 
     @classmethod
     def of(cls, first: Array, second: Array) -> FineFilter:
-        """Estimate the filter from two images."""
+        """Return the filter estimated from two images."""
         from scipy.fft import dctn
 
         shapes = [first.shape, second.shape]
@@ -235,9 +235,9 @@ def products(one: NDArray[Real], two: NDArray[Real]) -> Array:
 
 
 def noise_metric(residual: Array, known: NDArray[np.bool_], seen_through: FineFilter) -> Array | None:
-    """Return Q of white and 1/f noise, N(f) = a + b / f; None if the noise is nearly white (b W <= 0.3 a).
+    """Return the metric Q of white and 1/f noise; None if the noise is nearly white (b W <= 0.3 a).
 
-    N is fitted to the median row spectrum of a residual, corrected for the filter.
+    N(f) = a + b / f is fitted to the median row spectrum of a residual, corrected for the filter.
     """
     from scipy.linalg import inv, toeplitz
     from scipy.optimize import nnls

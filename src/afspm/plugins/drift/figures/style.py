@@ -77,7 +77,7 @@ def shared_span(scans: Sequence[DriftScan]) -> ValueRange:
 
 
 def show_scan(ax: Axes, scan: DriftScan, span: ValueRange) -> None:
-    """Show a scan in grey, levelled line by line, in µm of its own frame (before rotation), with a scale bar."""
+    """Show a scan in grey, levelled line by line, with a scale bar; axes in µm of its own frame (before rotation)."""
     left, low = (1e6 * edge for edge in scan.region.top_left_m)
     width, height = (1e6 * size for size in scan.region.size_m)
     level = flattened(scan.values)

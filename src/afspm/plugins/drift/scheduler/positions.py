@@ -34,7 +34,7 @@ class PlaceCodec(Codec, Protocol):
         """Return a ScanParameters or ProbePosition as a message."""
 
     def relocated(self, message: str, payload: bytes | memoryview, told: bytes) -> bytes:
-        """Return a message with its place replaced by the place in another: a ScanParameters2d, or a ProbePosition."""
+        """Return a message with its place taken from another message: a ScanParameters2d or a ProbePosition."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class PositionPair(Generic[P]):
 
     Attributes:
         sample: place as requested by a component.
-        requested: the component's message, bit by bit.
+        requested: the component's message, unchanged.
         tip: place as set at the microscope.
         sent: message that set the place at the microscope.
     """

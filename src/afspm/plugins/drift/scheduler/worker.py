@@ -56,8 +56,8 @@ class Reports(Protocol):
 
 
 class DriftWorkerInProcess:
-    """Worker without a separate process, for tests: `take` returns when the job is done. See
-    `scheduler.shell.FrameWorker`.
+    """Worker without a separate process, for tests; see `scheduler.shell.FrameWorker`. `take` returns when the job is
+    done.
 
     Args:
         file: file for the worker's state; None: the state is not saved.

@@ -48,7 +48,7 @@ class SimulatedNight:
 
     @property
     def unknown_m(self) -> Array:
-        """Estimated minus true drift after each scan, (n, 2)."""
+        """Estimated minus true drift after each scan, (n, 2), in m."""
         return self.record.drift_m - self.record.drift_m[:1] - self.truth_m
 
     def metrics(self) -> dict[str, float]:

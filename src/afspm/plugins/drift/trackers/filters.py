@@ -41,8 +41,7 @@ class Models:
         return np.asarray(self.walk_m2_s * duration_s / 12 + self.density_m2_s3 * duration_s**3 / 320)
 
     def over(self, step_s: float) -> tuple[Array, Array]:
-        """Return transition matrix (n, 4, 4) and added covariance (n, 4, 4) of a state (x, y, v_x, v_y) over a time
-        step.
+        """Return transition matrix and added covariance, (n, 4, 4) each, of a state (x, y, v_x, v_y) over a time step.
 
         A negative step goes back in a straight line, and adds the same covariance.
         """
